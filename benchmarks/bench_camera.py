@@ -8,7 +8,7 @@ import numpy as np
 from cpu_time import cpu_ms
 
 from flcav.geometry import pose
-from flcav.sensors.camera.camera import Camera, photograph
+from flcav.sensors.camera import Camera, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays
 from flcav.sensors.rendering.render import FAR_M
 from flcav.world.map.town import load_town

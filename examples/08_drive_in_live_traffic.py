@@ -9,8 +9,7 @@ from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar32
 from flcav.world.commands import Controls, Spawn
 from flcav.world.live import LiveWorld, Settings
-from flcav.world.map.roads import read_net
-from flcav.world.map.routes import Route, draw_route
+from flcav.world.map.roads import Route, draw_route, read_net
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot

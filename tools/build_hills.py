@@ -16,7 +16,7 @@ from flcav.statistics.streams import stream
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import Edge, RoadNet, read_net
 from flcav.world.map.town import HILLS, TOWNS
-from flcav.world.opendrive.heights import surround
+from flcav.world.opendrive.heights import surround_terrain
 
 FOLDER = Path(__file__).parents[1] / "src/flcav/world/towns"
 Array = NDArray[np.float64]
@@ -52,7 +52,7 @@ def build_relief(name: str, net: RoadNet) -> Relief:
     grid = np.meshgrid(*(np.arange(first, last, LAND_M) for first, last in zip(low, high)))
     beside = np.concatenate((corners, np.stack(grid, axis=-1).reshape(-1, 2)))
     points = _thin(np.concatenate((roads, np.column_stack((beside, land(beside))))), APART_M, keep=len(roads))
-    return Relief(np.concatenate((points, surround(points, FAR_M))).round(3))
+    return Relief(np.concatenate((points, surround_terrain(points, FAR_M))).round(3))
 
 
 def _cross_sections(edge: Edge) -> tuple[Array, Array]:

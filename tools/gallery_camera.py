@@ -12,8 +12,8 @@ from PIL import Image
 
 from flcav.geometry import pose
 from flcav.report.pictures.camera import thermal_grey
-from flcav.sensors.camera.camera import Camera, photograph
-from flcav.sensors.camera.infrared import Infrared, render_thermal
+from flcav.sensors.camera import Camera, photograph
+from flcav.sensors.infrared import Infrared, render_thermal
 from flcav.sensors.lens import BODY_FROM_OPTICAL
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene

@@ -12,7 +12,7 @@ from flcav.report import style
 from flcav.report.pictures.birdseye import HEIGHT_COLOURS, HEIGHTS_M, BirdseyeView, draw_view
 from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
 from flcav.sensors.lidar.lidar import Lidar, scan
-from flcav.sensors.radar.radar import Radar, sweep_radar
+from flcav.sensors.radar import Radar, sweep_radar
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.traffic.traffic import simulate

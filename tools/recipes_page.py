@@ -12,16 +12,15 @@ from pydantic.fields import FieldInfo
 
 from flcav.config import Config
 from flcav.interface.fields import written_fields
-from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.camera.camera import Camera
-from flcav.sensors.camera.infrared import Infrared
+from flcav.sensors.camera import Camera
+from flcav.sensors.infrared import Infrared
 from flcav.sensors.lens import Lens
-from flcav.sensors.lidar.beams import BEAMS, CarlaReturns
-from flcav.sensors.lidar.lidar import Lidar
+from flcav.sensors.lidar.lidar import BEAMS, CarlaReturns, Lidar
 from flcav.sensors.navigation import Gnss, Imu
-from flcav.sensors.radar.detector import Radar
+from flcav.sensors.radar import Radar
 from flcav.sensors.rig import (
     RIGS,
+    CalibrationError,
     Mount,
     Mounted,
     MountedCamera,

@@ -30,8 +30,8 @@ from flcav.perception.objects.truth import CARS
 from flcav.perception.ops.rectangles import iou
 from flcav.perception.signs.background import picture_reader
 from flcav.perception.signs.predict import detect
-from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
+from flcav.sensors.rig import CalibrationError
 from flcav.storage.markdown import format_table
 
 CALIBRATED, CORRECTED, EXACT = "as calibrated", "corrected", "true extrinsics"

@@ -33,8 +33,7 @@ from flcav.perception.objects.truth import CARS
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.reproductions.fig4.cameras import CALIBRATED, CORRECTED, CameraResult, associate_camera, tabulate_cameras
-from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.rig import RIGS
+from flcav.sensors.rig import RIGS, CalibrationError
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.storage.markdown import format_table

@@ -67,7 +67,7 @@ from flcav.reproductions.placement.records import (
 from flcav.reproductions.placement.tables import tables
 from flcav.statistics.power import MOST_SEEDS
 from flcav.statistics.seeds import MeanOverSeeds, half_width, mean_over_seeds
-from flcav.world.line_of_sight import find_visible
+from flcav.world.line_of_sight import find_visible_pairs
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
@@ -392,7 +392,7 @@ def expect_labels(town: Town, traces: Sequence[Trace], errors: Sequence[Percepti
     apart = np.linalg.norm(sites[:, None, :2] - places[None, :, :2], axis=2)
     recall = np.append(RECALL, 0.0)[np.minimum(apart / BIN_M, len(RECALL)).astype(np.int64)]
     pole, error = (rows.astype(np.int64) for rows in np.nonzero(recall))
-    seen = find_visible(town, traces, sites, places, (pole, error))
+    seen = find_visible_pairs(town, traces, sites, places, (pole, error))
     return np.bincount(pole, recall[pole, error] * seen, minlength=len(sites)).astype(np.float64)
 
 

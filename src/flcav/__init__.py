@@ -6,7 +6,7 @@ name is first used.
 
 from typing import TYPE_CHECKING
 
-from flcav.interface.lazy import lazy_names
+from flcav.interface.fields import lazy_names
 
 if TYPE_CHECKING:
     from flcav.dataset import Dataset, record, validate

@@ -27,7 +27,7 @@ from flcav.federation.strategies import FEDAVG, STRATEGIES, Strategy, of_servers
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
-from flcav.network import messages
+from flcav.network import ledger
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.errors import MISS, PerceptionError, Registry
 from flcav.perception.objects.task import OBJECTS
@@ -113,7 +113,7 @@ class Walk:
 @pytest.fixture
 def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
     found = Wire()
-    monkeypatch.setattr(messages, "carry", found.carry)
+    monkeypatch.setattr(ledger, "carry", found.carry)
     monkeypatch.setattr(
         links, "MeteredGrid", lambda grid, account, names: WiredGrid(MeteredGrid(grid, account, names), found)
     )
@@ -139,7 +139,7 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
     assert report_errors(book, OBJECTS, Registry((missed,)), "grid", split).errors == (missed,)
     view = RoadView(Boxes.empty(), np.zeros(2), np.ones((3, 5), bool), np.zeros((3, 5), bool))
     about: Any = {"stage": "edge", "task": "objects", "link": "wireless", "direction": "down", "client": "grid/cav0"}
-    assert RoadView.from_message(messages.send(book, view.message(), **about)).ground.all()
+    assert RoadView.from_message(ledger.send_message(book, view.message(), **about)).ground.all()
 
     start, schedule = {"w": np.zeros(300, np.float32)}, Schedule(2, 1, 0.1, 0.1, 3)
     vehicles: dict[str, Trainable] = {f"grid/cav{i}": Walk() for i in range(3)}

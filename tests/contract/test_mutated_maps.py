@@ -16,14 +16,12 @@ from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.importing import import_town
-from flcav.world.opendrive.mending.maps import mend_map
-from flcav.world.opendrive.mending.roads import mend_roads
-from flcav.world.opendrive.mirror import mirror_map
-from flcav.world.opendrive.objects.crosswalks import find_crosswalks
-from flcav.world.opendrive.objects.parking_spaces import find_parking
+from flcav.world.opendrive.mending import mend_map, mend_roads
+from flcav.world.opendrive.netconvert import mirror_map
+from flcav.world.opendrive.objects.crossings import find_crosswalks
 from flcav.world.opendrive.objects.signal_heads import find_heads
-from flcav.world.opendrive.objects.signs import find_posts, find_signs
-from flcav.world.opendrive.objects.standing import find_objects
+from flcav.world.opendrive.objects.signs import find_map_poles, find_signs
+from flcav.world.opendrive.objects.standing import find_parking, find_standing_objects
 from flcav.world.opendrive.objects.stop_lines import find_stop_lines
 
 DATA = Path(__file__).parents[1] / "data"
@@ -71,10 +69,10 @@ def _read_whole(path: Path, place: Place) -> None:
 
 
 def _read_objects(root: ElementTree.Element, place: Place) -> None:
-    for find in (find_signs, find_posts, find_crosswalks):
+    for find in (find_signs, find_map_poles, find_crosswalks):
         find(root, place.offset_m)
     if place.net is not None:
-        for find in (find_heads, find_parking, find_objects, find_stop_lines):
+        for find in (find_heads, find_parking, find_standing_objects, find_stop_lines):
             find(root, place.offset_m, place.net)
 
 

@@ -21,7 +21,7 @@ ALLOWED: Mapping[str, str] = {
     "flcav.config:parse_config": UNCHECKED,
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
-    "flcav.interface.lazy:lazy_names": OWN,
+    "flcav.interface.fields:lazy_names": OWN,
     "flcav.pipeline.engine.run:run_steps": STEPS,
     "flcav.pipeline.engine.step:Step.arguments": STEPS,
     "flcav.pipeline.engine.step:Step.run": STEPS,

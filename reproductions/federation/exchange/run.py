@@ -22,8 +22,8 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.federation.state import RoundDivergence
-from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
-from flcav.network.clock.work import ClientWork, work_of_messages
+from flcav.network.clock.records import ClientWork, work_of_messages
+from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_round
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.pipeline.arms import name_steps
@@ -292,7 +292,7 @@ def _time_round(links: RadioLinks, works: Mapping[str, ClientWork], number: int)
     if not there:
         return None
     start = float(links.time_s[0])
-    timings = time_clients(links, there, number, start, RoundRules())
+    timings = time_round(links, there, number, start, RoundRules())
     return max((timing.end_s - start for timing in timings if not timing.dropped), default=None)
 
 

@@ -29,8 +29,7 @@ from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
 from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
-from flcav.network.messages import pack, send
+from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes, pack_arrays, send_message
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.pipeline.recipe import EDGE, Requests
@@ -158,10 +157,10 @@ def call(fleet: Fleet, seed: int) -> Followed:
         return Followed((fleet.start,), (0,), ())
     for name in asked:
         about = {"position": np.zeros(3, np.float32), "loss": np.array([losses[name]], np.float32)}
-        send(book, pack(about), client=name, **UP)
+        send_message(book, pack_arrays(about), client=name, **UP)
     offers = {name: make_offer(own, fleet.start, seed) for name, own in fleet.train.items()}
     for name, offer in offers.items():
-        send(book, offer.message(), client=name, **UP)
+        send_message(book, offer.message(), client=name, **UP)
     chosen = choose_members(REQUESTS, asked, weigh_offers(offers), {})
     return follow(fleet, seed, book, chosen.members, asked=asked)
 
@@ -170,7 +169,7 @@ def follow(
     fleet: Fleet, seed: int, book: Ledger, members: Sequence[str], rules: Rules = EVERYBODY, asked: Sequence[str] = ()
 ) -> Followed:
     """Return the rounds of the `members`; a group, of which some `asked`, dissolves when its loss has levelled off."""
-    kept, told = [fleet.start], pack({"loss": np.zeros(1, np.float32)})
+    kept, told = [fleet.start], pack_arrays({"loss": np.zeros(1, np.float32)})
     held = [fleet.held[name] for name in members]
     losses = [float(np.mean([measure_losses(fleet.start, own).mean() for own in held]))]
 
@@ -179,7 +178,7 @@ def follow(
         if asked:
             losses.append(float(np.mean([measure_losses(weights, own).mean() for own in held])))
             for name in members:
-                send(book, told, client=name, round_=number, **UP)
+                send_message(book, told, client=name, round_=number, **UP)
             if has_levelled(losses, REQUESTS):
                 raise Levelled
 

@@ -18,7 +18,7 @@ from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.client import client_app
 from flcav.federation.links.in_process import EmbeddedGrid, LinkGrid
 from flcav.federation.links.metered import Account
-from flcav.federation.loop import Schedule, federate
+from flcav.federation.loop import FederationServer, Schedule, federate
 from flcav.federation.privacy import SEEDED, Privacy, account_epsilon, draw_secret
 from flcav.federation.rules import Rules, SecureAggregation
 from flcav.federation.secure.primitives import to_values

@@ -41,9 +41,8 @@ def radio(
     from flcav.config import read_config
     from flcav.dataset.store import Dataset
     from flcav.network.clock.rounds import NetworkSettings
-    from flcav.network.radio.coverage import cover_town
-    from flcav.network.radio.propagation import PathState
-    from flcav.network.radio.recorded import link_scene, summarise_links
+    from flcav.network.radio.budget import PathState
+    from flcav.network.radio.recorded import cover_town, link_scene, summarise_links
     from flcav.storage.files import check_writable, write_bytes
 
     if map_ is not None:
@@ -130,9 +129,8 @@ def rounds(
 
     from flcav.config import read_config
     from flcav.dataset.store import Dataset
-    from flcav.network.clock.records import save_rounds
+    from flcav.network.clock.records import ClientWork, save_rounds
     from flcav.network.clock.rounds import NetworkSettings, simulate_rounds
-    from flcav.network.clock.work import ClientWork
     from flcav.network.radio.recorded import link_scene
     from flcav.storage.files import check_writable, write_bytes
 

@@ -234,8 +234,8 @@ def errors(
     from flcav.perception.objects.task import ObjectsTask
     from flcav.perception.task import Scores
     from flcav.perception.tasks import task_named
-    from flcav.storage.exchange import check_ending
     from flcav.storage.files import check_writable, write_bytes
+    from flcav.storage.records import check_ending
 
     learned = task_named(task)
     if not isinstance(learned, Scores):

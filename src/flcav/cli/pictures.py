@@ -76,7 +76,7 @@ def view(
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
     from flcav.interface import progress
-    from flcav.interface.extras import format_install_command
+    from flcav.interface.wording import format_install_command
     from flcav.storage.files import atomic_path
 
     if find_spec("rerun") is None:

@@ -8,8 +8,8 @@ import numpy as np
 import pyarrow as pa
 
 from flcav.config import InputError, shorten
-from flcav.storage.exchange import read_csv
-from flcav.storage.parquet import read_parquet
+from flcav.storage.files import read_parquet
+from flcav.storage.records import read_csv
 
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 

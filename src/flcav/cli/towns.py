@@ -45,14 +45,14 @@ def show(
     poles' id, x, y, z [m, world], yaw_deg and kind, which `flcav place` reads; recipes take the same ids.
     """
     from flcav.report.pictures.town_map import town_map
-    from flcav.storage.exchange import write_table
     from flcav.storage.files import write_bytes
+    from flcav.storage.records import write_any_table
     from flcav.world.map.census import summarise_town
     from flcav.world.map.town import load_town
 
     loaded = load_town(town)
     if poles is not None:
-        write_table(_poles_table(loaded), poles)
+        write_any_table(_poles_table(loaded), poles)
         echo(f"{poles}: {plural(len(loaded.poles.id), 'candidate pole')} of {loaded.name}")
     if out is not None:
         write_bytes(out, town_map(loaded))

@@ -13,8 +13,7 @@ from flcav.config import Config, InputError, parse_config
 from flcav.dataset.checks.navigation import check_log
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.navigation_log import NavigationLog
-from flcav.storage.files import atomic_path
-from flcav.storage.parquet import read_parquet
+from flcav.storage.files import atomic_path, read_parquet
 
 Sheet = TypeVar("Sheet", bound=Config)
 

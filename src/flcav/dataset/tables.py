@@ -13,7 +13,7 @@ import pyarrow.parquet as pq
 
 from flcav.config import InputError
 from flcav.dataset.layout import FILES, Manifest, table_path
-from flcav.storage.parquet import read_parquet
+from flcav.storage.files import read_parquet
 from flcav.world.weather import Weather
 
 ROWS_PER_GROUP = 65_536

@@ -29,8 +29,8 @@ from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
 from flcav.interface.progress import Report, print_progress
 from flcav.interface.wording import make_printable, plural
-from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Frame
+from flcav.sensors.rig import CalibrationError
 from flcav.storage.files import sha256
 from flcav.world.trace import Trace
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from flcav.geometry import Boxes, heading_vectors, left_vectors
-from flcav.world.map.routes import Route
+from flcav.world.map.roads import Route
 
 Array = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from flcav.driving.corridor import Occupied, find_meeting, find_occupied
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import heading_vectors, rotate
 from flcav.world.commands import Controls
-from flcav.world.dynamics.blueprints import Blueprint
-from flcav.world.map.routes import Route
+from flcav.world.dynamics.vehicle import BodyBlueprint
+from flcav.world.map.roads import Route
 
 Array = NDArray[np.float64]
 
@@ -62,7 +62,7 @@ class Decision:
     emergency: bool
 
 
-def decide(route: Route, own: Motion, seen: Seen, vehicle: Blueprint, settings: Settings = DEFAULT) -> Decision:
+def decide(route: Route, own: Motion, seen: Seen, vehicle: BodyBlueprint, settings: Settings = DEFAULT) -> Decision:
     """Return the controls for the next tenth of a second."""
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
@@ -170,7 +170,7 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: Route, own: Motion, vehicle: Blueprint) -> float:
+def _steer(route: Route, own: Motion, vehicle: BodyBlueprint) -> float:
     """Return the share of the greatest steering angle (pure pursuit)."""
     aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
     ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)

@@ -11,7 +11,7 @@ from flcav.driving.scenarios import DT_S, Scenario, Staged
 from flcav.driving.seen import EGO, Perception
 from flcav.driving.truth import Truth, read_lights
 from flcav.geometry import heading_vectors
-from flcav.world.map.routes import Route
+from flcav.world.map.roads import Route
 from flcav.world.snapshot import Snapshot
 
 LASTS_S = 30.0

@@ -17,7 +17,7 @@ from flcav.driving.driver import Motion
 from flcav.driving.seen import EGO, TIMES_S, Seen
 from flcav.geometry import heading_vectors
 from flcav.storage.records import Record
-from flcav.world.map.routes import Route
+from flcav.world.map.roads import Route
 from flcav.world.snapshot import Collision, Snapshot
 
 Array = NDArray[np.float64]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from flcav.driving.seen import EGO
 from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.geometry import Boxes, concatenate
-from flcav.network.messages import from_names, pack
+from flcav.network.ledger import from_names, pack_arrays
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import link_vehicles, unit_positions
 from flcav.perception.objects.predict import detect
@@ -104,7 +104,7 @@ def pack_tracks(tracked: Tracked) -> bytes:
     """Return the message of a pole's tracks to vehicles: boxes, variances, classes, scores and velocities."""
     boxes = tracked.boxes
     arrays = {"boxes": boxes.array(), "category": from_names(boxes.label.tolist()), "velocity": tracked.velocity}
-    return pack({**arrays, "score": np.asarray(boxes.score), "variance": np.asarray(boxes.variance)})
+    return pack_arrays({**arrays, "score": np.asarray(boxes.score), "variance": np.asarray(boxes.variance)})
 
 
 def learn_pole_background(town: Town, pole: str, seed: int) -> Background:

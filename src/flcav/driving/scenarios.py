@@ -16,8 +16,7 @@ from flcav.geometry import heading_vectors, left_vectors
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.commands import Controls, Drive, Remove, Spawn, Walk
 from flcav.world.live import LiveWorld, Settings
-from flcav.world.map.roads import read_net
-from flcav.world.map.routes import Route, draw_route
+from flcav.world.map.roads import Route, draw_route, read_net
 from flcav.world.map.town import TOWNS, Town, load_town
 
 Event = Literal["none", "walker", "stalled", "braking"]

@@ -3,7 +3,7 @@
 import os
 from typing import TYPE_CHECKING
 
-from flcav.interface.lazy import lazy_names
+from flcav.interface.fields import lazy_names
 
 os.environ.setdefault("FLWR_TELEMETRY_ENABLED", "0")  # read when Flower is imported
 

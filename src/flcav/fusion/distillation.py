@@ -29,7 +29,7 @@ from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
 from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
@@ -66,12 +66,12 @@ class Guidance:
 
     def message(self) -> bytes:
         """Return it as the message to the vehicle."""
-        return pack({"pose": self.world_from_agent, "confirmed": self.confirmed, **_pack_boxes(self.boxes)})
+        return pack_arrays({"pose": self.world_from_agent, "confirmed": self.confirmed, **_pack_boxes(self.boxes)})
 
     @classmethod
     def from_message(cls, message: bytes) -> "Guidance":
         """Return what is in a message: the inverse of `message` up to single precision."""
-        arrays = unpack(message)
+        arrays = unpack_arrays(message)
         return cls(_unpack_boxes(arrays), arrays["confirmed"], arrays["pose"])
 
 
@@ -81,12 +81,12 @@ def pack_sighting(seen: Sighting) -> bytes:
     assert known is not None  # vehicles alone send messages: road sensors are wired
     about = {"time_s": np.array(seen.time_s), "accuracy": np.array((known.position_m, known.heading_rad))}
     posts = seen.posts.astype(np.float32)
-    return pack({**about, "pose": seen.world_from_agent, "posts": posts, **_pack_boxes(seen.boxes)})
+    return pack_arrays({**about, "pose": seen.world_from_agent, "posts": posts, **_pack_boxes(seen.boxes)})
 
 
 def unpack_sighting(agent: str, message: bytes) -> Sighting:
     """Return the sighting in a message of `agent`: the inverse of `pack_sighting` up to single precision."""
-    arrays = unpack(message)
+    arrays = unpack_arrays(message)
     posts, known = arrays["posts"].astype(np.float64), Navigation(*arrays["accuracy"].tolist())
     return Sighting(agent, float(arrays["time_s"]), arrays["pose"], _unpack_boxes(arrays), posts, known)
 

@@ -18,7 +18,7 @@ from flcav.fusion.average import YAW, RoadAverage, average_boxes, variance_of
 from flcav.fusion.clocks import set_clocks
 from flcav.fusion.sightings import Navigation, Sighting, tell
 from flcav.geometry import pose, transform_points, wrap_angle, yaw_of
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 
 Array = NDArray[np.float64]
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
 from flcav.geometry import Boxes, transform_points
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.sensors.frame import Frame
 from flcav.world.map.relief import Relief
 
@@ -52,12 +52,12 @@ class RoadView:
             "ground": np.packbits(self.ground),
             "occupied": np.packbits(self.occupied),
         }
-        return pack(arrays)
+        return pack_arrays(arrays)
 
     @classmethod
     def from_message(cls, message: bytes) -> "RoadView":
         """Return the view in a message: the inverse of `message`."""
-        arrays = unpack(message)
+        arrays = unpack_arrays(message)
         x, y = arrays["shape"].tolist()
         ground, occupied = (
             np.unpackbits(arrays[name], count=x * y).reshape(x, y).astype(bool) for name in ("ground", "occupied")

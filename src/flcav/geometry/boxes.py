@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flcav.arrays import Array, Array32, Ints, Mask, Words
 from flcav.geometry.poses import (
-    Array,
     angles_of,
     heading_vectors,
     inverse,
@@ -39,7 +39,7 @@ class Boxes:
     center: Array  # (N, 3) geometric centre x, y, z [m]
     size: Array  # (N, 3) length along x, width along y, height along z of the box's own frame [m]
     yaw: Array  # (N,) heading, counter-clockwise from the frame's x axis [rad]
-    label: NDArray[np.str_]  # (N,) class name
+    label: Words  # (N,) class name
     score: Array | None = None  # (N,) confidence in [0, 1]
     variance: Array | None = None  # (N, 7) of x, y, z [m^2], length, width, height [m^2], yaw [rad^2]
     tilt: Array | None = None  # (N, 2) pitch and roll [rad], as in `pose`; None: upright
@@ -140,7 +140,7 @@ class Boxes:
         return np.stack((x, y, local[..., 2]), axis=-1) + self.center[:, None]
 
 
-def turned_boxes(center: Array, size: Array, rotation: Array, label: NDArray[np.str_]) -> Boxes:
+def turned_boxes(center: Array, size: Array, rotation: Array, label: Words) -> Boxes:
     """Return boxes by their rotations: upright where none leans by more than `LEVEL_RAD`.
 
     Args:
@@ -163,7 +163,7 @@ def spread_over_footprints(boxes: Boxes, along: int, across: int) -> Array:
     return boxes.center[:, None, :2] + reach[..., :1] * forward + reach[..., 1:] * left
 
 
-def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> NDArray[np.bool_]:
+def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> Mask:
     """Return (N, P) whether each of P points lies in each of N boxes, enlarged by `margin_m` on every side.
 
     `points` is (P, >= 3), x, y, z [m] first, in the frame of the boxes. Faces count as inside.
@@ -181,7 +181,7 @@ def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> N
     return inside
 
 
-def count_points_in_boxes(points: NDArray[np.float32], boxes: Boxes, boxes_from_points: Array) -> NDArray[np.int64]:
+def count_points_in_boxes(points: Array32, boxes: Boxes, boxes_from_points: Array) -> Ints:
     """Return (N,) the number of P points (P, >= 3), x, y, z [m], in each of N boxes; faces count as inside.
 
     `boxes_from_points` is (4, 4). As `points_in_boxes`, for large clouds: only points near a box are transformed.
@@ -212,7 +212,7 @@ def _turn_back(offset: Array, yaw: ArrayLike) -> Array:
     return np.stack((dx * cos + dy * sin, dy * cos - dx * sin, dz), axis=1)
 
 
-def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> NDArray[np.bool_]:
+def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> Mask:
     """Return (S, N) whether each of S segments meets each of N boxes, by slabs (Kay and Kajiya, SIGGRAPH 1986).
 
     `starts` and `ends` are (S, 3), x, y, z [m] in the frame of the boxes. Faces belong to the box.

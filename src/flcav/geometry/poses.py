@@ -10,7 +10,8 @@ from typing import TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-Array = NDArray[np.float64]
+from flcav.arrays import Array
+
 Coordinate = TypeVar("Coordinate", float, Array)
 
 
@@ -27,14 +28,7 @@ def pose(x: float, y: float, z: float = 0.0, yaw: float = 0.0, pitch: float = 0.
         pitch: inclination; positive turns the nose down [rad] (right-hand rule about the left axis).
         roll: bank; positive turns the right side down [rad].
     """
-    cy, sy, cp, sp, cr, sr = (
-        np.cos(yaw),
-        np.sin(yaw),
-        np.cos(pitch),
-        np.sin(pitch),
-        np.cos(roll),
-        np.sin(roll),
-    )
+    cy, sy, cp, sp, cr, sr = (np.cos(yaw), np.sin(yaw), np.cos(pitch), np.sin(pitch), np.cos(roll), np.sin(roll))
     return np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr, x],

@@ -1,8 +1,14 @@
-"""Wording of messages: names that were probably meant, numbers without their units, plurals of counts."""
+"""Wording of messages: names that were probably meant, numbers without their units, plurals of counts.
+
+Optional dependencies: the packages of flcav's extras and the command that installs them.
+"""
 
 import re
+import shlex
+import sys
 from collections.abc import Iterable, Mapping
 from difflib import get_close_matches
+from importlib.metadata import requires
 
 AMOUNT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z%/]+)\s*")
 UNITS: Mapping[str, Mapping[str, float]] = {  # by the ending of a field's name: what one of a unit is in its own
@@ -76,3 +82,11 @@ def _unit_of(part: str) -> bool:
 def hint_share(value: float) -> str:
     """Return "; 55 % is 0.55" of a value that is too large for a share, and may be a percentage; "" of others."""
     return f"; {value:g} % is {value / 100:g}" if 1 < value <= 100 else ""
+
+
+def format_install_command(extra: str) -> str:
+    """Return the pip command that installs the packages of `extra`, as flcav's metadata list them, for this Python."""
+    lines = (line.partition(";") for line in requires("flcav") or ())
+    wanted = f"extra == '{extra}'"  # a build back end may write either quotes
+    packages = [package.strip() for package, _, condition in lines if wanted in condition.replace('"', "'")]
+    return shlex.join([sys.executable, "-m", "pip", "install", *packages])

@@ -27,7 +27,7 @@ except ImportError:  # Windows
 
 LOCK = ".lock"
 ATTEMPTS = 100  # to lock a file that its holder does not remove meanwhile
-COMMAND = 200  # most characters of a command that are told
+COMMAND = 200  # longest command in a message, in characters
 
 _mine: ContextVar[frozenset[Path]] = ContextVar("_mine", default=frozenset())  # locks that this thread holds
 _files: set[int] = set()  # open files of the locks that this process holds
@@ -61,8 +61,8 @@ def only_writer(path: Path) -> Iterator[None]:
 
 
 @contextlib.contextmanager
-def take_turns(what: str) -> Iterator[None]:
-    """Hold what is called `what` (letters, digits, dashes) within the context; others on this machine wait for it."""
+def wait_for_turn(what: str) -> Iterator[None]:
+    """Hold the machine-wide lock named `what` (letters, digits, dashes) within the context; other processes wait."""
     with (Path(tempfile.gettempdir()) / f"flcav-{what}{LOCK}").open("a") as file:
         if fcntl is not None:
             fcntl.flock(file, fcntl.LOCK_EX)
@@ -92,7 +92,7 @@ def _open_locked(lock: Path, path: Path) -> int:
         _lock(file, path)
         if not os.path.samestat(os.fstat(file), lock.stat()):
             raise FileNotFoundError(lock)
-        with contextlib.suppress(OSError):  # a full disk is the writer's to tell
+        with contextlib.suppress(OSError):  # the writer itself reports a full disk
             os.ftruncate(file, 0)
             os.write(file, _describe_process().encode())
     except BaseException:

@@ -2,19 +2,23 @@
 
 from typing import TYPE_CHECKING
 
-from flcav.interface.lazy import lazy_names
+from flcav.interface.fields import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.network.clock.records import ClientTiming, RoundTiming, load_rounds, save_rounds
+    from flcav.network.clock.records import (
+        ClientTiming,
+        ClientWork,
+        RoundTiming,
+        load_rounds,
+        save_rounds,
+        work_of_messages,
+    )
     from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds
-    from flcav.network.clock.work import ClientWork, work_of_messages
     from flcav.network.ledger import BudgetExceeded, Ledger, LedgerEntry, LinkMegabytes
     from flcav.network.plan import MessageSizes, StagePlan, price
     from flcav.network.radio.budget import Radio
-    from flcav.network.radio.coverage import Coverage, cover_town
-    from flcav.network.radio.links import RadioLinks, link_vehicles
-    from flcav.network.radio.recorded import RecordedScene, link_scene
-    from flcav.network.radio.wireline import Wireline
+    from flcav.network.radio.links import RadioLinks, Wireline, link_vehicles
+    from flcav.network.radio.recorded import Coverage, RecordedScene, cover_town, link_scene
 
 PLACES = {
     "LinkMegabytes": "flcav.network.ledger",
@@ -29,11 +33,11 @@ PLACES = {
     "link_vehicles": "flcav.network.radio.links",
     "RecordedScene": "flcav.network.radio.recorded",
     "link_scene": "flcav.network.radio.recorded",
-    "Coverage": "flcav.network.radio.coverage",
-    "cover_town": "flcav.network.radio.coverage",
-    "Wireline": "flcav.network.radio.wireline",
-    "ClientWork": "flcav.network.clock.work",
-    "work_of_messages": "flcav.network.clock.work",
+    "Coverage": "flcav.network.radio.recorded",
+    "cover_town": "flcav.network.radio.recorded",
+    "Wireline": "flcav.network.radio.links",
+    "ClientWork": "flcav.network.clock.records",
+    "work_of_messages": "flcav.network.clock.records",
     "NetworkSettings": "flcav.network.clock.rounds",
     "RoundRules": "flcav.network.clock.rounds",
     "simulate_rounds": "flcav.network.clock.rounds",

@@ -1,32 +1,30 @@
-"""Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces."""
+"""Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces.
+
+Messages on a link: arrays as bytes and back, and sending them through a ledger.
+
+A message is a safetensors file: names, types and shapes of its arrays in JSON, then their values; nothing is unpickled.
+"""
 
 import json
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Literal, get_args
 
+import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
+from safetensors.numpy import load, save
 
+from flcav.arrays import Bytes, Words
 from flcav.config import InputError
-from flcav.storage.parquet import read_parquet, write_parquet
+from flcav.storage.files import read_parquet, write_parquet
 
 Link = Literal["wireless", "wireline"]
 Direction = Literal["up", "down"]
 
 LINKS: tuple[Link, ...] = get_args(Link)
 BYTES_PER_MB = 1_000_000
-_SCHEMA = pa.schema(
-    [
-        ("stage", pa.string()),
-        ("task", pa.string()),
-        ("link", pa.string()),
-        ("direction", pa.string()),
-        ("round", pa.int64()),
-        ("client", pa.string()),
-        ("bytes", pa.int64()),
-    ]
-)
 
 
 class BudgetExceeded(InputError):
@@ -57,7 +55,7 @@ class LedgerEntry:
     link: Link
     direction: Direction  # up: towards the cloud; only this counts against a budget
     round: int  # within its stage, from 1; 0 where a stage has no rounds
-    client: str  # who sent it (up) or received it (down), e.g. "grid/cav0"
+    client: str  # sender (up) or receiver (down), e.g. "grid/cav0"
     bytes: int  # serialised size
 
     def __post_init__(self) -> None:
@@ -67,6 +65,9 @@ class LedgerEntry:
             raise ValueError(f"LedgerEntry.direction = {self.direction!r}, expected one of {get_args(Direction)}")
         if self.bytes < 0:
             raise ValueError(f"LedgerEntry.bytes = {self.bytes}, expected at least 0")
+
+
+_SCHEMA = pa.schema([(each.name, pa.int64() if each.type is int else pa.string()) for each in fields(LedgerEntry)])
 
 
 class Ledger:
@@ -170,3 +171,50 @@ class Ledger:
 
 def _mb(count: int) -> str:
     return f"{count / BYTES_PER_MB:.6g}"
+
+
+Arrays = Mapping[str, NDArray]  # by name
+
+
+def pack_arrays(arrays: Arrays) -> bytes:
+    """Return arrays of numbers or truth values as a message."""
+    return save({name: np.asarray(array, order="C") for name, array in arrays.items()})
+
+
+def unpack_arrays(message: bytes) -> dict[str, NDArray]:
+    """Return the arrays of a message: the inverse of `pack_arrays`, but for their order."""
+    return load(message)
+
+
+def from_names(names: Iterable[str]) -> Bytes:
+    """Return names without line breaks as an array for a message: UTF-8, each ends with a line break."""
+    return np.frombuffer(bytearray("".join(f"{name}\n" for name in names), "utf-8"), dtype=np.uint8)
+
+
+def to_names(array: Bytes) -> Words:
+    """Return the names (N,) in an array of a message: the inverse of `from_names`."""
+    return np.array(array.tobytes().decode("utf-8").split("\n")[:-1], dtype=np.str_)
+
+
+def carry(message: bytes) -> bytes:
+    """Return a message as it is received at the other end of its link: in a simulation, the same bytes."""
+    return message
+
+
+def send_message(
+    book: Ledger,
+    message: bytes,
+    *,
+    stage: str,
+    task: str,
+    link: Link,
+    direction: Direction,
+    client: str,
+    round_: int = 0,
+) -> bytes:
+    """Send a message of a client, up, or to it, down; return its bytes as they are received.
+
+    It is entered in the ledger first, see `LedgerEntry`. Raises `BudgetExceeded`, and then nothing is sent.
+    """
+    book.enter(LedgerEntry(stage, task, link, direction, round_, client, len(message)))
+    return carry(message)

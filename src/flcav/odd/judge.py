@@ -18,8 +18,7 @@ from flcav.interface.wording import plural
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements
 from flcav.statistics.estimates import Estimate, score_interval
-from flcav.storage.exchange import write_table
-from flcav.storage.records import Record
+from flcav.storage.records import Record, write_any_table
 
 INSIDE, OUTSIDE, UNKNOWN = "inside", "outside", "unknown"
 
@@ -78,7 +77,7 @@ def describe_agreement(agreement: Agreement) -> list[str]:
 def write_verdicts(data: Dataset, truth: Verdicts, seen: Verdicts | None, path: Path) -> None:
     """Write a table, CSV or Parquet: frame, verdict, and the perceived verdict where there is one."""
     columns = {"frame": [data.name(i) for i in truth.frames], "verdict": truth.verdict.tolist()}
-    write_table(pa.table(columns if seen is None else columns | {"perceived": seen.verdict.tolist()}), path)
+    write_any_table(pa.table(columns if seen is None else columns | {"perceived": seen.verdict.tolist()}), path)
 
 
 def judge_values(domain: Domain, measured: Mapping[str, Value]) -> str:

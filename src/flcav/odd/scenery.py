@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 from shapely.geometry.base import BaseGeometry
 
-from flcav.world.map.roads import Connection, RoadNet, read_net
+from flcav.world.map.roads import LaneConnection, RoadNet, read_net
 from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
@@ -187,7 +187,7 @@ def _outline(net: RoadNet, name: str) -> BaseGeometry:
 def count_conflicts(net: RoadNet) -> Counter[str]:
     """Return the conflict points of vehicles at each junction: where paths diverge, merge and cross."""
     driving = {lane.id: (edge, lane) for edge in net.edges.values() for lane in edge.lanes_of("driving")}
-    ways: dict[str, list[Connection]] = {}
+    ways: dict[str, list[LaneConnection]] = {}
     for way in net.connections:
         if way.start in driving and way.end in driving and way.turn != "t":
             edge, _ = driving[way.start]
@@ -206,7 +206,7 @@ def count_conflicts(net: RoadNet) -> Counter[str]:
     return found
 
 
-def _path(way: Connection, driving: dict[str, tuple], onward: dict[tuple[str, str], str]) -> LineString:
+def _path(way: LaneConnection, driving: dict[str, tuple], onward: dict[tuple[str, str], str]) -> LineString:
     """Return the line through a junction, from the end of a lane to the start of another."""
     points = [driving[way.start][1].shape[-1:]]
     via, seen = way.via, set[str]()

@@ -13,7 +13,7 @@ from torch import nn
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
 from flcav.machine.threads import use_threads
-from flcav.network.messages import from_names, pack
+from flcav.network.ledger import from_names, pack_arrays
 from flcav.perception.images import pack_pictures
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task, find_configuration
 from flcav.perception.training import train_steps
@@ -90,7 +90,7 @@ def pack_frame(data: Dataset, i: int) -> bytes:
     frame = data.frame(i)
     boxes = frame.annotations.boxes
     labels = {"boxes": boxes.array(), "boxes.label": from_names(boxes.label.tolist())}
-    return pack(
+    return pack_arrays(
         {**{f"lidar.{name}": points for name, points in frame.lidar.items()}, **pack_pictures(data, i), **labels}
     )
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.messages import from_names, pack, to_names, unpack
-from flcav.storage.exchange import write_table
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
+from flcav.storage.records import write_any_table
 
 if TYPE_CHECKING:
     from torch import nn
@@ -139,7 +139,7 @@ def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
     schema = pa.schema([(name, kinds[kind]) for name, kind in PerceptionError.__annotations__.items()])
     table = pa.Table.from_pylist([asdict(error) for error in errors], schema=schema)
     table = table.rename_columns([CLASS if name == "label" else name for name in table.column_names])
-    write_table(table, path)
+    write_any_table(table, path)
 
 
 def load_errors(path: Path) -> tuple[PerceptionError, ...]:
@@ -154,12 +154,12 @@ def pack_errors(errors: Sequence[PerceptionError]) -> bytes:
     for name, kind in PerceptionError.__annotations__.items():
         values = [getattr(error, name) for error in errors]
         arrays[name] = from_names(values) if kind is str else np.array(values, dtype=kind)
-    return pack(arrays)
+    return pack_arrays(arrays)
 
 
 def unpack_errors(message: bytes) -> tuple[PerceptionError, ...]:
     """Return the mistakes in a message: the inverse of `pack_errors`."""
-    arrays, kinds = unpack(message), PerceptionError.__annotations__
+    arrays, kinds = unpack_arrays(message), PerceptionError.__annotations__
     columns = ((to_names(arrays[name]) if kind is str else arrays[name]).tolist() for name, kind in kinds.items())
     return tuple(PerceptionError(*row) for row in zip(*columns, strict=True))
 

@@ -20,7 +20,7 @@ from flcav.dataset.payloads import open_image
 from flcav.dataset.store import Dataset
 from flcav.dataset.upright import turn_upright
 from flcav.geometry import inverse, transform_points
-from flcav.network.messages import from_names, to_names
+from flcav.network.ledger import from_names, to_names
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import project_points
 

@@ -40,7 +40,7 @@ from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import FrameTruth, level_mount
 from flcav.perception.ops.rotated import iou
 from flcav.perception.task import Evaluated, KnownLidar
-from flcav.sensors.labels.outlines import BOX_EDGES, NEAR_M, clip_in_front
+from flcav.sensors.views import BOX_EDGES, NEAR_M, clip_in_front
 from flcav.storage.records import LEFT_OUT, Class
 
 Array = NDArray[np.float64]

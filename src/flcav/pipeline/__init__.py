@@ -2,7 +2,7 @@
 
 from typing import TYPE_CHECKING
 
-from flcav.interface.lazy import lazy_names
+from flcav.interface.fields import lazy_names
 
 if TYPE_CHECKING:
     from flcav.pipeline.comparing import Compared, compare

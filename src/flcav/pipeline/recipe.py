@@ -18,7 +18,7 @@ from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
 from flcav.pipeline.lifelong import Lifelong
-from flcav.sensors.calibration import CalibrationError
+from flcav.sensors.rig import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
 from flcav.world.map.parameters import RareKinds

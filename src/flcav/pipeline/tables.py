@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 
 from flcav.config import InputError, read_file, shorten
 from flcav.pipeline.recipe import find_path
-from flcav.storage.exchange import read_csv
 from flcav.storage.files import atomic_path
+from flcav.storage.records import read_csv
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance

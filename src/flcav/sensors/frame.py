@@ -10,10 +10,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Bytes, Ints, Words
 from flcav.geometry import Boxes
 from flcav.world.weather import Weather
-
-Array = NDArray[np.float64]
 
 UNKNOWN_PIXELS = -1  # in `Views.pixels`
 LONGEST_NAME = 100  # characters of a frame's key, and of the names in it: parts of file names
@@ -65,9 +64,9 @@ class Calibration:
 class CameraImage:
     """A colour image, with depth, semantic and instance ground truth of each of its (H, W) pixels; None: unknown."""
 
-    rgb: NDArray[np.uint8]  # (H, W, 3) sRGB
-    depth_m: NDArray[np.float32] | None = None  # (H, W) z in the optical frame; inf for the sky
-    semantic: NDArray[np.uint8] | None = None  # (H, W) class: one of SEMANTICS
+    rgb: Bytes  # (H, W, 3) sRGB
+    depth_m: Array32 | None = None  # (H, W) z in the optical frame; inf for the sky
+    semantic: Bytes | None = None  # (H, W) class: one of SEMANTICS
     instance: NDArray[np.uint16] | None = None
     # (H, W) 1 + row of the frame's annotations, 0 where there is no annotated actor
 
@@ -78,7 +77,7 @@ class Views:
 
     amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN where it does not touch it
     visible_box: Array  # (M, 4) around its visible pixels, to their outer edges; NaN where there are none
-    pixels: NDArray[np.int64]  # (M,) number of visible pixels; UNKNOWN_PIXELS where an imported dataset does not say
+    pixels: Ints  # (M,) number of visible pixels; UNKNOWN_PIXELS where an imported dataset does not say
     truncation: Array  # (M,) share of the amodal box that lies outside the image, 0 to 1
     occlusion: Array
     # (M,) 1 - visible pixels / pixels in a world without other objects; 1 where none is visible, NaN where unknown
@@ -93,12 +92,12 @@ class Views:
 class SignViews:
     """Image annotations of K traffic signs and signal heads whose front one camera shows; pixels as in `Views`."""
 
-    kind: NDArray[np.str_]  # (K,) class: see `flcav.world.static.SignsAndSignals`
-    state: NDArray[np.str_]  # (K,) of a signal: "red", "red_amber", "amber", "green", "off"; of a sign ""
+    kind: Words  # (K,) class: see `flcav.world.static.SignsAndSignals`
+    state: Words  # (K,) of a signal: "red", "red_amber", "amber", "green", "off"; of a sign ""
     box: Array  # (K, 4) x1 y1 x2 y2 around its visible pixels, to their outer edges
-    pixels: NDArray[np.int64]  # (K,) number of visible pixels
+    pixels: Ints  # (K,) number of visible pixels
     distance_m: Array  # (K,) from the camera
-    thing: NDArray[np.int64]  # (K,) index into the town's signs and signal heads, the same in all scenes
+    thing: Ints  # (K,) index into the town's signs and signal heads, the same in all scenes
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -118,13 +117,13 @@ class Annotations:
     what their format labels; velocity, acceleration and occlusion are NaN where it does not say.
     """
 
-    track: NDArray[np.str_]  # (M,) track ids, the same in all frames of a scene
+    track: Words  # (M,) track ids, the same in all frames of a scene
     boxes: Boxes  # (M,) world frame, at the LiDAR spin; label = actor category (car, van, truck, ...)
     velocity: Array  # (M, 3) world [m/s]
     acceleration: Array  # (M, 3) world [m/s^2]
-    returns: NDArray[np.int64]  # (M,) LiDAR returns from the actor in this frame, all LiDARs together
+    returns: Ints  # (M,) LiDAR returns from the actor in this frame, all LiDARs together
     occlusion: Array  # (M,) for the LiDARs: 1 - visible rays / unoccluded rays; 1 where none is visible
-    points: Mapping[str, NDArray[np.int64]] = field(default_factory=dict)  # LiDAR or radar -> (M,) points from it
+    points: Mapping[str, Ints] = field(default_factory=dict)  # LiDAR or radar -> (M,) points from it
     views: Mapping[str, Views] = field(default_factory=dict)  # colour or thermal camera -> actors in it
     signs: Mapping[str, SignViews] = field(default_factory=dict)  # camera -> signs and signal heads in it
 
@@ -151,15 +150,15 @@ class Frame:
     world_from_agent: Array  # (4, 4) at the spin
     calibration: Calibration  # the true one
     assumed: Calibration  # the one that the agent works with
-    lidar: Mapping[str, NDArray[np.float32]]  # LiDAR name -> (N, 4) x, y, z [m], intensity [0, 1]; sensor frame
+    lidar: Mapping[str, Array32]  # LiDAR name -> (N, 4) x, y, z [m], intensity [0, 1]; sensor frame
     annotations: Annotations
-    point_times: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    point_times: Mapping[str, Array32] = field(default_factory=dict)
     # LiDAR with a rolling spin -> (N,) time of each point [s] after `time_s`; a point is given in the sensor's frame at
     # that time: see `flcav.sensors.lidar.rolling`. Of an imported dataset it is in the sensor's frame at `time_s`, its
     # motion compensated
     images: Mapping[str, CameraImage] = field(default_factory=dict)
     infrared: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)  # (H, W) apparent temperature [0.01 K]
-    radar: Mapping[str, NDArray[np.float32]] = field(default_factory=dict)
+    radar: Mapping[str, Array32] = field(default_factory=dict)
     # (N, 5) range [m], azimuth, elevation [rad], Doppler [m/s, + receding], radar cross-section [dBsm]
     gnss: Mapping[str, Array] = field(default_factory=dict)  # (3,) latitude, longitude [degrees], altitude [m]
     imu: Mapping[str, Array] = field(default_factory=dict)  # (6,) specific force [m/s^2], angular rate [rad/s]

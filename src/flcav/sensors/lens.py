@@ -10,12 +10,11 @@ is at (0, 0), as in OpenCV. With a = x / z, b = y / z and r^2 = a^2 + b^2 (Brown
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
+from flcav.arrays import Array, Array32
 from flcav.config import Config
-
-Array = NDArray[np.float64]
 
 BODY_FROM_OPTICAL: Array = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # rotation of axes
 NEWTON_STEPS = 12  # by which the distortion is inverted
@@ -59,13 +58,13 @@ class Lens(Config):
         return np.array([self.k1, self.k2, self.p1, self.p2, self.k3])
 
 
-def project(lens: Lens, points: ArrayLike) -> Array:
+def project_optical(lens: Lens, points: ArrayLike) -> Array:
     """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those with z <= 0."""
     return project_points(lens.intrinsics(), lens.distortion(), points)
 
 
 def project_points(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
-    """Return pixels as `project` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
+    """Return pixels as `project_optical` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
     fx, fy, cx, cy = _focus(intrinsics)
@@ -80,16 +79,14 @@ def unproject(lens: Lens, pixels: ArrayLike) -> Array:
     return unproject_pixels(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
 
-def compute_pixel_rays(lens: Lens) -> NDArray[np.float32]:
+def compute_pixel_rays(lens: Lens) -> Array32:
     """Return the viewing rays of the pixels' centres: (height * width, 3) unit vectors, optical frame; read-only."""
     intrinsics, distortion = lens.intrinsics().ravel().tolist(), lens.distortion().tolist()
     return _directions(lens.width, lens.height, tuple(intrinsics), tuple(distortion))
 
 
 @lru_cache(maxsize=16)
-def _directions(
-    width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]
-) -> NDArray[np.float32]:
+def _directions(width: int, height: int, intrinsics: tuple[float, ...], distortion: tuple[float, ...]) -> Array32:
     v, u = np.mgrid[:height, :width]
     pixels = np.stack((u.ravel(), v.ravel()), axis=1).astype(np.float64)
     plane = unproject_pixels(np.reshape(intrinsics, (3, 3)), np.array(distortion), pixels)

@@ -9,14 +9,13 @@ walk, as on data sheets (IEEE 952).
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
+from flcav.arrays import Array
 from flcav.config import Config
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.scene import Scene
-
-Array = NDArray[np.float64]
 
 STEP_S = 0.1  # of the grid on which biases are simulated
 GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]

@@ -9,8 +9,8 @@ Biases are those of the sensors' samples in frames, white noise is drawn for the
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Mask
 from flcav.geometry import rotations
 from flcav.sensors.navigation import GRAVITY, Gnss, Imu, draw_fix_errors, draw_imu_errors
 from flcav.sensors.rig import Rig
@@ -18,8 +18,6 @@ from flcav.statistics.streams import stream
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.parameters import GeoReference
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 GNSS_HZ = 10.0  # rate of fixes
 SLACK_S = 1e-6  # of times that are compared
@@ -41,21 +39,21 @@ class NavigationLog:
 
     @property
     def begin_s(self) -> float:
-        """Return from when on both sensors measure [s]."""
+        """Return the time from which both sensors measure [s]."""
         return float(max(self.fix_time_s[0], self.imu_time_s[0]))
 
     @property
     def end_s(self) -> float:
-        """Return until when the IMU measures [s]."""
+        """Return the time of the last sample of the IMU [s]."""
         return float(self.imu_time_s[-1])
 
-    def covers(self, times_s: Array) -> NDArray[np.bool_]:
+    def covers(self, times_s: Array) -> Mask:
         """Return (T,) whether the times [s] are within the log, to a microsecond."""
         return (times_s >= self.begin_s - SLACK_S) & (times_s <= self.end_s + SLACK_S)
 
 
 def log_drive(drives: Trace, agent: str, rig: Rig, geo: GeoReference, *, scene: str, seed: int) -> NavigationLog | None:
-    """Return the navigation log of the vehicle `agent` over its drive, from when it is under way for good.
+    """Return the navigation log of the vehicle `agent` over its drive, from the time after which it is always present.
 
     drives: its poses at every step of the traffic. geo: position of the town's origin. None where the rig lacks a GNSS
     receiver or an IMU, or the drive takes less than `LEAST_STEPS` steps.

@@ -4,20 +4,19 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints32, Mask
 from flcav.config import InputError
 from flcav.geometry import pose
-from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
-from flcav.sensors.camera.camera import photograph
-from flcav.sensors.camera.infrared import render_thermal
-from flcav.sensors.frame import Array, Calibration, CameraImage, Frame
-from flcav.sensors.labels.annotate import InstanceImage, Sweep, annotate
+from flcav.sensors.camera import photograph
+from flcav.sensors.frame import Calibration, CameraImage, Frame
+from flcav.sensors.ground_truth import InstanceImage, LidarSweep, annotate_frame
+from flcav.sensors.infrared import render_thermal
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, point_times_s, scan
 from flcav.sensors.navigation import measure_inertia, measure_position
-from flcav.sensors.radar.radar import sweep_radar
-from flcav.sensors.rig import CAMERA_RANGE_M, Rig
+from flcav.sensors.radar import sweep_radar
+from flcav.sensors.rig import CAMERA_RANGE_M, CalibrationError, Rig, build_calibration, perturb_calibration
 from flcav.statistics.streams import stream
 from flcav.world.scene import Scene
 from flcav.world.weather import WEATHERS, Weather
@@ -40,7 +39,7 @@ def observe(
 ) -> Frame:
     """Return the frame of `agent` ("cav0", "pole3") with `rig` at instant `index` of the scene's traffic run.
 
-    Its own index is `number`, by default `index`: of a live world, whose traces have one instant, that of the step.
+    The frame's index is `number`, by default `index`; in a live world, whose traces have one instant, the step.
     Moves `scene` there. The same arguments give the same bytes, whatever was observed before: each sensor has a random
     stream of its own, named by `seed`, scene, number, agent and sensor, so that it does not depend on the rig's other
     sensors. `error` changes the frame's assumed calibration alone.
@@ -80,7 +79,7 @@ def observe(
         )
 
     scene.move_to(index)
-    annotations, actors = annotate(
+    annotations, actors = annotate_frame(
         scene, carrier.own, within=_within_range(carrier, rig), sweeps=sweeps, sights=sights, echoes=echoes
     )
     row = np.zeros(len(scene.trace.actor) + 1, np.uint16)
@@ -183,23 +182,23 @@ def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
 
 def _sweep(
     carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
-) -> tuple[NDArray[np.float32], Sweep]:
+) -> tuple[Array32, LidarSweep]:
     """Return the points (N, 4) of a LiDAR, and its rays and counts for the ground truth."""
     scene, world_from_sensor = carrier.scene, carrier.go_to(name)
     points, actor, passes, hits = scan(scene, world_from_sensor, lidar, rng, carrier.own, weather)
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
     visible = np.bincount(hits.instance + 1, minlength=count + 2)[2:]  # without misses (-1) and the town (0)
-    return points, Sweep(lidar, world_from_sensor, passes, hits.distance, hits.instance, returns, visible)
+    return points, LidarSweep(lidar, world_from_sensor, passes, hits.distance, hits.instance, returns, visible)
 
 
-def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> NDArray[np.int32]:
+def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> Ints32:
     """Return an instance image (H, W) by one ray for each pixel: a + 1 at the trace's actor a, else 0."""
     hits = carrier.scene.cast(world_from_camera, compute_pixel_rays(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
 
-def _within_range(carrier: _Carrier, rig: Rig) -> NDArray[np.bool_]:
+def _within_range(carrier: _Carrier, rig: Rig) -> Mask:
     """Return (A,) whether each actor is present and the centre of its box within the range of any LiDAR.
 
     Where the rig has no LiDAR: within CAMERA_RANGE_M of any camera.

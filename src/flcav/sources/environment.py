@@ -23,14 +23,13 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.geometry import rotate, wrap_angle
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Mount, MountedLidar, Rig
 from flcav.world.commands import Controls, Spawn
 from flcav.world.live import LiveWorld, Settings
-from flcav.world.map.roads import read_net
-from flcav.world.map.routes import Route, draw_route
+from flcav.world.map.roads import Route, draw_route, read_net
 from flcav.world.map.town import Town, load_town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot

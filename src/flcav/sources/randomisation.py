@@ -15,8 +15,7 @@ import yaml
 from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
-from flcav.sensors.lidar.beams import BEAMS
-from flcav.sensors.lidar.lidar import Lidar
+from flcav.sensors.lidar.lidar import BEAMS, Lidar
 from flcav.sensors.rig import MountedLidar, Rig
 from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, StreetParameters, TownParameters
 from flcav.world.map.relief import Relief

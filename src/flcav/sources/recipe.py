@@ -11,9 +11,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from flcav.config import Config, InputError, Json, parse_config, read_yaml, shorten
 from flcav.interface.wording import suggest
-from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.lens import Lens
-from flcav.sensors.rig import RIGS, Mounted, MountedInfrared, MountedRadar, Rig
+from flcav.sensors.rig import RIGS, CalibrationError, Mounted, MountedInfrared, MountedRadar, Rig
 from flcav.world.map.parameters import RareKinds
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario

@@ -1,4 +1,7 @@
-"""Atomic and durable file writing, JSON files and SHA-256 checksums."""
+"""Atomic and durable file writing, JSON files and SHA-256 checksums.
+
+Strict reading of Parquet files, and their writing as a whole.
+"""
 
 import contextlib
 import errno
@@ -9,8 +12,12 @@ import tempfile
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
-from flcav.config import Json
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from flcav.config import InputError, Json, check_is_file
 
 PIECE_BYTES = 1 << 16
 SYNCING = 8  # files that are flushed at once: the file system commits them together, ten times as fast as in turn
@@ -42,7 +49,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 
 def _flush(path: Path) -> None:
-    """Write what the system holds back of a file, or of the names in a folder, to the disk: fsync(2)."""
+    """Flush a file, or the names in a folder, from the system's cache to the disk: fsync(2)."""
     file = os.open(path, os.O_RDONLY)
     try:
         os.fsync(file)
@@ -51,14 +58,14 @@ def _flush(path: Path) -> None:
 
 
 def flush_all(paths: Iterable[Path]) -> None:
-    """Write what the system holds back of files, and of the names in folders, to the disk, except of symbolic links."""
+    """Flush files, and the names in folders, to the disk, except symbolic links."""
     with ThreadPoolExecutor(SYNCING) as threads:
         for _ in threads.map(_flush, (path for path in paths if not path.is_symlink())):
             pass  # raises the OSError of a file
 
 
 def flush_tree(folder: Path) -> None:
-    """Write what the system holds back of a folder, of all below it and of its own name to the disk."""
+    """Flush a folder, everything below it and its name in its parent to the disk."""
     flush_all([folder.parent, folder, *folder.rglob("*")])
 
 
@@ -107,3 +114,39 @@ def sha256(path: Path) -> str:
     """Return the SHA-256 checksum of a file as 64 hexadecimal digits."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+HARMLESS_BYTES = 1 << 28  # that any table may take in memory
+UNFOLDED = 1000  # most bytes in memory that a byte of a larger table stands for; unlike rows unfold to a few
+
+
+def read_parquet(path: Path) -> pa.Table:
+    """Return the table in a Parquet file, validated in full: its strings are UTF-8.
+
+    Raises `InputError` where the file is missing, not Parquet, or damaged, and before it is read where it would unfold
+    to far more than tables do.
+    """
+    check_is_file(path, None)
+    try:
+        file = pq.ParquetFile(path)
+        if (size := _measure_table(file.metadata)) > max(HARMLESS_BYTES, UNFOLDED * path.stat().st_size):
+            raise ValueError(f"it would take {size} bytes of memory")
+        table = file.read()
+        table.validate(full=True)
+    except (pa.ArrowException, OSError, ValueError, OverflowError, MemoryError) as error:
+        raise InputError(f"{path}: not a readable Parquet file ({error})") from None
+    return table
+
+
+def _measure_table(metadata: Any) -> int:
+    """Return the size of a file's values in memory by its metadata [bytes]: at least eight a value, or their pages."""
+    groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
+    columns = (group.column(j) for group in groups for j in range(group.num_columns))
+    return sum(max(8 * column.num_values, column.total_uncompressed_size) for column in columns)
+
+
+def write_parquet(table: pa.Table, path: Path) -> None:
+    """Write a table to a Parquet file atomically; raises `OSError` that names the file where the disk is full."""
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    write_bytes(path, memoryview(sink.getvalue()))

@@ -1,12 +1,19 @@
-"""Conversion of frozen dataclasses to JSON values and back, by pydantic, and to rows of a table."""
+"""Conversion of frozen dataclasses to JSON values and back, by pydantic, and to rows of a table.
 
-from collections.abc import Iterable, Iterator, Mapping
+Tables of users: CSV read, and tables written as CSV or Parquet by the suffix of the file's name.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any, Self, TypeVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Self, TypeVar
 
+import pyarrow as pa
+import pyarrow.csv as csv
 from pydantic import Field, TypeAdapter, ValidationError
 
-from flcav.config import InputError, Json
+from flcav.config import InputError, Json, check_is_file
+from flcav.storage.files import atomic_path, write_parquet
 
 if TYPE_CHECKING:
     from _typeshed import DataclassInstance
@@ -58,14 +65,14 @@ def to_rows(records: Iterable["DataclassInstance"]) -> list[dict[str, Json]]:
     >>> to_rows([Estimate(0.5, 0.4, 0.6)])
     [{'mean': 0.5, 'low': 0.4, 'high': 0.6}]
     """
-    return [dict(flatten(to_json(record, type(record)))) for record in records]
+    return [dict(flatten_record(to_json(record, type(record)))) for record in records]
 
 
-def flatten(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
+def flatten_record(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, Json]]:
     """Yield the values within nested JSON objects by dotted names, as in "estimate.mean"; empty objects are values."""
     for name, value in values.items():
         if isinstance(value, Mapping) and value:
-            yield from flatten(value, f"{above}{name}.")
+            yield from flatten_record(value, f"{above}{name}.")
         else:
             yield above + name, value
 
@@ -73,3 +80,43 @@ def flatten(values: Mapping[str, Json], above: str = "") -> Iterator[tuple[str, 
 @cache
 def _adapter(record: type) -> TypeAdapter[Any]:
     return TypeAdapter(record)
+
+
+ENDINGS = (".csv", ".parquet")
+
+
+def check_ending(path: Path) -> None:
+    """Raise `InputError` where the suffix of `path` is none of ENDINGS."""
+    if path.suffix not in ENDINGS:
+        raise InputError(f"{path}: tables are written as {' or '.join(ENDINGS)}; end the name with one of them")
+
+
+def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str = "") -> pa.Table:
+    """Return the table in the CSV file at `path`, or in an open one called `origin`, the columns `texts` as text.
+
+    Only an empty cell is None; "NaN" is a number, "NA" is text. Raises `InputError` where the file is missing or no
+    table, or a column is there twice.
+    """
+    named = origin or str(path)
+    written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
+    if isinstance(path, Path | str):
+        check_is_file(Path(path))
+    try:
+        table = csv.read_csv(path, convert_options=written)
+    except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
+        said = str(error) if str(error).isprintable() else "its bytes are no text"
+        raise InputError(f"{named}: not a table ({said})") from None
+    for name in table.column_names:
+        if name and table.column_names.count(name) > 1:
+            raise InputError(f"{named}: column '{name}' is there twice; found {', '.join(table.column_names)}")
+    return table
+
+
+def write_any_table(table: pa.Table, path: Path) -> None:
+    """Write `table` atomically to `path`, as CSV or Parquet by its suffix; raises `InputError` for any other suffix."""
+    check_ending(path)
+    if path.suffix == ".parquet":
+        write_parquet(table, path)
+        return
+    with atomic_path(path) as temporary:
+        csv.write_csv(table, temporary)

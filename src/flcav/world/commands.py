@@ -1,7 +1,7 @@
 """Commands to a live world: what a client does to it between two steps.
 
 World frame: ENU, metres, radians. Where `z` is None an actor stands on the ground; where bridges are, on the level that
-is nearest to `z`. Who is placed far above it falls, and who is far below it stays there: `dynamics.bodies.ALOFT_M`.
+is nearest to `z`. An actor placed far above it falls, one far below it stays there: see `dynamics.bodies.ALOFT_M`.
 Actors are known by names that the client chooses.
 """
 
@@ -13,7 +13,7 @@ Vector = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Controls:
-    """What the driver of a vehicle does, until told otherwise."""
+    """The controls of a vehicle; they hold until the next ones."""
 
     throttle: float = 0.0  # 0 to 1
     steer: float = 0.0  # -1 to 1, share of the greatest steering angle, positive to the left
@@ -54,7 +54,7 @@ class Drive:
 
 @dataclass(frozen=True)
 class Grip:
-    """The tyres of a vehicle hold by this share of the friction of a dry road, until told otherwise."""
+    """The tyres of a vehicle have this share of the friction of a dry road, until the next such command."""
 
     name: str
     share: float  # 0 to 1
@@ -62,7 +62,7 @@ class Grip:
 
 @dataclass(frozen=True)
 class Walk:
-    """A walker walks at this velocity in the plane, until told otherwise."""
+    """A walker walks at this velocity in the plane, until the next such command."""
 
     name: str
     velocity: tuple[float, float]  # x, y [m/s]
@@ -83,7 +83,7 @@ class Place:
 
 @dataclass(frozen=True)
 class Push:
-    """An actor has another velocity at once; without physics it only is what is told about it."""
+    """An actor has another velocity at once; without physics it does not move, and only reports that velocity."""
 
     name: str
     velocity: Vector  # [m/s]

@@ -6,11 +6,9 @@ of geodetic latitude and height equations", Survey Review 28:202, 1985), exact t
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.world.map.parameters import GeoReference
-
-Array = NDArray[np.float64]
 
 EQUATOR_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 FLATTENING = 1 / 298.257223563

@@ -7,13 +7,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace, empty_trace
-
-Array = NDArray[np.float64]
 
 START_M = 0.6  # from the mount to the start of a ray
 END_M = 2.5  # from an error's position to the end of a ray: half of a long car may lie between
@@ -28,16 +26,12 @@ class Viewshed:
 
     x: Array  # (N,) world [m], ascending
     y: Array  # (N,)
-    seen: NDArray[np.bool_]  # (N, N): rows by y, columns by x
+    seen: Mask  # (N, N): rows by y, columns by x
 
 
-def find_visible(
-    town: Town,
-    traces: Sequence[Trace],
-    sites: Array,
-    places: Array,
-    pairs: tuple[NDArray[np.int64], NDArray[np.int64]],
-) -> NDArray[np.bool_]:
+def find_visible_pairs(
+    town: Town, traces: Sequence[Trace], sites: Array, places: Array, pairs: tuple[Ints, Ints]
+) -> Mask:
     """Return (M,) whether each pair's site (P, 3) sees its place (E, 3), at half of the instants or more.
 
     `pairs` are the M rows of `sites` and of `places`, world frame [m]. Without `traces` only the town is in the way.
@@ -54,14 +48,14 @@ def find_visible(
 def find_viewshed(town: Town, traces: Sequence[Trace], site: Array, range_m: float) -> Viewshed:
     """Return the viewshed of a site (3,): points EYE_M above the ground that it sees within `range_m`.
 
-    Seen is what `find_visible` calls so.
+    `site` (3,) is in the world frame [m]; a point counts as seen as in `find_visible_pairs`.
     """
     x, y = site[:2, None] + np.linspace(-range_m, range_m, 2 * FINE + 1)
     across, along = (each.ravel() for each in np.meshgrid(x, y))
     places = np.c_[across, along, town.grounds(across, along) + EYE_M]
     near = np.flatnonzero(np.linalg.norm(places - site, axis=1) <= range_m)
     seen = np.zeros(len(places), np.bool_)
-    seen[near] = find_visible(town, traces, site[None], places, (np.zeros_like(near), near))
+    seen[near] = find_visible_pairs(town, traces, site[None], places, (np.zeros_like(near), near))
     return Viewshed(x, y, seen.reshape(len(y), len(x)))
 
 
@@ -87,7 +81,7 @@ def count_visible_actors(town: Town, traces: Sequence[Trace], sites: Array, rang
     return total / max(instants, 1)
 
 
-def _rays(starts: Array, ends: Array) -> tuple[NDArray[np.float32], NDArray[np.float32], Array]:
+def _rays(starts: Array, ends: Array) -> tuple[Array32, Array32, Array]:
     """Return origins (M, 3), unit directions (M, 3) and whole lengths (M,) [m] of rays from `starts` to `ends`."""
     along = ends - starts
     lengths = np.linalg.norm(along, axis=1)

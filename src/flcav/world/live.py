@@ -11,25 +11,20 @@ from types import MappingProxyType, TracebackType
 from typing import Self
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.config import InputError, shorten
 from flcav.world import commands
-from flcav.world.actors import NOBODY, Actors, join_actors, pick_actors
 from flcav.world.commands import Command, Controls
-from flcav.world.dynamics.blueprints import VEHICLES, blueprint
-from flcav.world.dynamics.bodies import Bodies, Body
-from flcav.world.dynamics.contacts import Contacts, Footprints, find_overlaps, resolve
-from flcav.world.dynamics.obstacles import corners, join_footprints, list_obstacles, outline
-from flcav.world.dynamics.standing import Ground
+from flcav.world.dynamics.bodies import Bodies, ControlledBody
+from flcav.world.dynamics.contacts import Contacts, Footprints, find_overlaps, resolve_contacts
+from flcav.world.dynamics.obstacles import TownGround, corners, join_footprints, list_obstacles, outline_actors
+from flcav.world.dynamics.vehicle import VEHICLES, make_blueprint
 from flcav.world.map.town import Town
 from flcav.world.scenarios.stage import STEP_S
-from flcav.world.snapshot import Collision, Snapshot
+from flcav.world.snapshot import NOBODY, Actors, Collision, Snapshot, join_actors, pick_actors
 from flcav.world.trace import Trace
-from flcav.world.traffic.lights import Lights, read_light_programs
-from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, stand_parked
-
-Array = NDArray[np.float64]
+from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, TrafficLights, read_light_programs, stand_parked
 
 SUBSTEP_S, SUBSTEP_M = 0.05, 2.0  # longest step and way of the vehicle model: nobody passes through a box in it
 LONGEST_S = 10.0  # of a step
@@ -40,12 +35,12 @@ NOTHING: Mapping[str, Controls] = MappingProxyType({})
 
 
 class Obstructed(InputError):
-    """A place where an actor cannot appear, since something else is there."""
+    """Raised where an actor cannot appear, since its place is occupied."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """What a live world is started with, besides its town."""
+    """Initial conditions and settings of a live world, besides its town."""
 
     seed: int = 0
     traffic: int = 0  # vehicles of SUMO; without these and without pedestrians there is no SUMO
@@ -60,7 +55,7 @@ DEFAULT = Settings()
 
 
 @dataclass(frozen=True)
-class Step:
+class LiveStep:
     """A step in the history of a live world."""
 
     dt_s: float
@@ -88,9 +83,9 @@ class LiveWorld:
             raise InputError(f"traffic = {settings.traffic}, pedestrians = {settings.pedestrians}: must be 0 or more")
         self.town = town
         self.settings = settings
-        self.history: list[Command | Step] = []
-        self.lights = Lights(read_light_programs(town.net), WARM_UP_S)
-        self.bodies = Bodies(ground := Ground(town), leans=settings.leans)
+        self.history: list[Command | LiveStep] = []
+        self.lights = TrafficLights(read_light_programs(town.net), WARM_UP_S)
+        self.bodies = Bodies(ground := TownGround(town), leans=settings.leans)
         self._ground = ground
         self._parked = stand_parked(town, ground, settings.seed) if settings.parked else NOBODY
         self.obstacles = list_obstacles(town, self._parked)
@@ -115,7 +110,7 @@ class LiveWorld:
         self.close()
 
     def close(self) -> None:
-        """End the traffic; a world that had some makes no further steps then."""
+        """End the traffic; a world with traffic cannot be stepped any more."""
         if self._traffic is not None:
             self._traffic.close()
 
@@ -133,10 +128,10 @@ class LiveWorld:
         """
         dt_s = self.settings.dt_s if dt_s is None else dt_s
         _check_step(dt_s)
-        for name, told in controls.items():
-            if self.bodies.find(name).controls != told:
-                self.apply(commands.Drive(name, told))
-        self._note(Step(dt_s))
+        for name, wanted in controls.items():
+            if self.bodies.find(name).controls != wanted:
+                self.apply(commands.Drive(name, wanted))
+        self._note(LiveStep(dt_s))
         begins, velocity = self._time_s, self.bodies.velocity.copy()
         found: dict[tuple[str, str], Collision] = {}
         fastest = float(np.abs(velocity).max(initial=0.0))
@@ -199,8 +194,10 @@ class LiveWorld:
     def find_obstruction(self, command: commands.Spawn) -> str | None:
         """Return the name of what stands where an actor would appear, as in `Collision`; None where there is room."""
         probe = Bodies(self._ground)
-        probe.add(Body(command.name, blueprint(command.category, command.shape, command.size)), *_pose(command))
-        box = outline(probe.actors())
+        probe.add(
+            ControlledBody(command.name, make_blueprint(command.category, command.shape, command.size)), *_pose(command)
+        )
+        box = outline_actors(probe.actors())
         others, names = self._list_boxes(self.bodies.actors(), *corners(box))
         overlaps = find_overlaps(box, others)
         return names[overlaps[0, 1]] if len(overlaps) else None
@@ -209,12 +206,12 @@ class LiveWorld:
         """Return the height of the ground [m] at a place, or of the bridge there that is nearer to `z`."""
         return float(self._ground.heights(np.array([x]), np.array([y]), np.array([np.nan if z is None else z]))[0])
 
-    def _note(self, entry: Command | Step) -> None:
+    def _note(self, entry: Command | LiveStep) -> None:
         if self.settings.remembers:
             self.history.append(entry)
 
     def _spawn(self, command: commands.Spawn) -> None:
-        name, made = command.name, blueprint(command.category, command.shape, command.size)
+        name, made = command.name, make_blueprint(command.category, command.shape, command.size)
         if not name or name.startswith(RESERVED):
             raise InputError(f"name {shorten(name)}: must not be empty, nor begin with {', '.join(RESERVED)}")
         if any(body.name == name for body in self.bodies.members):
@@ -222,7 +219,7 @@ class LiveWorld:
         _check_numbers(command.x, command.y, command.yaw, command.z or 0.0)
         if not command.anywhere and (other := self.find_obstruction(command)):
             raise Obstructed(f"actor {shorten(name)}: '{other}' is in its place")
-        self.bodies.add(Body(name, made), *_pose(command))
+        self.bodies.add(ControlledBody(name, made), *_pose(command))
 
     def _advance_traffic(self) -> None:
         """Let SUMO go on to the present time, and look where its actors are now."""
@@ -242,14 +239,14 @@ class LiveWorld:
         before = bodies.actors().places
         bodies.move(dt_s)
         now = bodies.actors()
-        boxes, names = self._list_boxes(now, *corners(outline(now)))
+        boxes, names = self._list_boxes(now, *corners(outline_actors(now)))
         mass, inertia = (np.concatenate((own, np.full(len(names) - count, np.inf))) for own in bodies.weights())
         flow = slice(count, count + len(self._flow.name))
         velocity, yaw_rate = np.zeros((len(names), 2)), np.zeros(len(names))
         velocity[:count], yaw_rate[:count] = now.velocity[:, :2], now.yaw_rate
         velocity[flow], yaw_rate[flow] = self._flow.velocity[:, :2], self._flow.yaw_rate
         start = np.concatenate((before, boxes.place[count:]))
-        place, velocity, yaw_rate, contacts = resolve(boxes, start, velocity, yaw_rate, mass, inertia)
+        place, velocity, yaw_rate, contacts = resolve_contacts(boxes, start, velocity, yaw_rate, mass, inertia)
         bodies.fall(velocity[:count] - now.velocity[:, :2])
         bodies.position[:, :2], bodies.yaw = place[:count, :2], place[:count, 2]
         bodies.velocity[:, :2], bodies.yaw_rate = velocity[:count], yaw_rate[:count]
@@ -261,7 +258,7 @@ class LiveWorld:
         """Return the boxes of the bodies, of SUMO's actors, and of obstacles about these corners; and their names."""
         near = self.obstacles.near(low - NEAR_M, high + NEAR_M)
         obstacles = Footprints(*(array[near] for array in self.obstacles.boxes))
-        boxes = join_footprints(outline(own), outline(self._flow), obstacles)
+        boxes = join_footprints(outline_actors(own), outline_actors(self._flow), obstacles)
         return boxes, [*own.name, *self._flow.name, *(self.obstacles.name[row] for row in near.tolist())]
 
     def _report(self, contacts: Contacts, names: Sequence[str], found: dict[tuple[str, str], Collision]) -> None:
@@ -298,12 +295,12 @@ class LiveWorld:
         return Snapshot(self._number, self._time_s, trace, MappingProxyType(controls), self._collisions)
 
 
-def replay(town: Town, settings: Settings, history: Sequence[Command | Step]) -> LiveWorld:
+def replay(town: Town, settings: Settings, history: Sequence[Command | LiveStep]) -> LiveWorld:
     """Return a world with this history: a fork of the one whose settings and history they are."""
     world = LiveWorld(town, settings)
     try:
         for entry in history:
-            if isinstance(entry, Step):
+            if isinstance(entry, LiveStep):
                 world.step(dt_s=entry.dt_s)
             else:
                 world.apply(entry)
@@ -328,6 +325,6 @@ def _check_numbers(*values: float) -> None:
             raise InputError(f"{value}: must be a number of at most {FARTHEST:g}")
 
 
-def _check_category(body: Body, categories: Sequence[str], word: str) -> None:
+def _check_category(body: ControlledBody, categories: Sequence[str], word: str) -> None:
     if body.category not in categories:
         raise InputError(f"actor {shorten(body.name)}: is no {word}, but a {body.category}")

@@ -1,26 +1,23 @@
 """Scenes: the static mesh of a town and the meshes of its actors at one instant of a trace, for ray casting."""
 
-import pickle
 import zlib
 from collections.abc import Mapping
 from functools import cached_property, lru_cache
-from hashlib import sha256
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Bytes, Ints, Mask
 from flcav.geometry import pose, rotations, rotations_about_z
 from flcav.world.map.town import Town
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, RETRO, Material
 from flcav.world.meshes import Mesh, actor_mesh
-from flcav.world.rays.embree import Embree, Solid
-from flcav.world.rays.hits import Hits
-from flcav.world.static import SignsAndSignals, build_town_mesh, list_signs_and_signals
+from flcav.world.rays.embree import Assembly, Solid, check_embree, trace_each
+from flcav.world.rays.packets import Hits
+from flcav.world.static import SignsAndSignals, TownCache, build_town_mesh, list_signs_and_signals
 from flcav.world.trace import Trace
 
 OFFSET_S = 0.1  # largest extrapolation from an instant of the trace: one step of the traffic
-TOWNS_KEPT = 4
 
 
 class Surfaces(NamedTuple):
@@ -29,11 +26,11 @@ class Surfaces(NamedTuple):
     There are I instances and M materials; instances of the same shape share their rows.
     """
 
-    normal: NDArray[np.float32]  # (S, 3) unit normals, of either sign, body frame
-    material: NDArray[np.uint8]  # (S,) a Material
-    first: NDArray[np.int64]  # (I,) first row of each instance's mesh
-    reflectivity: NDArray[np.float32]  # (I, M) at 905 nm, by material: actors differ in their paint
-    retro: NDArray[np.bool_] = RETRO  # (M,) retroreflectors
+    normal: Array32  # (S, 3) unit normals, of either sign, body frame
+    material: Bytes  # (S,) a Material
+    first: Ints  # (I,) first row of each instance's mesh
+    reflectivity: Array32  # (I, M) at 905 nm, by material: actors differ in their paint
+    retro: Mask = RETRO  # (M,) retroreflectors
 
 
 class Scene:
@@ -46,8 +43,8 @@ class Scene:
         """
         self.town = town
         self.paints: Mapping[str, tuple[float, float, float]] = {}  # linear RGB by actor; others are painted by name
-        self._engine = Embree()
-        self._town_model = _town_model(town)
+        check_embree()
+        self._town_model = _TOWNS.get(town, lambda: _model(build_town_mesh(town)))
         self._cast(trace)
 
     def follow(self, trace: Trace) -> None:
@@ -71,7 +68,7 @@ class Scene:
         models = [self._town_model, *(_actor_model(*trace.model(actor)) for actor in range(len(trace.actor)))]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
         self._solids = [model.solid for model in models]
-        self._assembly = self._engine.assembly(self._solids)
+        self._assembly = Assembly(self._solids)
         self._assembly.place(0, np.eye(4))
         # x, y, z, yaw, pitch, roll; NaN where an actor is not placed
         self._placed = np.full((len(trace.actor), 6), np.nan)
@@ -89,7 +86,7 @@ class Scene:
         return list_signs_and_signals(self.town)
 
     def move_to(self, index: int, offset_s: float = 0.0) -> None:
-        """Move every actor to its pose at instant `index` of the trace, or `offset_s` later.
+        """Move every actor to its pose at instant `index` of the trace, or `offset_s` [s] later.
 
         Poses off an instant are extrapolated with constant acceleration and yaw rate. Raises `ValueError` where
         `offset_s` is not within -`OFFSET_S` and `OFFSET_S`.
@@ -100,7 +97,7 @@ class Scene:
             self.index, self.offset_s = index, offset_s
             self._place()
 
-    def poses(self) -> NDArray[np.float64]:
+    def poses(self) -> Array:
         """Return x, y, z [m] and yaw [rad] of every actor at the scene's time (A, 4), world frame; NaN where absent."""
         trace, i, dt = self.trace, self.index, self.offset_s
         position, yaw = trace.position[i], trace.yaw[i]
@@ -109,15 +106,15 @@ class Scene:
             yaw = yaw + dt * trace.yaw_rate[i]
         return np.concatenate((position, yaw[:, None]), axis=1)
 
-    def world_from_actor(self, actor: int) -> NDArray[np.float64]:
-        """Return the pose (4, 4) of an actor that is present; the origin of its body frame is its ground centre."""
+    def world_from_actor(self, actor: int) -> Array:
+        """Return the pose (4, 4) [m] of an actor that is present; the origin of its body frame is its ground centre."""
         return pose(*self.poses()[actor], *self.trace.tilts(self.index)[actor])
 
-    def world_from_instance(self) -> NDArray[np.float64]:
+    def world_from_instance(self) -> Array:
         """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
         return np.concatenate((np.eye(3)[None], self.rotations()))
 
-    def rotations(self) -> NDArray[np.float64]:
+    def rotations(self) -> Array:
         """Return the rotations of the actors' body frames (A, 3, 3); the identity for absent ones."""
         yaw = np.nan_to_num(self.poses()[:, 3])
         if self.trace.tilt is None:
@@ -126,10 +123,10 @@ class Scene:
 
     def cast(
         self,
-        world_from_rays: NDArray[np.float64],
-        directions: NDArray[np.float32],
+        world_from_rays: Array,
+        directions: Array32,
         *,
-        near_m: NDArray[np.float32] | None = None,
+        near_m: Array32 | None = None,
         far_m: float = np.inf,
         hidden: int | None = None,
         threads: int = 1,
@@ -139,14 +136,8 @@ class Scene:
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
     def find_occluded(
-        self,
-        origins: NDArray[np.float32],
-        directions: NDArray[np.float32],
-        far_m: NDArray[np.float32],
-        *,
-        hidden: int | None = None,
-        threads: int = 1,
-    ) -> NDArray[np.bool_]:
+        self, origins: Array32, directions: Array32, far_m: Array32, *, hidden: int | None = None, threads: int = 1
+    ) -> Mask:
         """Return (N,) whether anything but the actor `hidden` occludes each ray before its end `far_m` (N,) [m].
 
         `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the world frame. A ray whose
@@ -157,12 +148,12 @@ class Scene:
 
     def cast_each(
         self,
-        actors: NDArray[np.int64],
-        body_from_rays: NDArray[np.float64],
-        ends: NDArray[np.int64],
-        directions: NDArray[np.float32],
+        actors: Ints,
+        body_from_rays: Array,
+        ends: Ints,
+        directions: Array32,
         *,
-        near_m: NDArray[np.float32] | None = None,
+        near_m: Array32 | None = None,
         far_m: float = np.inf,
     ) -> Hits:
         """Return the first hits of K groups of rays, group k with the mesh of `actors[k]` alone.
@@ -171,7 +162,7 @@ class Scene:
         pose in the actor's body frame is `body_from_rays[k]` (4, 4).
         """
         solids = [self._solids[actor + 1] for actor in actors.tolist()]
-        return self._engine.trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
+        return trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
 
     def _hide(self, hidden: int | None) -> None:
         if hidden != self._hidden:
@@ -200,12 +191,12 @@ class _Model(NamedTuple):
     """A mesh with its normals and its acceleration structure."""
 
     mesh: Mesh
-    normal: NDArray[np.float32]
+    normal: Array32
     solid: Solid
 
 
 def _model(mesh: Mesh) -> _Model:
-    return _Model(mesh, mesh.normals(), Embree().solid(mesh.vertices, mesh.faces))
+    return _Model(mesh, mesh.normals(), Solid(mesh.vertices, mesh.faces))
 
 
 def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:
@@ -229,13 +220,4 @@ def _actor_model(category: str, shape: int, size: tuple[float, ...]) -> _Model:
     return _model(actor_mesh(category, shape, size))
 
 
-_TOWNS: dict[str, _Model] = {}  # by hash of the town: the last TOWNS_KEPT
-
-
-def _town_model(town: Town) -> _Model:
-    key = sha256(pickle.dumps(town)).hexdigest()
-    if key not in _TOWNS:
-        while len(_TOWNS) >= TOWNS_KEPT:
-            del _TOWNS[next(iter(_TOWNS))]
-        _TOWNS[key] = _model(build_town_mesh(town))
-    return _TOWNS[key]
+_TOWNS = TownCache[_Model]()

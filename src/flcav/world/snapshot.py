@@ -2,14 +2,14 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import compress
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.world.commands import Controls
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -57,8 +57,8 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
     count, actors = len(snapshots), len(names)
     known: dict[str, tuple[str, int, tuple[float, ...]]] = {}
     present = np.zeros((count, actors), np.bool_)
-    motion = {name: np.full((count, actors, 3), np.nan) for name in ("position", "velocity", "acceleration")}
-    turning = {name: np.full((count, actors), np.nan) for name in ("yaw", "yaw_rate")}
+    axes = {"position": (3,), "velocity": (3,), "acceleration": (3,), "yaw": (), "yaw_rate": ()}
+    motion = {name: np.full((count, actors, *shape), np.nan) for name, shape in axes.items()}
     tilt = np.full((count, actors, 2), np.nan)
     for i, each in enumerate(snapshots):
         trace = each.trace
@@ -67,7 +67,7 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
             if known.setdefault(name, trace.model(actor)) != trace.model(actor):
                 raise ValueError(f"actor '{name}' is not the same in all snapshots")
         present[i, at] = True
-        for name, array in (motion | turning).items():
+        for name, array in motion.items():
             array[i, at] = getattr(trace, name)[0]
         tilt[i, at] = trace.tilts(0)
     category, shape, size = zip(*(known[name] for name in names)) if names else ((), (), ())
@@ -83,5 +83,43 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
         light_state=np.concatenate([each.trace.light_state for each in snapshots]),
         tilt=None if all(each.trace.tilt is None for each in snapshots) else tilt,
         **motion,
-        **turning,
+    )
+
+
+class Actors(NamedTuple):
+    """N actors at one instant, world frame: the fields of a `Trace`."""
+
+    name: tuple[str, ...]  # (N,)
+    category: tuple[str, ...]  # (N,)
+    shape: Ints  # (N,)
+    size: Array  # (N, 3) length, width, height [m]
+    position: Array  # (N, 3) ground centre [m]
+    yaw: Array  # (N,) [rad]
+    velocity: Array  # (N, 3) [m/s]
+    acceleration: Array  # (N, 3) [m/s^2]
+    yaw_rate: Array  # (N,) [rad/s]
+    tilt: Array  # (N, 2) pitch and roll [rad]
+
+    @property
+    def places(self) -> Array:
+        """Return x, y [m] and yaw [rad] of each (N, 3)."""
+        return np.column_stack((self.position[:, :2], self.yaw))
+
+
+_ONES, _TWOS, _THREES = np.zeros(0), np.zeros((0, 2)), np.zeros((0, 3))
+NOBODY = Actors((), (), np.zeros(0, np.int64), _THREES, _THREES, _ONES, _THREES, _THREES, _ONES, _TWOS)
+
+
+def pick_actors(actors: Actors, mask: Mask) -> Actors:
+    """Return the actors for which `mask` (N,) is true."""
+    names, categories = (tuple(compress(words, mask)) for words in actors[:2])
+    return Actors(names, categories, actors.shape[mask], *(column[mask] for column in actors[3:]))
+
+
+def join_actors(*parts: Actors) -> Actors:
+    """Return the actors of all parts, in order."""
+    return Actors(
+        tuple(name for part in parts for name in part.name),
+        tuple(category for part in parts for category in part.category),
+        *(np.concatenate(column) for column in zip(*(part[2:] for part in parts))),
     )

@@ -1,4 +1,4 @@
-"""The static mesh of a town, with the object that each face belongs to."""
+"""The static mesh of a town, its buildings included, with the object that each face belongs to."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -7,13 +7,14 @@ from enum import IntEnum
 from hashlib import sha256
 from itertools import chain
 from pathlib import Path
-from typing import NamedTuple
+from typing import Generic, NamedTuple, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 import shapely
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Bytes, Ints32
 from flcav.geometry import left_vectors
 from flcav.statistics.streams import stream
 from flcav.storage.files import atomic_path
@@ -21,8 +22,6 @@ from flcav.world.map.relief import Relief
 from flcav.world.map.signals import Signals
 from flcav.world.map.town import KERB_M, Town
 from flcav.world.materials import Material
-from flcav.world.meshes.buildings import make_building
-from flcav.world.meshes.drape import drape_area, drape_polygon, drape_wall
 from flcav.world.meshes.furniture import (
     make_clutter,
     make_lamp,
@@ -34,7 +33,7 @@ from flcav.world.meshes.furniture import (
     signal_head,
     signal_mast,
 )
-from flcav.world.meshes.mesh import Mesh, join_meshes, sheet, transform_mesh
+from flcav.world.meshes.mesh import Mesh, box, drape_area, drape_polygon, drape_wall, join_meshes, sheet, transform_mesh
 
 GROUND_M = -0.03  # height of open ground, a little below the road
 UNDER_M, ROUGH_M = 1.5, 1.0  # by which sloping ground reaches below roads and sidewalks, and how roughly it is cut
@@ -44,6 +43,9 @@ LAND_M = 150.0  # width of open ground beyond the town's bounds
 TOWNS_KEPT = 4  # size of the cache of meshes
 _FIELDS = ("vertices", "faces", "material", "part", "row")  # of a static world in a file, and their forms
 _FORMS = [("float32", (3,)), ("int32", (3,)), ("uint8", ()), ("uint8", ()), ("int32", ())]
+
+
+Made = TypeVar("Made")
 
 
 class TownPart(IntEnum):
@@ -68,18 +70,18 @@ class StaticWorld(NamedTuple):
     """The static mesh of a town, and the object of each of its F faces."""
 
     mesh: Mesh  # world frame
-    part: NDArray[np.uint8]  # (F,) a Part
-    row: NDArray[np.int32]  # (F,) the object's row in its field of `Town`; clutter is numbered through all kinds
+    part: Bytes  # (F,) a Part
+    row: Ints32  # (F,) the object's row in its field of `Town`; clutter is numbered through all kinds
 
 
 class SignsAndSignals(NamedTuple):
     """The K traffic signs and signal heads of a town: first the signs, then the heads, in the town's order."""
 
     kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal | walker_signal
-    position: NDArray[np.float64]  # (K, 3) centre of the plate or head, world [m]
-    yaw: NDArray[np.float64]  # (K,) direction it faces, world [rad]
+    position: Array  # (K, 3) centre of the plate or head, world [m]
+    yaw: Array  # (K,) direction it faces, world [rad]
     link: tuple[str, ...]  # (K,) the entry of `Trace.light` that a head shows; empty for signs
-    face: NDArray[np.int32]  # (F,) row here of the sign or head that each face of the town's mesh belongs to; -1: none
+    face: Ints32  # (F,) row here of the sign or head that each face of the town's mesh belongs to; -1: none
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -115,22 +117,28 @@ def _head_kinds(signals: Signals) -> list[str]:
     return ["signal"] * (len(signals.link) - signals.walkers) + ["walker_signal"] * signals.walkers
 
 
-_WORLDS: dict[str, StaticWorld] = {}  # by hash of the town: the last TOWNS_KEPT
+class TownCache(Generic[Made]):
+    """What was made of the last `TOWNS_KEPT` towns, by a hash of their content."""
+
+    def __init__(self) -> None:
+        self._kept: dict[str, Made] = {}
+
+    def get(self, town: Town, make: Callable[[], Made]) -> Made:
+        """Return what was made of an equal town, or else what `make` makes now."""
+        key = sha256(pickle.dumps(town)).hexdigest()
+        if key not in self._kept:
+            while len(self._kept) >= TOWNS_KEPT:
+                del self._kept[next(iter(self._kept))]
+            self._kept[key] = make()
+        return self._kept[key]
+
+
+_WORLDS = TownCache[StaticWorld]()
 
 
 def build_static_world(town: Town) -> StaticWorld:
     """Return the static mesh of a town with the object of each face; the last `TOWNS_KEPT` are cached."""
-    return _keep(town, lambda: _build_world(town))
-
-
-def _keep(town: Town, make: Callable[[], StaticWorld]) -> StaticWorld:
-    """Return the world of a town that is kept, or else keep what `make` makes."""
-    key = sha256(pickle.dumps(town)).hexdigest()
-    if key not in _WORLDS:
-        while len(_WORLDS) >= TOWNS_KEPT:
-            del _WORLDS[next(iter(_WORLDS))]
-        _WORLDS[key] = make()
-    return _WORLDS[key]
+    return _WORLDS.get(town, lambda: _build_world(town))
 
 
 def _build_world(town: Town) -> StaticWorld:
@@ -171,7 +179,7 @@ def recall_static_world(town: Town, path: Path) -> None:
         or part.max() >= len(TownPart)
     ):
         raise ValueError(f"{path}: a face names a corner, a material or a part that is not there")
-    _keep(town, lambda: StaticWorld(Mesh(vertices, faces, material), part, row))
+    _WORLDS.get(town, lambda: StaticWorld(Mesh(vertices, faces, material), part, row))
 
 
 Owned = tuple[TownPart, int, Mesh]  # kind of object, its row, its mesh in the world frame
@@ -232,7 +240,7 @@ def _sidewalks(town: Town) -> Iterator[Owned]:
         yield TownPart.SIDEWALK, row, kerb
 
 
-def _plate(polygon: NDArray[np.float64], z: float, material: Material, relief: Relief | None) -> Mesh:
+def _plate(polygon: Array, z: float, material: Material, relief: Relief | None) -> Mesh:
     """Return a polygon (K, 2) as a surface `z` [m] above the ground, by constrained Delaunay triangulation."""
     if relief is not None:
         return drape_polygon(polygon, relief, z, material)
@@ -250,7 +258,7 @@ def _buildings(town: Town) -> Iterator[Owned]:
         yield TownPart.BUILDING, row, transform_mesh(make_building(length, width, height, rng), x, y, foot[row], yaw)
 
 
-def find_lowest_ground(town: Town, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+def find_lowest_ground(town: Town, rows: Array) -> Array:
     """Return the lowest ground (N,) [m] under the corners of footprints (N, >=5) x, y, yaw, length, width [m, rad]."""
     x, y, yaw, length, width = rows[:, :5].T
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -297,3 +305,62 @@ def _signals(town: Town) -> Iterator[Owned]:
         ground = town.ground(*foot)
         yield TownPart.SIGNAL, row, transform_mesh(signal_head(kind, z - ground), x, y, ground, yaw)
         yield TownPart.POST, row, transform_mesh(signal_mast(z - ground, reach), foot[0], foot[1], ground, yaw)
+
+
+STOREY_M = 3.0  # height of a storey
+BAY_M = 4.5  # width of a bay of the facade
+GABLED_BELOW_M = 9.0  # buildings lower than this have a gabled roof
+
+
+def make_building(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
+    """Return a building of these dimensions [m] about its ground centre, `length` along x; `rng` draws its facades."""
+    walls = height * 0.68 if height < GABLED_BELOW_M else height - 0.5
+    parts = [box((0, 0, walls / 2), (length, width, walls), Material.WALL)]
+    parts.append(_gable(length, width, walls, height) if height < GABLED_BELOW_M else _parapet(length, width, walls))
+    for turned, (along, depth) in enumerate(((length, width), (width, length))):
+        for side in (-1, 1):
+            front = _facade(along, depth, walls, rng)
+            if front is not None:
+                parts.append(transform_mesh(front, 0, 0, 0, np.pi / 2 * turned + (np.pi if side < 0 else 0)))
+    return join_meshes(parts)
+
+
+def _facade(along: float, depth: float, walls: float, rng: np.random.Generator) -> Mesh | None:
+    """Return the balconies, sills and porches of the side at y = `depth` / 2, or None where it has no bay."""
+    bays = int(along // BAY_M)
+    storeys = int(walls // STOREY_M)
+    parts = []
+    balconies = rng.random() < 0.6
+    for bay in range(bays):
+        x = (bay - (bays - 1) / 2) * along / bays
+        for storey in range(storeys):
+            z = storey * STOREY_M
+            if storey == 0:
+                reach, size = (0.35, (1.6, 0.7, 0.12)) if rng.random() < 0.25 else (0.05, (1.4, 0.1, 0.12))
+                parts.append(box((x, depth / 2 + reach, z + 2.4), size, Material.ROOF))
+            elif balconies and rng.random() < 0.8:
+                parts.append(box((x, depth / 2 + 0.5, z), (2.4, 1.0, 0.15), Material.ROOF))
+                parts.append(box((x, depth / 2 + 0.97, z + 0.5), (2.4, 0.06, 0.9), Material.METAL))
+            else:
+                parts.append(box((x, depth / 2 + 0.06, z + 0.9), (1.5, 0.12, 0.12), Material.ROOF))
+    return join_meshes(parts) if parts else None
+
+
+def _parapet(length: float, width: float, walls: float) -> Mesh:
+    return box((0, 0, walls + 0.25), (length + 0.4, width + 0.4, 0.5), Material.ROOF)
+
+
+def _gable(length: float, width: float, walls: float, height: float) -> Mesh:
+    """Return a gabled roof with its ridge along the longer side, from the height `walls` to `height` [m]."""
+    turned = width > length
+    along, across = (width, length) if turned else (length, width)
+    x = np.array((-1.0, 1.0)) * (along / 2 + 0.3)
+    slopes = [[(end, y * (across / 2 + 0.3), z) for y, z in ((-1, walls), (0, height), (1, walls))] for end in x]
+    ends = [[(end, y * across / 2, z) for y, z in ((-1, walls), (0, height - 0.1), (1, walls))] for end in x * 0.97]
+    walled = [Mesh(np.array(end, np.float32), np.array([[0, 1, 2]], np.int32), _one(Material.WALL)) for end in ends]
+    return transform_mesh(join_meshes((sheet(slopes, Material.ROOF), *walled)), 0, 0, 0, np.pi / 2 if turned else 0.0)
+
+
+def _one(material: Material) -> np.ndarray:
+    """Return the material of a mesh of one face."""
+    return np.array([material], np.uint8)

@@ -8,15 +8,12 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import InputError
 from flcav.geometry import rotations
-from flcav.storage.files import atomic_path
-from flcav.storage.parquet import read_parquet
+from flcav.storage.files import atomic_path, read_parquet
 from flcav.world.shapes import SHAPES
-
-Array = NDArray[np.float64]
 
 CATEGORIES = ("car", "van", "truck", "bus", "motorcycle", "bicycle", "pedestrian")
 METADATA = b"flcav.trace"
@@ -51,22 +48,20 @@ class Trace:
 
     town: str  # name of the town
     time_s: Array  # (T,) ascending, from the start of the traffic
-    actor: NDArray[np.str_]  # (A,) track ids, e.g. "cav0", "veh17", "parked3", "ped8"
-    category: NDArray[np.str_]  # (A,) one of CATEGORIES; "prop" of what a client has put into a live world
-    shape: NDArray[np.int64]  # (A,) row of SHAPES[category], of props of PROPS
+    actor: Words  # (A,) track ids, e.g. "cav0", "veh17", "parked3", "ped8"
+    category: Words  # (A,) one of CATEGORIES; "prop" of what a client has put into a live world
+    shape: Ints  # (A,) row of SHAPES[category], of props of PROPS
     size: Array  # (A, 3) length, width, height [m]
-    present: NDArray[np.bool_]  # (T, A) whether the actor is in the town
+    present: Mask  # (T, A) whether the actor is in the town
     position: Array  # (T, A, 3) ground centre [m]; NaN where absent
     yaw: Array  # (T, A) [rad]; NaN where absent
     velocity: Array  # (T, A, 3) [m/s]; NaN where absent
     acceleration: Array  # (T, A, 3) [m/s^2]; NaN where absent
     yaw_rate: Array  # (T, A) [rad/s]; NaN where absent
-    light: NDArray[np.str_]  # (L,) ids of signals, "junction:link index"
-    light_state: NDArray[np.str_]  # (T, L) one SUMO state letter: G g y r ...
+    light: Words  # (L,) ids of signals, "junction:link index"
+    light_state: Words  # (T, L) one SUMO state letter: G g y r ...
     events: tuple[Event, ...] = ()
-    tilt: Array | None = (
-        None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN where absent; None: all level
-    )
+    tilt: Array | None = None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN if absent; None: all level
     bow: Array | None = None  # (A,) of the ends of its body [m], see `meshes.mesh.bow_ends`; None: all are flat
 
     def model(self, actor: int) -> tuple[str, int, tuple[float, ...]]:

@@ -31,14 +31,8 @@ WEATHER_CLASSES: dict[str, Region] = {
     "sunset": {**_DRY, **_FAR, "sun_elevation_deg": (1.0, 7.0), "cloud_cover": (0.0, 0.5)},
     "night": {**_DRY, **_FAR, "sun_elevation_deg": (-60.0, -10.0), "cloud_cover": (0.0, 1.0)},
 }
-# Least gap between the regions of any two classes, in at least one of these parameters.
-MARGINS: dict[str, float] = {
-    "sun_elevation_deg": 10.0,
-    "cloud_cover": 0.2,
-    "rain_mm_h": 1.0,
-    "visibility_m": 5000.0,
-}
-# The same gaps in units of `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H), of sight.
+# Least gap between the regions of any two classes, in at least one of these parameters, in units of
+# `find_nearest_class`: degrees, share of the sky, decades of rain (+ DRIZZLE_MM_H), decades of visibility.
 SEPARATION: dict[str, float] = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 0.59, "visibility_m": 0.85}
 DRIZZLE_MM_H = 0.1  # added to the rain rate before its logarithm
 

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.town import load_town
 

@@ -19,11 +19,11 @@ from flcav.driving.scenarios import find_scenarios, list_scenarios, spread_scena
 from flcav.driving.seen import TIMES_S, Perception, Seen, predict_motion
 from flcav.driving.studies.importance import compare, kendall, weigh
 from flcav.geometry import Boxes
-from flcav.world.dynamics.blueprints import blueprint
-from flcav.world.map.routes import Route
+from flcav.world.dynamics.vehicle import make_blueprint
+from flcav.world.map.roads import Route
 from flcav.world.snapshot import Collision, Snapshot
 
-CAR = blueprint("car", 3)
+CAR = make_blueprint("car", 3)
 HALF_M = CAR.size[0] / 2
 
 

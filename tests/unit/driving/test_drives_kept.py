@@ -25,15 +25,14 @@ from flcav.driving.studies.error_measurement import Tally, summarise
 from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
 from flcav.driving.studies.pole_gain import FusionTally, PoleGain, Precision, measure_precision
 from flcav.geometry import Boxes, left_vectors
-from flcav.network.messages import unpack
+from flcav.network.ledger import unpack_arrays
 from flcav.optimization.problem import Problem
 from flcav.perception.networks import resolve_network
 from flcav.perception.tracking.tracker import Tracker
 from flcav.perception.trajectory.config import FUTURE
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.statistics.estimates import Estimate
-from flcav.world.map.roads import read_net
-from flcav.world.map.routes import draw_route
+from flcav.world.map.roads import draw_route, read_net
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace, empty_trace
@@ -271,4 +270,4 @@ def test_boxes_of_the_road_join_those_of_the_vehicle_once() -> None:
     assert both.center[:, 0].tolist() == [10.0, 30.0]
     assert len(fuse(cars(), cars((1.0, 1.0)))) == 1
     tracked = Tracker().step(cars((1.0, 1.0)), 0.0)
-    assert unpack(pack_tracks(tracked))["boxes"].shape == (1, 7)
+    assert unpack_arrays(pack_tracks(tracked))["boxes"].shape == (1, 7)

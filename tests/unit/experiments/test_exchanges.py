@@ -12,9 +12,8 @@ from flcav.experiments.experiment import shrink_recipe
 from flcav.federation.state import Divergence, RoundDivergence
 from flcav.federation.upload import name_like
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
-from flcav.network.radio.budget import Radio
+from flcav.network.radio.budget import PathState, Radio
 from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.propagation import PathState
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays

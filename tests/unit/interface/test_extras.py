@@ -12,8 +12,8 @@ from packaging.requirements import Requirement
 
 from flcav.config import InputError
 from flcav.dataset.recording.workers import start_actors
-from flcav.interface.extras import format_install_command
-from flcav.world.opendrive import importing
+from flcav.interface.wording import format_install_command
+from flcav.world.opendrive import netconvert
 
 PROJECT = tomllib.loads((Path(__file__).parents[3] / "pyproject.toml").read_text())["project"]
 
@@ -37,5 +37,5 @@ def test_ray_says_how_to_get_it(monkeypatch, tmp_path):
 def test_importing_towns_says_how_to_get_netconvert(monkeypatch, tmp_path):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(InputError) as told:
-        importing.split_map(Element("OpenDRIVE"), tmp_path / "parts", tmp_path / "map.xodr", left_hand=False)
+        netconvert.split_map(Element("OpenDRIVE"), tmp_path / "parts", tmp_path / "map.xodr", left_hand=False)
     assert str(told.value).endswith(format_install_command("towns"))

@@ -6,8 +6,8 @@ from moving import made_links
 
 from flcav.config import InputError
 from flcav.network.clock.buffers import BufferClock, BufferTiming, chain_links
-from flcav.network.clock.rounds import RoundRules, time_clients
-from flcav.network.clock.work import ClientWork
+from flcav.network.clock.records import ClientWork
+from flcav.network.clock.rounds import RoundRules, time_round
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 NAN = np.nan
@@ -57,7 +57,7 @@ def test_a_buffer_of_all_is_a_synchronous_round():
     work = [ClientWork(name, 250_000, each, 500_000) for name, each in zip("abc", (1.0, 2.5, 4.0), strict=True)]
     own = clock(links, work, 3)
     first, second = own.fill(), own.fill()
-    alone = {each.client: each for each in time_clients(links, work, 1, 0.0, RoundRules())}
+    alone = {each.client: each for each in time_round(links, work, 1, 0.0, RoundRules())}
     assert {each.client: each for each in first.updates} == alone
     assert (first.versions, second.versions) == (dict.fromkeys("abc", 0), dict.fromkeys("abc", 1))
     assert second.end_s == pytest.approx(2 * first.end_s)

@@ -9,11 +9,17 @@ import pytest
 from moving import made_links
 
 from flcav.config import InputError
-from flcav.network.clock.records import ClientTiming, load_rounds, rounds_table, save_rounds
-from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds, time_clients
-from flcav.network.clock.work import ClientWork, work_of_messages
+from flcav.network.clock.records import (
+    ClientTiming,
+    ClientWork,
+    load_rounds,
+    save_rounds,
+    tabulate_rounds,
+    work_of_messages,
+)
+from flcav.network.clock.rounds import NetworkSettings, RoundRules, simulate_rounds, time_round
 from flcav.network.ledger import Direction, LedgerEntry, Link
-from flcav.network.radio.wireline import Wireline
+from flcav.network.radio.links import Wireline
 
 GOOD = 30.0  # dB: 2 bit/s/Hz, 20 Mbit/s of 10 MHz
 MB = 1_000_000
@@ -25,7 +31,7 @@ def work(name: str, down: int = 5 * MB, compute: float = 1.0, up: int = 10 * MB)
 
 
 def only(links, *works: ClientWork, rules: RoundRules | None = None, start_s: float = 0.0):
-    return {timing.client: timing for timing in time_clients(links, works, 1, start_s, rules or RoundRules())}
+    return {timing.client: timing for timing in time_round(links, works, 1, start_s, rules or RoundRules())}
 
 
 def test_one_vehicle_by_hand():
@@ -205,7 +211,7 @@ def test_records_come_back_from_parquet(tmp_path):
     assert table["dropped"].to_pylist() == ["", "left the town", ""]
     assert table["uploaded_bytes"].to_pylist() == [10 * MB, 0, 10 * MB]
     assert table["round_end_s"].to_pylist() == [records[0].end_s, records[0].end_s, records[1].end_s]
-    assert table.equals(rounds_table(records))
+    assert table.equals(tabulate_rounds(records))
     assert load_rounds(path) == records
     assert isinstance(records[0].clients[0], ClientTiming)
     pq.write_table(table.drop(["dropped"]), path)

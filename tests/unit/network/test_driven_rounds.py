@@ -20,8 +20,7 @@ from flcav.federation.strategies.robust import Krum, TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.wireline import Wireline
+from flcav.network.radio.links import RadioLinks, Wireline
 from flcav.pipeline.poles import Sites
 from flcav.pipeline.radio import driving as prediction
 from flcav.pipeline.radio.driving import (

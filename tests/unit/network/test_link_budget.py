@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from flcav.config import InputError
 from flcav.network.radio import budget
 from flcav.network.radio.budget import Radio
-from flcav.network.radio.wireline import Wireline
+from flcav.network.radio.links import Wireline
 
 BOLTZMANN = 1.380649e-23
 

@@ -8,9 +8,8 @@ import pytest
 
 from flcav.network.clock import rounds
 from flcav.network.clock.rounds import RoundRules
-from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
-from flcav.network.radio.propagation import LAWS, PathState, path_loss_db
-from flcav.network.radio.wireline import Wireline
+from flcav.network.radio.budget import LAWS, PathState, Radio, lone_rate_bps, path_loss_db, received_dbm
+from flcav.network.radio.links import Wireline
 
 PAGE = (Path(__file__).parents[3] / "docs" / "network.md").read_text(encoding="utf-8")
 

@@ -13,8 +13,7 @@ import math
 import numpy as np
 import pytest
 
-from flcav.network.radio.budget import Radio, spectral_efficiency
-from flcav.network.radio.propagation import LAWS, PathState, blockage_moments_db, path_loss_db
+from flcav.network.radio.budget import LAWS, PathState, Radio, blockage_moments_db, path_loss_db, spectral_efficiency
 
 # ns-3: loss at 1 m and 1 GHz, factors of lg distance and lg frequency, standard deviation of the shadowing [dB]
 NS3 = {

@@ -9,12 +9,10 @@ from scipy.optimize import linprog
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, points_in_boxes, segments_meet_boxes
-from flcav.network.radio import propagation
-from flcav.network.radio.budget import Radio
-from flcav.network.radio.coverage import cover_town
-from flcav.network.radio.links import link_vehicles, unit_positions
-from flcav.network.radio.propagation import PathState
-from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
+from flcav.network.radio import budget
+from flcav.network.radio.budget import PathState, Radio
+from flcav.network.radio.links import find_sight, link_vehicles, raise_walls, unit_positions, vehicle_boxes
+from flcav.network.radio.recorded import cover_town
 from flcav.statistics.streams import stream
 from flcav.world.map.town import load_town
 
@@ -133,7 +131,7 @@ def test_a_drive_behind_a_truck_and_a_house():
 def test_a_low_unit_behind_a_truck_is_below_it_like_the_car():
     trace = make_trace([0.0], {"cav0": [70.0, 0.0], "van1": [80.0, 0.0]}, {"van1": ("truck", 0)})  # 3.3 m high
     links = link_vehicles(open_town(HOUSE), trace, ["cav0"], {"low": np.array([100.0, 0.0, 2.8])}, MEDIAN)
-    clear = propagation.path_loss_db(links.distance_m, PathState.LOS, 5.9)
+    clear = budget.path_loss_db(links.distance_m, PathState.LOS, 5.9)
     assert (links.loss_db - clear).item() == pytest.approx(9.0)
 
 
@@ -179,7 +177,7 @@ def test_a_blocking_vehicle_keeps_its_draw_as_long_as_it_blocks():
     assert np.ptp(links.loss_db) == pytest.approx(0, abs=1e-9)  # nothing moves: shadowing rests, too
     draw = stream(5, "blockage", "cav0", "pole1", "van1").standard_normal()
     shadow = 3 * stream(5, "shadowing", "cav0", "pole1").standard_normal(3)[0]
-    clear = propagation.path_loss_db(links.distance_m[0, 0, 0], PathState.NLOSV, 5.9)
+    clear = budget.path_loss_db(links.distance_m[0, 0, 0], PathState.NLOSV, 5.9)
     assert links.loss_db[0, 0, 0] == pytest.approx(clear + shadow + max(0, 5 + 4 * draw))
 
 

@@ -10,7 +10,7 @@ import pytest
 from flcav.config import InputError
 from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.history import load_history, parse_histories
-from flcav.storage.exchange import read_csv
+from flcav.storage.records import read_csv
 
 
 def test_a_curve_is_fitted_to_a_file(tmp_path: Path):

@@ -19,10 +19,9 @@ from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.pictures.camera import ALONG
 from flcav.report.pictures.inference import draw
-from flcav.sensors.calibration import CalibrationError, perturb_calibration
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
-from flcav.sensors.rig import Rig
+from flcav.sensors.rig import CalibrationError, Rig, perturb_calibration
 from flcav.world.scene import Scene
 
 LENS = {"width": 320, "height": 192, "fov_deg": 80.0}

@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import _read_image
 from flcav.dataset.formats.reading import measure_picture
 from flcav.dataset.payloads import read_image
-from flcav.network.messages import from_names
+from flcav.network.ledger import from_names
 from flcav.perception.images import (
     check_picture,
     read_picture,

@@ -14,8 +14,7 @@ from flcav.config import InputError
 from flcav.federation.links.link import open_questions
 from flcav.federation.links.metered import open_account
 from flcav.federation.trainable import LocalUpdate
-from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
-from flcav.network.messages import pack
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack_arrays
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.pipeline.arms import check_federations, resolve_settings
@@ -130,7 +129,7 @@ def test_losses_that_members_tell_are_in_the_ledger_and_held_to_the_budget() -> 
 
 
 def as_message(**numbers: float) -> np.ndarray:
-    return np.frombuffer(pack({name: np.array([each], np.float32) for name, each in numbers.items()}), np.uint8)
+    return np.frombuffer(pack_arrays({name: np.array([each], np.float32) for name, each in numbers.items()}), np.uint8)
 
 
 def test_a_loss_that_is_lost_or_cannot_be_read_counts_for_nothing() -> None:

@@ -11,8 +11,7 @@ from line_task import LineTask, Slope
 from flcav.federation.links.link import Replies
 from flcav.federation.trainable import Weights
 from flcav.fleet.fl_request import make_request
-from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
-from flcav.network.messages import pack
+from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack_arrays
 from flcav.perception.task import Task
 from flcav.pipeline.steps.groups import UNREADABLE, Uplink
 from flcav.pipeline.training.fl_requests import answer_requests, take_requests
@@ -74,9 +73,9 @@ def test_messages_of_a_member() -> None:
     [
         b"",
         b"\xff" * 90,
-        pack({"samples": np.array([2])}),
+        pack_arrays({"samples": np.array([2])}),
         *(
-            pack(
+            pack_arrays(
                 {
                     "samples": np.array([2]),
                     "labels": np.array([97, 10], np.uint8),

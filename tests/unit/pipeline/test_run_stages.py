@@ -38,8 +38,8 @@ from flcav.pipeline.training.messages import choose_planned_uploads, choose_uplo
 from flcav.pipeline.training.records import ROUNDS, SCHEMA
 from flcav.statistics.streams import derive_seed
 from flcav.storage import files
-from flcav.storage.exchange import write_table
 from flcav.storage.files import write_bytes
+from flcav.storage.records import write_any_table
 
 START = {"w": np.zeros(3, dtype=np.float32), "count": np.array(0, dtype=np.int64)}
 STAGE_ONE = LedgerEntry("pretrain", "t", "wireless", "up", 0, "suburb/cav0", 4_000_000)
@@ -201,7 +201,7 @@ def test_a_full_disk_leaves_the_tables_of_rounds_that_were_there(
     clock, rounds = tmp_path / "clock.parquet", tmp_path / ROUNDS
     writes: dict[Path, Callable[[], None]] = {
         clock: lambda: save_rounds([], clock),
-        rounds: lambda: write_table(SCHEMA.empty_table(), rounds),
+        rounds: lambda: write_any_table(SCHEMA.empty_table(), rounds),
     }
     for write in writes.values():
         write()

@@ -178,7 +178,7 @@ def test_no_step_reaches_the_drawing_of_results_or_the_command_line(run):
     assert not [name for name in reached if name.startswith("flcav.pipeline.engine.run")]
     experiments = {name for name in reached if name.startswith(("flcav.experiments", "flcav.reproductions"))}
     assert experiments <= {"flcav.experiments.study", *(f"flcav.reproductions.task_{name}.run" for name in OF_STUDIES)}
-    observing = [name for name in reached if name.startswith(("flcav.sensors.rendering", "flcav.sensors.radar.radar"))]
+    observing = [name for name in reached if name.startswith(("flcav.sensors.rendering", "flcav.sensors.observe"))]
     assert bool(observing) == (run in (record_split, recording.record_step))
 
 

@@ -8,8 +8,8 @@ from matplotlib.collections import QuadMesh
 
 from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.radio.budget import Radio
-from flcav.network.radio.coverage import cover_town
 from flcav.network.radio.links import unit_positions
+from flcav.network.radio.recorded import cover_town
 from flcav.report import style
 from flcav.report.charts.timeline import COLOURS, timeline_of_rounds
 from flcav.report.pictures.coverage import coverage_map

@@ -6,11 +6,11 @@ import pytest
 from scipy.spatial import Delaunay
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
-from flcav.sensors.camera.infrared import Infrared, render_thermal
+from flcav.sensors.camera import Camera, Exposure, label, photograph
 from flcav.sensors.frame import SEMANTICS
-from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project
-from flcav.sensors.rendering.render import render
+from flcav.sensors.infrared import Infrared, render_thermal
+from flcav.sensors.lens import BODY_FROM_OPTICAL, compute_pixel_rays, project_optical
+from flcav.sensors.rendering.render import render_radiance
 from flcav.world.map.signals import Signals
 from flcav.world.map.town import Signs, Town
 from flcav.world.meshes import actor_mesh
@@ -49,7 +49,7 @@ def test_an_instance_lies_within_the_hull_of_its_mesh(street: Scene):
     vertices = transform_points(inverse(AHEAD) @ body, actor_mesh("car", 3).vertices.astype(np.float64))
     rows, columns = np.nonzero(picture.instance == 1)
     assert len(rows) > 300
-    assert (Delaunay(project(camera, vertices)).find_simplex(np.c_[columns, rows]) >= 0).all()
+    assert (Delaunay(project_optical(camera, vertices)).find_simplex(np.c_[columns, rows]) >= 0).all()
     assert set(np.unique(picture.semantic[picture.instance == 1])) == {SEMANTICS["car"]}
     assert (picture.semantic[np.isinf(picture.depth_m)] == SEMANTICS["sky"]).all()
 
@@ -95,7 +95,7 @@ def test_a_thin_pole_covers_pixels_by_its_width(small_town: Callable[..., Town],
 
     def light(lamps: np.ndarray) -> np.ndarray:
         scene = Scene(small_town(lamps=lamps), standing([]))
-        picture = render(scene, AHEAD, camera, overcast, np.random.default_rng(0), hidden=None)
+        picture = render_radiance(scene, AHEAD, camera, overcast, np.random.default_rng(0), hidden=None)
         return picture.radiance.reshape(192, 320, 3)[84:93].mean(axis=2)  # between its head and the horizon
 
     sky, taken = light(np.zeros((0, 3))), {}
@@ -135,7 +135,7 @@ def test_signals_show_their_state(
     scene = Scene(small_town(signals=signals), trace)
     picture = shot(scene, camera=camera)
     lens = transform_points(inverse(AHEAD), np.array([[7.89, 0.0, 2.0 + 0.32 * row]]))
-    column, line = np.rint(project(camera, lens)[0]).astype(int)
+    column, line = np.rint(project_optical(camera, lens)[0]).astype(int)
     colour = picture.rgb[line, column].astype(int)
     assert colour.argmax() == band
     assert colour[band] > 150

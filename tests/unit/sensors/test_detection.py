@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flcav.sensors.lidar.returns import QUANTILES, detect
+from flcav.sensors.lidar.returns import QUANTILES, detect_returns
 
 LEVELS = len(QUANTILES)
 LEAST = 1e-4  # P_min
@@ -23,7 +23,7 @@ def detected(
     directions = np.column_stack((np.cos(angle), np.sin(angle), np.zeros(rays))).astype(np.float32)
     points, actor = np.full((rays, 4), np.nan, np.float32), np.full(rays, -9, np.int32)
     far, bright = np.array(distance, np.float32), np.array(brightness, np.float32)
-    count = detect(
+    count = detect_returns(
         directions,
         far,
         bright,

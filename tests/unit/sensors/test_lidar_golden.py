@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flcav.geometry import pose
 from flcav.sensors.lidar.lidar import Lidar, scan
 from flcav.world.materials import PAINT_REFLECTIVITY, REFLECTIVITY, Material
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene, Surfaces
 
 FLOOR, WALL, PANE, DOOR, SIGN = range(5)  # planes: the floor z = 0, and x = their distance

@@ -9,13 +9,12 @@ from hypothesis import strategies as st
 from flcav.config import InputError
 from flcav.dataset.checks.images import check_images
 from flcav.geometry import inverse, points_in_boxes, pose
-from flcav.sensors.calibration import CalibrationError
-from flcav.sensors.camera.camera import Camera
-from flcav.sensors.lens import project
+from flcav.sensors.camera import Camera
+from flcav.sensors.ground_truth import find_occluded_rays
+from flcav.sensors.lens import project_optical
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern, cast, draw_passes
-from flcav.sensors.lidar.visibility import find_occluded_rays
 from flcav.sensors.observe import observe
-from flcav.sensors.rig import RIGS, MountedLidar, Rig
+from flcav.sensors.rig import RIGS, CalibrationError, MountedLidar, Rig
 from flcav.world.map.town import Signs, Town
 from flcav.world.scene import Scene
 from flcav.world.shapes import SHAPES
@@ -270,7 +269,7 @@ def test_signs_are_named_where_their_readable_side_shows(
     assert seen.pixels[0] > 5
     camera = frame.world_from_sensor("front")
     assert seen.distance_m[0] == pytest.approx(np.linalg.norm(position[0] - camera[:3, 3]))
-    u, v = project(Camera(width=96, height=64), (position[:1] - camera[:3, 3]) @ camera[:3, :3])[0]
+    u, v = project_optical(Camera(width=96, height=64), (position[:1] - camera[:3, 3]) @ camera[:3, :3])[0]
     x1, y1, x2, y2 = seen.box[0]
     assert x1 < u < x2
     assert y1 < v < y2

@@ -5,18 +5,21 @@ import numpy as np
 import pytest
 
 from flcav.geometry import pose
-from flcav.sensors.radar.detector import (
+from flcav.sensors.radar import (
     ACTOR_RCS,
     Cells,
+    Radar,
     compute_actor_rcs,
-    detect,
+    cross_sections,
+    detect_cells,
+    draw_rays,
     false_alarms,
     silhouette,
     snr_per_m2,
+    sweep_radar,
 )
-from flcav.sensors.radar.radar import Radar, cross_sections, draw_rays, sweep_radar
 from flcav.world.map.town import Town
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 from flcav.world.trace import CATEGORIES, Trace
 from flcav.world.weather import WEATHERS
@@ -89,7 +92,7 @@ def test_detection_follows_swerling_and_the_radar_equation(range_m: float, sigma
     radar = Radar(range_m=200.0, detects_car_m=150.0, false_alarm_rate=1e-5)
     half = -np.log(1e-5) / np.log(2) - 1
     snr = half * sigma / 10.0 * (150.0 / range_m) ** 4
-    reported, _ = detect(cells(20_000, range_m, sigma), radar, 0.0, np.random.default_rng(0))
+    reported, _ = detect_cells(cells(20_000, range_m, sigma), radar, 0.0, np.random.default_rng(0))
     assert len(reported) / 20_000 == pytest.approx(1e-5 ** (1 / (1 + snr)), abs=0.012)
 
 
@@ -97,7 +100,7 @@ def test_errors_shrink_with_power_and_cross_sections_are_right_on_average():
     radar = Radar(range_m=200.0, false_alarm_rate=1e-5)
     spread = []
     for range_m in (20.0, 120.0):
-        reported, _ = detect(cells(20_000, range_m, 10.0), radar, 0.0, np.random.default_rng(0))
+        reported, _ = detect_cells(cells(20_000, range_m, 10.0), radar, 0.0, np.random.default_rng(0))
         spread.append(reported[:, 0].std() / radar.range_cell_m)
         if range_m == 20.0:
             assert np.mean(10 ** (reported[:, 4] / 10)) == pytest.approx(10.0, rel=0.03)

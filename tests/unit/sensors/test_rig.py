@@ -2,9 +2,8 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.sensors.calibration import CalibrationError, build_calibration, perturb_calibration
-from flcav.sensors.lens import Lens, project
-from flcav.sensors.rig import RIGS, Rig
+from flcav.sensors.lens import Lens, project_optical
+from flcav.sensors.rig import RIGS, CalibrationError, Rig, build_calibration, perturb_calibration
 
 
 def rig(**kinds: object) -> Rig:
@@ -42,7 +41,7 @@ def test_six_cameras_leave_no_direction_unseen():
     for name, camera in RIGS["car_surround"].cameras.items():
         agent_from_camera = calibration.agent_from_sensor[name]
         far = 1e4 * np.stack((np.cos(azimuth), np.sin(azimuth), 0 * azimuth), axis=1)
-        pixels = project(camera.settings, (far - agent_from_camera[:3, 3]) @ agent_from_camera[:3, :3])
+        pixels = project_optical(camera.settings, (far - agent_from_camera[:3, 3]) @ agent_from_camera[:3, :3])
         seen |= (pixels[:, 0] >= 0) & (pixels[:, 0] <= camera.settings.width - 1)
     assert seen.all()
 

@@ -9,20 +9,16 @@ from scipy.ndimage import label
 from shapely.geometry import MultiPolygon, Point, Polygon
 
 from flcav.geometry import pose
-from flcav.machine import memory
-from flcav.sensors.camera.camera import Camera, photograph
-from flcav.sensors.camera.tone import develop, grain
+from flcav.machine import threads
+from flcav.sensors.camera import Camera, develop, grain, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
-from flcav.sensors.rendering import supersampling
-from flcav.sensors.rendering.ambient_occlusion import DARKEST, compute_ambient_occlusion
+from flcav.sensors.rendering import render
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sensors.rendering.gbuffer import fill_gbuffer
-from flcav.sensors.rendering.glare import add_sun_glare
-from flcav.sensors.rendering.ground import build_markings, find_paint
-from flcav.sensors.rendering.light import compute_light
-from flcav.sensors.rendering.rain import add_drops
-from flcav.world.map.layers import Arrow, Crossing, MapLayers, Marking
-from flcav.world.map.paint import outline_paint
+from flcav.sensors.rendering.ground import build_markings, sample_paint
+from flcav.sensors.rendering.light import DARKEST, compute_ambient_occlusion, compute_light
+from flcav.sensors.rendering.rain import add_drops, add_sun_glare
+from flcav.world.map.layers import Arrow, Crossing, MapLayers, Marking, outline_paint
 from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
@@ -47,7 +43,7 @@ def test_further_rays_may_take_what_pixels_beside_them_show(street: Scene, monke
         return photograph(street, AHEAD, camera, WEATHERS["clear"], np.random.default_rng(0)).rgb.astype(int)
 
     quick = shot()
-    monkeypatch.setattr(supersampling, "donors", lambda *arguments: arguments[-1].fill(-1))
+    monkeypatch.setattr(render, "donors", lambda *arguments: arguments[-1].fill(-1))
     difference = np.abs(quick - shot()).max(axis=2)
     assert difference.max() > 0
     assert difference.mean() < 0.3
@@ -74,7 +70,7 @@ def test_what_is_painted_is_what_the_map_says():
     rng, narrow, found = np.random.default_rng(0), np.float32(1e-4), 0
     for x, y in rng.uniform((-1, -9), (21, 6), (2500, 2)):
         if shapes.boundary.distance(Point(x, y)) > 0.07:  # arrows are strips
-            share, _ = find_paint(x, y, np.float32(1), np.float32(0), narrow, narrow, markings)
+            share, _ = sample_paint(x, y, np.float32(1), np.float32(0), narrow, narrow, markings)
             assert share == shapes.contains(Point(x, y))
             found += share
     assert found > 40
@@ -138,8 +134,8 @@ def test_brightness_rises_and_walls_in_the_sun_are_not_burnt_out():
 @pytest.mark.parametrize(("library", "calls"), [("glibc", 2), ("", 0)])
 def test_memory_is_kept_only_where_the_library_can(monkeypatch: pytest.MonkeyPatch, library: str, calls: int):
     set_to: list[tuple[int, int]] = []
-    monkeypatch.setattr(memory.platform, "libc_ver", lambda: (library, ""))
-    monkeypatch.setattr(memory.ctypes, "CDLL", lambda name: SimpleNamespace(mallopt=lambda *pair: set_to.append(pair)))
-    memory.keep_freed_memory.__wrapped__()
+    monkeypatch.setattr(threads.platform, "libc_ver", lambda: (library, ""))
+    monkeypatch.setattr(threads.ctypes, "CDLL", lambda name: SimpleNamespace(mallopt=lambda *pair: set_to.append(pair)))
+    threads.keep_freed_memory.__wrapped__()
     assert len(set_to) == calls
-    assert all(size in (memory.KEPT_BYTES, memory.LARGEST_BYTES) for _, size in set_to)
+    assert all(size in (threads.KEPT_BYTES, threads.LARGEST_BYTES) for _, size in set_to)

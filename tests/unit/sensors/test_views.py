@@ -9,9 +9,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
-from flcav.sensors.labels.outlines import clip_boxes, compute_amodal_boxes, hull
-from flcav.sensors.labels.views import find_actor_regions, find_thing_regions, view_actors
-from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays, project
+from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays, project_optical
+from flcav.sensors.views import (
+    clip_boxes,
+    compute_amodal_boxes,
+    find_actor_regions,
+    find_thing_regions,
+    hull,
+    view_actors,
+)
 from flcav.world.map.town import Town
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
@@ -67,7 +73,7 @@ def test_amodal_boxes_are_around_every_vertex(
     points = transform_points(inverse(at) @ scene.world_from_actor(0), actor_mesh(*pair).vertices.astype(np.float64))
     if points[:, 2].min() < 0.1:
         return
-    pixels = project(lens, points)
+    pixels = project_optical(lens, points)
     expected = np.concatenate((pixels.min(axis=0), pixels.max(axis=0)))
     if (expected[:2] < (lens.width - 0.5, lens.height - 0.5)).all() and (expected[2:] > -0.5).all():
         if k1 == 0:

@@ -16,8 +16,7 @@ from flcav.sources.live import LiveSource
 from flcav.storage.files import sha256
 from flcav.world.commands import Controls, Spawn
 from flcav.world.live import LiveWorld, Settings
-from flcav.world.map.roads import read_net
-from flcav.world.map.routes import draw_route
+from flcav.world.map.roads import draw_route, read_net
 from flcav.world.snapshot import Snapshot
 
 RIG = Rig(lidars={"lidar": MountedLidar(mount=Mount(z=1.8), settings=Lidar(channels=8, azimuth_steps=180))})

@@ -9,7 +9,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
-from flcav.storage.parquet import read_parquet
+from flcav.storage.files import read_parquet
 
 
 def test_a_table_that_would_fill_the_memory_is_not_read(tmp_path: Path) -> None:

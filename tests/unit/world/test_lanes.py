@@ -14,8 +14,7 @@ from shapely.geometry.polygon import orient
 
 from flcav.geometry import pose
 from flcav.world.map.lanes import RASTER_LAYERS, fill_polygons, map_layers, rasterise
-from flcav.world.map.layers import MapLayers
-from flcav.world.map.paint import outline_paint
+from flcav.world.map.layers import MapLayers, outline_paint
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.town import TOWNS, Town, load_town
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from flcav.world.line_of_sight import count_visible_actors, find_viewshed, find_visible
+from flcav.world.line_of_sight import count_visible_actors, find_viewshed, find_visible_pairs
 
 HOUSE = np.array([[20.0, 0.0, 0.0, 10.0, 10.0, 10.0]])  # x 15-25, y -5-5, 10 m high
 SITES = np.array([[0.0, 0.0, 5.0], [20.0, 30.0, 5.0]])
@@ -12,7 +12,7 @@ PAIRS = (np.array([0, 0, 0, 1, 1, 1]), np.array([0, 1, 2, 0, 1, 2]))
 
 
 def test_a_building_hides_what_is_behind_it(small_town):
-    seen = find_visible(small_town(buildings=HOUSE), [], SITES, PLACES, PAIRS)
+    seen = find_visible_pairs(small_town(buildings=HOUSE), [], SITES, PLACES, PAIRS)
     assert seen.reshape(2, 3).tolist() == [[False, True, True], [True, True, True]]
 
 
@@ -30,9 +30,9 @@ def test_traffic_hides_where_it_stands_at_half_of_the_instants(small_town, stand
     town, site, place = small_town(), np.array([[0.0, 0.0, 1.5]]), np.array([[30.0, 0.0, 0.8]])
     pair = (np.zeros(1, np.int64), np.zeros(1, np.int64))
     van = standing([("van0", "van", 0, 12.0, 0.0, np.pi / 2)])
-    assert find_visible(town, [], site, place, pair).tolist() == [True]
-    assert find_visible(town, [van], site, place, pair).tolist() == [False]
-    assert find_visible(town, [van, standing([])], site, place, pair).tolist() == [True]
+    assert find_visible_pairs(town, [], site, place, pair).tolist() == [True]
+    assert find_visible_pairs(town, [van], site, place, pair).tolist() == [False]
+    assert find_visible_pairs(town, [van, standing([])], site, place, pair).tolist() == [True]
 
 
 def test_actors_count_where_they_are_near_and_seen(small_town, standing):

@@ -29,13 +29,13 @@ from flcav.world.commands import (
     Spawn,
     Walk,
 )
-from flcav.world.live import LiveWorld, Obstructed, Settings, Step, replay
+from flcav.world.live import LiveStep, LiveWorld, Obstructed, Settings, replay
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot, join_snapshots
-from flcav.world.traffic.lights import read_light_programs
+from flcav.world.traffic.live import read_light_programs
 from flcav.world.traffic.traffic import simulate
 
 EMPTY = Settings()
@@ -377,7 +377,7 @@ def test_the_same_commands_give_the_same_bytes_and_a_fork_goes_on_alike():
         assert [content(each) for each in drive_along(fork, 10, np.random.default_rng(2))] == [content(e) for e in end]
     with replay(town, Settings(seed=4, traffic=12, pedestrians=4, dt_s=0.1), history) as other:
         assert content(other.snapshot) != content(whole[-1])
-    assert sum(isinstance(entry, Step) for entry in history) == 40
+    assert sum(isinstance(entry, LiveStep) for entry in history) == 40
 
 
 def test_traffic_brakes_for_what_stands_in_its_way():

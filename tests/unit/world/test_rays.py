@@ -10,10 +10,8 @@ from hypothesis import strategies as st
 
 from flcav.geometry import inverse, pose, transform_points
 from flcav.machine.compiled import compiled
-from flcav.world.rays.embree import Assembly, Embree, Solid
-from flcav.world.rays.hits import MISS
-from flcav.world.rays.loader import embree_library
-from flcav.world.rays.packets import trace_packets
+from flcav.world.rays.embree import Assembly, Solid, embree_library
+from flcav.world.rays.packets import MISS, trace_packets
 
 FORWARD = np.array([[1.0, 0.0, 0.0]], np.float32)
 
@@ -74,10 +72,9 @@ def test_matches_brute_force(seed: int):
 
 def test_solid_alone_matches_the_placed_one():
     rng = np.random.default_rng(0)
-    engine = Embree()
-    solid = engine.solid(*soup(rng, 60))
+    solid = Solid(*soup(rng, 60))
     place, eye, rays = pose(20.0, -3.0, 1.0, yaw=0.7), pose(15.0, -3.0, 0.0, yaw=-0.4), directions(rng, 501)
-    assembly = engine.assembly([solid])
+    assembly = Assembly([solid])
     assembly.place(0, place)
     assembly.commit()
     placed = assembly.trace(eye, rays)

@@ -5,10 +5,9 @@ import pytest
 from shapely.geometry import LineString, Point
 
 from flcav.config import InputError
-from flcav.world.map.roads import RoadNet, read_net
-from flcav.world.map.routes import Route, draw_route
+from flcav.world.map.roads import RoadNet, Route, draw_route, read_net
 from flcav.world.map.town import PACKAGED, load_town
-from flcav.world.traffic.lights import read_light_programs
+from flcav.world.traffic.live import read_light_programs
 
 
 @pytest.fixture(scope="module")

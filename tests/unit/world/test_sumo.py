@@ -17,7 +17,7 @@ from flcav.world.map.town import load_town
 from flcav.world.traffic import client
 from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import write_demand
-from flcav.world.traffic.simulation import ROUTES, Job, Request
+from flcav.world.traffic.simulation import ROUTES, StepRequest, TrafficJob
 
 ASK = """
 import sys
@@ -33,7 +33,7 @@ sys.stdin.read()
 """
 
 
-def asked(folder: Path, seed: int = 1, net: Path | None = None) -> Job:
+def asked(folder: Path, seed: int = 1, net: Path | None = None) -> TrafficJob:
     """Return a job with its files in the folder."""
     folder.mkdir(exist_ok=True)
     town = load_town("suburb")
@@ -41,7 +41,7 @@ def asked(folder: Path, seed: int = 1, net: Path | None = None) -> Job:
     return write_job(folder, net or town.net, demand, seed)
 
 
-def recorded(job: Job, steps: list[int]) -> np.ndarray:
+def recorded(job: TrafficJob, steps: list[int]) -> np.ndarray:
     """Return the states of a run at these steps."""
     out = Path(job.folder) / "out.npz"
     with closing(Sumo(job)) as sumo:
@@ -81,7 +81,7 @@ def test_a_recording_is_what_steps_with_nobody_under_control_are(tmp_path: Path)
     with np.load(tmp_path / "recorded/out.npz") as arrays:
         names, types = arrays["id"].tolist(), arrays["type"].tolist()
     with closing(Sumo(asked(tmp_path / "stepped"))) as sumo:
-        seen = [sumo.begun, *(sumo.step(Request()) for _ in range(steps[-1]))]
+        seen = [sumo.begun, *(sumo.step(StepRequest()) for _ in range(steps[-1]))]
     assert len(seen[steps[-1]]) > len(seen[1]) > len(seen[0]) == 0
     for row, step in zip(states, steps):
         there = {names[i]: (types[i], *row[i].tolist()) for i in np.flatnonzero(~np.isnan(row[:, 0]))}
@@ -104,9 +104,9 @@ def test_a_run_that_crashes_is_told_and_the_next_one_is_done(tmp_path: Path):
     assert sumo._process is not None
     os.kill(int(children(sumo._process.pid)), signal.SIGSEGV)
     with pytest.raises(RuntimeError, match="SUMO failed: exit code -11"):
-        sumo.step(Request())
+        sumo.step(StepRequest())
     with pytest.raises(RuntimeError, match="closed"):
-        sumo.step(Request())
+        sumo.step(StepRequest())
     sumo.close()
     assert len(recorded(asked(tmp_path / "second"), [50])[0])
 
@@ -128,11 +128,11 @@ def test_an_interrupted_request_leaves_no_answer_to_the_next(tmp_path: Path, mon
     assert sumo._process is not None
     monkeypatch.setattr(sumo._process.stdout, "readline", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        sumo.step(Request())
+        sumo.step(StepRequest())
     monkeypatch.undo()
     os.kill(fork, signal.SIGKILL)
     with pytest.raises(RuntimeError, match="closed"):
-        sumo.step(Request())
+        sumo.step(StepRequest())
     job = asked(tmp_path / "bad")
     (tmp_path / "bad" / ROUTES).write_text("<routes><vehicle")
     with pytest.raises(RuntimeError, match="unexpected end"):

@@ -15,8 +15,8 @@ from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, TOWNS, Town, load_town
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import CATEGORIES, Trace
+from flcav.world.traffic.simulation import HURRY_MPS, Walkers
 from flcav.world.traffic.traffic import simulate, simulate_drives
-from flcav.world.traffic.walkers import HURRY_MPS, Walkers
 
 TIMES_S = 60.0 + 0.1 * np.arange(300)
 ROUGHLY = {

@@ -10,7 +10,6 @@ from flcav.config import Config, InputError, parse_config
 from flcav.world.weather import (
     ANY,
     DRIZZLE_MM_H,
-    MARGINS,
     SEPARATION,
     WEATHER_CLASSES,
     WEATHERS,
@@ -23,6 +22,9 @@ from flcav.world.weather import (
 )
 
 CLASSES = ["clear", "cloudy", "overcast", "light_rain", "heavy_rain", "fog", "sunset", "night"]
+
+# least gap between the regions of any two classes, in at least one of these parameters
+MARGINS = {"sun_elevation_deg": 10.0, "cloud_cover": 0.2, "rain_mm_h": 1.0, "visibility_m": 5000.0}
 
 
 class Wanted(Config):

@@ -117,8 +117,8 @@ def inside(
     from flcav.odd.domain import read_domain
     from flcav.odd.judge import compare_verdicts, describe_agreement, judge, write_verdicts
     from flcav.odd.measure import measure, scenery_of
-    from flcav.storage.exchange import check_ending
     from flcav.storage.files import check_writable
+    from flcav.storage.records import check_ending
 
     if not perceived:
         refuse_unused("odd inside without --perceived", "weather", "objects", "device")

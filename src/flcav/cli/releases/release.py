@@ -6,7 +6,7 @@ import typer
 
 from flcav.cli.releases import candidates, repositories, rollouts
 from flcav.config import InputError
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 
 release = typer.Typer(
     help="Releases: verify a network, let provider and customer acknowledge it, roll it out.", no_args_is_help=True

@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from flcav.dataset.calibration import Calibrations
 from flcav.geometry import inverse, is_rigid
-from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Calibration
+from flcav.sensors.rig import CalibrationError
 
 SIGMAS = 6.0  # a larger error, in standard deviations, is reported
 EXACT = 1e-6  # tolerance of rounding, in the unit of each error: [m], [degrees], [px], [ms]

@@ -7,9 +7,9 @@ import numpy as np
 from flcav.config import parse_config
 from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.sensors.frame import Array, CameraImage, Frame, SignViews, Views
-from flcav.sensors.labels.signs import STATES
-from flcav.sensors.labels.views import find_actor_regions
+from flcav.sensors.ground_truth import STATES
 from flcav.sensors.lens import Lens, compute_pixel_rays
+from flcav.sensors.views import find_actor_regions
 
 MARGIN_M = 0.3  # distance by which a pixel may lie outside its actor's 3D box: wing mirrors, turning since the spin
 MARGIN_PX = 3.0  # distance by which a pixel may lie outside its actor's amodal box

@@ -23,8 +23,8 @@ from flcav.dataset.upright import measure_upright
 from flcav.geometry import Boxes, count_points_in_boxes, inverse, is_rigid
 from flcav.interface.wording import plural
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
-from flcav.sensors.labels.outlines import outline_boxes
 from flcav.sensors.lens import Lens
+from flcav.sensors.views import outline_boxes
 
 Array = NDArray[np.float64]
 

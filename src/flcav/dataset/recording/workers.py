@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from flcav.dataset.recording.jobs import Engine, Job, Part, perform
-from flcav.machine.actors import actor_pool
 from flcav.machine.processes import process_pool, start_server
+from flcav.machine.ray_engine import actor_pool
 from flcav.sources.source import Isolated, Source
 
 POLL_S = 0.2

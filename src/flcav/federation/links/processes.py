@@ -20,9 +20,8 @@ from typing import Any
 from flcav.config import InputError
 from flcav.federation.links.in_process import ClientLate, NamedClients
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
-from flcav.machine.memory import keep_freed_memory
 from flcav.machine.processes import exit_with_parent, start_server
-from flcav.machine.threads import use_threads
+from flcav.machine.threads import keep_freed_memory, use_threads
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from flcav.federation.links.in_process import LinkGrid, NamedClients, keep_ident
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Arrays, Trainable
 from flcav.federation.wire import METRICS, to_array_record
-from flcav.machine.actors import ray_session
+from flcav.machine.ray_engine import ray_session
 
 STARTING_S = 120.0  # for the nodes to be there
 

@@ -30,7 +30,7 @@ from flcav.federation.links.ros_names import ROS_NAMESPACE, join_names
 from flcav.federation.state import ClientStates
 from flcav.federation.trainable import Trainable
 from flcav.federation.wire import pack_records, refuse_request, unpack_records
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 from flcav.storage.files import write_bytes
 
 DEFINITION = """std_msgs/MultiArrayLayout layout

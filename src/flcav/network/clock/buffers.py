@@ -12,9 +12,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flcav.config import InputError
-from flcav.network.clock.records import ClientTiming, RoundTiming
+from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.clock.rounds import TIE, ClientPhases, Phase, RoundRules
-from flcav.network.clock.work import ClientWork
 from flcav.network.radio.links import RadioLinks
 
 PATIENCE = 10  # passes through all scenes, with the longest training each, in which one update has to arrive
@@ -22,7 +21,7 @@ PATIENCE = 10  # passes through all scenes, with the longest training each, in w
 
 @dataclass(frozen=True)
 class BufferTiming:
-    """A buffer that filled: when, whose updates, by which version of the weights, and what broke off meanwhile."""
+    """A full buffer: time, updates with their versions of the weights, and the attempts that failed meanwhile."""
 
     number: int  # from 1; the version of the weights that it leads to
     start_s: float  # when the buffer before was full
@@ -32,7 +31,7 @@ class BufferTiming:
     broken: tuple[ClientTiming, ...]  # attempts, some of them of one client
 
     def as_round(self) -> RoundTiming:
-        """Return it as a round, in which clients may have begun before it did."""
+        """Return the buffer as a round; its clients may have begun before the round."""
         return RoundTiming(self.number, self.start_s, self.end_s, 0.0, 0.0, (*self.updates, *self.broken))
 
 
@@ -109,7 +108,7 @@ class BufferClock(ClientPhases):
         return False
 
     def fill(self) -> BufferTiming:
-        """Let time go on until the buffer is full, and return it; raises `InputError` where no update arrives."""
+        """Advance the clock until the buffer is full, and return it; raises `InputError` where no update arrives."""
         last_s = self.time_s
         while len(self._arrived) < self._size:
             before = len(self._arrived)
@@ -127,7 +126,7 @@ class BufferClock(ClientPhases):
         return found
 
     def hold(self, until_s: float) -> None:
-        """Let time go on to `until_s` [s]: updates arrive, and no client begins, as the server is to have new weights.
+        """Advance the clock to `until_s` [s]: updates arrive, and no client begins before the server has new weights.
 
         In a time that is over nothing happens.
         """
@@ -137,7 +136,7 @@ class BufferClock(ClientPhases):
         self._limit_s = np.inf
 
     def _step(self, *, begin: bool) -> None:
-        """Go on to the next event."""
+        """Advance the clock to the next event."""
         under_way = self.phase < Phase.OVER
         self._drop()
         self._broken += [self._timing(k) for k in np.flatnonzero(under_way & (self.phase == Phase.OVER)).tolist()]
@@ -153,7 +152,7 @@ class BufferClock(ClientPhases):
             self._waits[k] = True
 
     def _begin(self) -> None:
-        """Let clients begin that neither train nor wait, and are in the town and in coverage."""
+        """Start the clients that neither train nor wait, and are in the town and in coverage."""
         n = self.instant
         distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)
         nearest = distance.argmin(axis=1)

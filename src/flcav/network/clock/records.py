@@ -1,15 +1,18 @@
-"""Records of rounds on the clock: when each client downloaded, trained and uploaded, and why one was dropped."""
+"""Records of the clock of rounds: the work of each client, when it did what, and why its update did not arrive."""
 
-from collections.abc import Sequence
+from collections import Counter
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pyarrow as pa
 
 from flcav.config import InputError
-from flcav.storage.parquet import read_parquet, write_parquet
+from flcav.network.ledger import LedgerEntry
+from flcav.storage.files import read_parquet, write_parquet
 
 _TYPES: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.float64()}
 
@@ -60,8 +63,8 @@ SCHEMA = pa.schema(
 )
 
 
-def rounds_table(records: Sequence[RoundTiming]) -> pa.Table:
-    """Return a table with a row per client and round; what is said of the round is in the columns `round_...`."""
+def tabulate_rounds(records: Sequence[RoundTiming]) -> pa.Table:
+    """Return a table with a row per client and round; attributes of the round are in the columns `round_...`."""
     rows = [
         {**asdict(client), **{f"round_{field.name}": getattr(record, field.name) for field in _ROUND}}
         for record in records
@@ -71,8 +74,8 @@ def rounds_table(records: Sequence[RoundTiming]) -> pa.Table:
 
 
 def save_rounds(records: Sequence[RoundTiming], path: Path) -> None:
-    """Write `rounds_table` atomically to a Parquet file."""
-    write_parquet(rounds_table(records), path)
+    """Write `tabulate_rounds` atomically to a Parquet file."""
+    write_parquet(tabulate_rounds(records), path)
 
 
 def load_rounds(path: Path) -> tuple[RoundTiming, ...]:
@@ -90,3 +93,39 @@ def load_rounds(path: Path) -> tuple[RoundTiming, ...]:
         clients = (ClientTiming(**{field.name: row[field.name] for field in fields(ClientTiming)}) for row in own)
         records.append(RoundTiming(round=number, clients=tuple(clients), **about))
     return tuple(records)
+
+
+@dataclass(frozen=True)
+class ClientWork:
+    """The work of a client in a round. Raises `InputError` for a negative number."""
+
+    client: str  # a vehicle of the links
+    download_bytes: int  # the model, from its edge server
+    compute_s: float
+    upload_bytes: int  # its update
+
+    def __post_init__(self) -> None:
+        for name in ("download_bytes", "compute_s", "upload_bytes"):
+            value = getattr(self, name)
+            if not 0 <= value < np.inf:
+                raise InputError(f"{self.client}: {name} = {value}, at least 0 are wanted")
+
+
+def work_of_messages(entries: Iterable[LedgerEntry], compute_s: Mapping[str, float]) -> dict[str, ClientWork]:
+    """Return the work of the clients of one round, by vehicle, with the bytes of its messages by wireless.
+
+    A client of the ledger, "region/vehicle", is the vehicle; `compute_s` has its time to compute [s]. Raises
+    `InputError` for a vehicle that is not in `compute_s`, and for entries of several rounds, stages, tasks or regions.
+    """
+    moved: dict[str, Counter[str]] = {}
+    found = set()
+    for entry in entries:
+        if entry.link == "wireless":
+            region, _, vehicle = entry.client.rpartition("/")
+            found.add((entry.stage, entry.task, entry.round, region))
+            moved.setdefault(vehicle, Counter())[entry.direction] += entry.bytes
+    if len(found) > 1:
+        raise InputError(f"messages of {len(found)} rounds, stages, tasks or regions: those of one round are wanted")
+    if unknown := [vehicle for vehicle in moved if vehicle not in compute_s]:
+        raise InputError(f"{unknown[0]}: has no time to compute")
+    return {name: ClientWork(name, sizes["down"], compute_s[name], sizes["up"]) for name, sizes in moved.items()}

@@ -8,17 +8,13 @@ from collections.abc import Mapping, Sequence
 from enum import IntEnum
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from flcav.arrays import Mask
 from flcav.config import Config, InputError
-from flcav.network.clock.records import ClientTiming, RoundTiming
-from flcav.network.clock.work import ClientWork
+from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.radio.budget import Radio, shared_rates_bps
-from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.wireline import Wireline
-
-Array = NDArray[np.float64]
+from flcav.network.radio.links import RadioLinks, Wireline
 
 LEFT_TOWN = "left the town"
 NO_COVERAGE = "out of coverage"
@@ -89,7 +85,7 @@ class ClientPhases:
         return self.instant == len(self.links.time_s) - 1
 
     def run(self) -> tuple[ClientTiming, ...]:
-        """Go from event to event until every client's update has arrived or is given up."""
+        """Advance from event to event until every client's update has arrived or is dropped."""
         while True:
             self._drop()
             active = self.phase < Phase.OVER
@@ -97,8 +93,8 @@ class ClientPhases:
                 return tuple(map(self._timing, range(len(self.work))))
             self._advance(active)
 
-    def _advance(self, active: NDArray[np.bool_]) -> None:
-        """Let the active clients, one or more, go on until the next event, and end the phases that are done."""
+    def _advance(self, active: Mask) -> None:
+        """Advance the active clients, one or more, to the next event, and end the phases that are complete."""
         transfers = active & (self.phase != Phase.COMPUTE)
         rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
         speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s, or seconds a second
@@ -124,7 +120,7 @@ class ClientPhases:
         self.end_s[rows[self.phase[rows] == Phase.OVER]] = self.time_s
 
     def _drop(self) -> None:
-        """Drop the clients that cannot go on at this time, each for the first reason that holds."""
+        """Drop the clients that cannot continue at this time, each for the first reason that applies."""
         n, rules = self.instant, self.rules
         distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)  # (K, U)
         nearest = distance.argmin(axis=1)
@@ -159,7 +155,7 @@ class ClientPhases:
         )
 
 
-def time_clients(
+def time_round(
     links: RadioLinks, work: Sequence[ClientWork], number: int, start_s: float, rules: RoundRules
 ) -> tuple[ClientTiming, ...]:
     """Return the times of the clients of round `number`, which all begin at `start_s` [s] on the trace's clock.
@@ -196,7 +192,7 @@ def simulate_rounds(
 
     Every vehicle of a round's work that is in the town when the round begins takes part. Before each group of edge
     rounds of a cloud round the cloud's model reaches the edge servers, and after it theirs the cloud, over
-    `settings.wireline`. Raises `InputError` as `time_clients`, and where there is no round, or no multiple of k.
+    `settings.wireline`. Raises `InputError` as `time_round`, and where there is no round, or no multiple of k.
 
     Args:
         links: radio links of the vehicles.
@@ -218,7 +214,7 @@ def simulate_rounds(
         begins = now + down
         instant = int(np.searchsorted(links.time_s, begins, side="right")) - 1
         here = [name for name, there in zip(links.vehicle, links.present[instant].tolist()) if there and name in work]
-        clients = time_clients(links, [work[name] for name in here], number, begins, settings.rounds)
+        clients = time_round(links, [work[name] for name in here], number, begins, settings.rounds)
         ends = max(client.end_s for client in clients) + up
         records.append(RoundTiming(number, now, ends, down, up, clients))
         now = ends

@@ -1,4 +1,9 @@
-"""Radio links of the connected vehicles of a trace to roadside units, instant by instant."""
+"""Radio links of the connected vehicles of a trace to roadside units, instant by instant; wireline links to the cloud.
+
+The direct path between a vehicle and a unit is free, blocked by vehicles, or blocked by buildings. TR 37.885 draws the
+state of urban links along a street by distance; here it follows from the town and its traffic: buildings are the town's
+meshes, and vehicles are boxes as in the report.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,18 +12,18 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from flcav.config import InputError
-from flcav.network.radio import propagation as laws
-from flcav.network.radio.budget import Radio, lone_rate_bps, received_dbm
-from flcav.network.radio.propagation import PathState
-from flcav.network.radio.sight import find_sight, raise_walls, vehicle_boxes
+from flcav.arrays import Array, Ints, Mask
+from flcav.config import Config, InputError
+from flcav.geometry import Boxes, segments_meet_boxes
+from flcav.network.radio import budget as laws
+from flcav.network.radio.budget import PathState, Radio, lone_rate_bps, received_dbm
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
-from flcav.world.rays.embree import Assembly
+from flcav.world.rays.embree import Assembly, Solid, check_embree
+from flcav.world.static import build_buildings_mesh
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -34,7 +39,7 @@ class RadioLinks:
     loss_db: Array  # (T, V, U) path loss, blockage and shadowing; infinite where the vehicle is absent
 
     @property
-    def present(self) -> NDArray[np.bool_]:
+    def present(self) -> Mask:
         """Return (T, V) whether each vehicle is in the town."""
         return self.state[:, :, 0] >= 0
 
@@ -70,7 +75,7 @@ def check_units(town: Town, units: Mapping[str, Array], radio: Radio) -> None:
 
 
 def walls_of(town: Town, radio: Radio) -> Assembly | None:
-    """Return the buildings that the radio's environment knows: none on a highway."""
+    """Return the buildings that block links in the radio's environment; None on a highway, which has none."""
     return raise_walls(town) if radio.environment == "urban" else None
 
 
@@ -117,13 +122,13 @@ def link_vehicles(
 
 
 class _Paths(NamedTuple):
-    """Geometry of the direct paths, the first two as in `RadioLinks`."""
+    """Geometry of the direct paths; `distance_m` and `state` as in `RadioLinks`."""
 
     distance_m: Array  # (T, V, U)
     state: NDArray[np.int8]  # (T, V, U)
     antenna: Array  # (T, V, 3) of the vehicles [m, world]
     site: Array  # (U, 3)
-    blocker: NDArray[np.int64]  # (T, V, U) the actor in the path; -1 for none
+    blocker: Ints  # (T, V, U) the actor in the path; -1 for none
 
 
 def _losses(
@@ -142,11 +147,7 @@ def _losses(
     tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A)
     top_m = np.take_along_axis(tops, paths.blocker.reshape(len(tops), -1) % tops.shape[1], axis=1)
     blocked = laws.blockage_db(
-        distance,
-        np.minimum(antenna_m, unit_m),
-        np.maximum(antenna_m, unit_m),
-        top_m.reshape(distance.shape),
-        blockage,
+        distance, np.minimum(antenna_m, unit_m), np.maximum(antenna_m, unit_m), top_m.reshape(distance.shape), blockage
     )
     moved = np.linalg.norm(np.diff(paths.antenna, axis=0, prepend=np.nan), axis=-1)
     moved = np.nan_to_num(moved, nan=np.inf)[:, :, None]  # a path begins anew after an absence
@@ -156,3 +157,81 @@ def _losses(
     )
     path_loss = laws.path_loss_db(distance, state, radio.frequency_ghz, radio.environment)
     return path_loss + np.where(paths.state == PathState.NLOSV, blocked, 0.0) + shadowing
+
+
+BLOCKING = ("car", "van", "truck", "bus")  # the vehicle types of TR 37.885, clause 6.1.2
+
+
+@dataclass(frozen=True)
+class PathStates:
+    """States of the direct paths from N antennas to U sites."""
+
+    state: NDArray[np.int8]  # (N, U) a State
+    blocker: Ints  # (N, U) row of the tallest vehicle in the path; -1 where none is
+
+
+def raise_walls(town: Town) -> Assembly:
+    """Return the buildings of a town for ray casting, world frame; raises `OSError` where the engine is missing."""
+    check_embree()
+    mesh = build_buildings_mesh(town)
+    walls = Assembly([Solid(mesh.vertices, mesh.faces)])
+    walls.place(0, np.eye(4))
+    walls.commit()
+    return walls
+
+
+def vehicle_boxes(trace: Trace, instant: int) -> tuple[Boxes, Ints]:
+    """Return the vehicles that can block a path at an instant of a trace, world frame, and their actors (B,)."""
+    actor = np.flatnonzero(trace.present[instant] & np.isin(trace.category, BLOCKING))
+    tilt = None if trace.tilt is None else trace.tilt[instant, actor]
+    center = trace.box_centres(instant)[actor]
+    label = trace.category[actor]
+    return Boxes(center, trace.size[actor], trace.yaw[instant, actor], label, tilt=tilt), actor
+
+
+def find_sight(
+    antennas: Array, sites: Array, walls: Assembly | None, vehicles: Boxes, carrier: Ints | None = None
+) -> PathStates:
+    """Return the states of the paths from antennas (N, 3) to sites (U, 3) [m], all in the frame of the boxes.
+
+    `walls` are the buildings, None where there are none.
+    `carrier` (N,) is the row in `vehicles` of the vehicle that carries each antenna, -1 for none: it does not block.
+    """
+    starts = np.repeat(antennas, len(sites), axis=0)
+    ends = np.tile(sites, (len(antennas), 1))
+    walled = np.zeros(len(starts), np.bool_) if walls is None else _occlude(walls, starts, ends)
+    crossed = segments_meet_boxes(starts, ends, vehicles)
+    if carrier is not None:
+        carried = np.repeat(carrier, len(sites))
+        rows = np.flatnonzero(carried >= 0)
+        crossed[rows, carried[rows]] = False
+    tops = np.where(crossed, vehicles.corners()[..., 2].max(axis=1), -np.inf)
+    hidden = crossed.any(axis=1)
+    blocker = np.where(hidden, tops.argmax(axis=1) if len(vehicles) else 0, -1)
+    state = np.where(walled, PathState.NLOS, np.where(hidden, PathState.NLOSV, PathState.LOS)).astype(np.int8)
+    shape = (len(antennas), len(sites))
+    return PathStates(state.reshape(shape), blocker.reshape(shape))
+
+
+def _occlude(walls: Assembly, starts: Array, ends: Array) -> Mask:
+    """Return (S,) whether a wall is between starts and ends (S, 3) [m]."""
+    length = np.linalg.norm(ends - starts, axis=1)
+    directions = (ends - starts) / np.maximum(length, 1e-9)[:, None]
+    return walls.find_occluded(*(each.astype(np.float32) for each in (starts, directions, length)))
+
+
+class Wireline(Config):
+    """A cable between an edge server and the cloud, the same in both directions, used by nobody else."""
+
+    rate_mbps: float = Field(default=1000.0, gt=0)
+    latency_s: float = Field(default=0.01, ge=0, le=3600)
+
+    def seconds(self, count: int) -> float:
+        """Return the time that a message of `count` bytes takes [s]; raises `InputError` for a negative count.
+
+        >>> Wireline(rate_mbps=100, latency_s=0.02).seconds(1_000_000)
+        0.1
+        """
+        if count < 0:
+            raise InputError(f"a message of {count} bytes: at least 0 are wanted")
+        return self.latency_s + 8 * count / (self.rate_mbps * 1e6)

@@ -24,7 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from flcav.config import InputError, shorten
 from flcav.interface.wording import describe_number, hint_share
 from flcav.optimization.curves.curves import STAGES
-from flcav.storage.exchange import read_csv
+from flcav.storage.records import read_csv
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from flcav.config import InputError, shorten
 from flcav.optimization.placement.cheapest import cover_share
 from flcav.optimization.placement.instance import find_covered
 from flcav.optimization.placement.solve import Method, Placement, find_candidates, place_budget, place_count
-from flcav.world.line_of_sight import find_visible
+from flcav.world.line_of_sight import find_visible_pairs
 from flcav.world.map.town import Town, load_town
 from flcav.world.trace import Trace
 
@@ -118,5 +118,5 @@ def find_seen(
     """Return (P, E) 1.0 where a pole sees an error within `range_m` in the town, past the traffic."""
     visible = find_covered(errors, poles, [range_m])
     pole, error = np.repeat(np.arange(len(poles)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
-    seen = find_visible(town, traces, poles, errors, (pole, error))
+    seen = find_visible_pairs(town, traces, poles, errors, (pole, error))
     return csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)

@@ -1,7 +1,7 @@
 """Labelled sweeps as messages: whole and uncompressed, 16 bytes a point, with the boxes to learn from."""
 
 from flcav.geometry import Boxes
-from flcav.network.messages import Arrays, from_names, pack, to_names, unpack
+from flcav.network.ledger import Arrays, from_names, pack_arrays, to_names, unpack_arrays
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, label_sweep
 from flcav.sensors.frame import Frame
@@ -10,12 +10,14 @@ from flcav.sensors.frame import Frame
 def pack_sweep(frame: Frame, config: SecondConfig) -> bytes:
     """Return the message of a frame's sweep with its ground truth; raises `InputError` where it has no LiDAR."""
     sample = label_sweep(frame, config)
-    return pack({"points": sample.points, **pack_boxes(sample.boxes, "boxes"), **pack_boxes(sample.ignore, "ignore")})
+    return pack_arrays(
+        {"points": sample.points, **pack_boxes(sample.boxes, "boxes"), **pack_boxes(sample.ignore, "ignore")}
+    )
 
 
 def unpack_sweep(message: bytes, config: SecondConfig) -> Sample:
     """Return the training sample in a message: that of `sample_from_frame`."""
-    arrays = unpack(message)
+    arrays = unpack_arrays(message)
     points = crop_to_range(arrays["points"], config)
     return Sample(points, unpack_boxes(arrays, "boxes"), unpack_boxes(arrays, "ignore"))
 

@@ -19,7 +19,7 @@ from flcav.perception.signs.predict import SignDetections, detect
 from flcav.perception.signs.samples import find_targets, size_px
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import unproject_pixels
-from flcav.world.rays.embree import Embree, Solid
+from flcav.world.rays.embree import Solid
 from flcav.world.static import SignsAndSignals, build_static_world, list_signs_and_signals
 
 OVERLAP = 0.5  # least IoU of a true positive
@@ -43,7 +43,7 @@ def register_errors(
     if town is None:
         raise InputError(f"{data.folder}: its town is not known, so that signs have no place in it")
     things, mesh = list_signs_and_signals(town), build_static_world(town).mesh
-    solid = Embree().solid(mesh.vertices, mesh.faces)
+    solid = Solid(mesh.vertices, mesh.faces)
     pairs = [(number, camera) for number in frames for camera in data.cameras(number)]
     if not pairs:
         raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")

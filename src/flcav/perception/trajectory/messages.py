@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.perception.trajectory.config import TrajectoryConfig
 from flcav.perception.trajectory.samples import Columns, Sample, Surround, pictures_at, samples_of
 
@@ -29,14 +29,14 @@ def pack_frames(data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) 
         own["shape"] = np.array(own["raster"].shape)
         own["raster"] = np.frombuffer(zlib.compress(own["raster"].tobytes()), dtype=np.uint8)
         seen = pictures_at(data, i, config.cameras) if config.cameras and len(own["past"]) else None
-        yield pack(own if seen is None else own | dict(zip(Surround._fields, seen, strict=True)))
+        yield pack_arrays(own if seen is None else own | dict(zip(Surround._fields, seen, strict=True)))
 
 
 def unpack_frames(messages: Sequence[bytes]) -> list[Sample]:
     """Return the samples in messages, each once: of several agents, the first one's."""
     found: dict[tuple[int, int], Sample] = {}
     for message in messages:
-        arrays = unpack(message)
+        arrays = unpack_arrays(message)
         arrays["scene"] = to_names(arrays["scene"])
         packed = zlib.decompress(arrays["raster"].tobytes())
         arrays["raster"] = np.frombuffer(packed, dtype=np.uint8).reshape(arrays["shape"])

@@ -20,7 +20,7 @@ from pathlib import Path
 from queue import Queue
 from typing import IO, Any
 
-from flcav.machine.actors import Actor, actor_pool
+from flcav.machine.ray_engine import RayActor, actor_pool
 from flcav.machine.threads import use_threads
 from flcav.pipeline.engine.source_hash import package_hash
 from flcav.pipeline.engine.step import Step, StepRecord, digest, read_value, remove, reserve_sibling
@@ -50,7 +50,7 @@ def open_actors(jobs: int) -> Iterator[Workers]:
         yield Workers(submit, reports)
 
 
-def _perform(actor: "Actor[_Worker]", folder: Path, step: Step, record: StepRecord, reports: Queue[Any]) -> Any:
+def _perform(actor: "RayActor[_Worker]", folder: Path, step: Step, record: StepRecord, reports: Queue[Any]) -> Any:
     """Send an actor the folders that it does not have yet, let it perform a step, and return the step's value."""
     from ray import cloudpickle  # pyright: ignore[reportMissingImports]: an extra
 

@@ -21,7 +21,7 @@ from typing import Any
 
 import flcav
 from flcav.config import Config
-from flcav.machine.memory import pause_collector
+from flcav.machine.threads import pause_collector
 from flcav.pipeline.engine.step import digest
 
 Place = tuple[str, str]  # module, name bound at its top; WHOLE: all of them, "": statements that any import runs

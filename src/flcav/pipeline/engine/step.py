@@ -17,7 +17,7 @@ from flcav.config import SHOWN, Config, InputError, Json, read_json, shorten
 from flcav.interface.progress import Report, print_progress
 from flcav.interface.wording import plural
 from flcav.storage.files import flush_tree, write_json
-from flcav.storage.records import flatten
+from flcav.storage.records import flatten_record
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps
@@ -69,7 +69,7 @@ class Step:
     def asked(self) -> dict[str, Json]:
         """Return the arguments as JSON values, by dotted name, to say in which of them two steps differ."""
         values = json.loads(json.dumps(self.arguments, default=_fields))
-        return {name.removeprefix("settings.").removeprefix("recipe."): value for name, value in flatten(values)}
+        return {name.removeprefix("settings.").removeprefix("recipe."): value for name, value in flatten_record(values)}
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
         """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).

@@ -13,8 +13,7 @@ from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.fusion.road import RoadView, build_road_view, label_ideally
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report
-from flcav.network.ledger import Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Ledger, send_message
 from flcav.perception.metrics import match
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
@@ -117,7 +116,7 @@ def label_frames(
         told, name = [*views.get((key.scene, key.index), {}).values()], f"{region}/{key.agent}"
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
-            told = [RoadView.from_message(send(book, view.message(), **about)) for view in told]
+            told = [RoadView.from_message(send_message(book, view.message(), **about)) for view in told]
         known = replace(frame, world_from_agent=navigate(data, i, poses)[0])
         samples.setdefault(name, []).append(label(i, known, told))
         report(done, len(frames), "labels")

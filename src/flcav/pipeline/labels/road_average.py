@@ -29,8 +29,7 @@ from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import Direction, Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Direction, Ledger, send_message
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import second
 from flcav.perception.objects.samples import Sample
@@ -170,4 +169,4 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
 
     def _send(self, direction: Direction, i: int, round_: int, message: bytes) -> bytes:
         about: Any = {"stage": self._stage, "task": OBJECTS.name, "link": "wireless", "client": self._name(i)}
-        return send(self._book, message, **about, direction=direction, round_=round_)
+        return send_message(self._book, message, **about, direction=direction, round_=round_)

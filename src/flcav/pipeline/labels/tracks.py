@@ -14,7 +14,7 @@ from flcav.fusion.road import RoadView
 from flcav.fusion.tracks import LEAST_SCORE, Sweep, track_objects
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_in
@@ -69,12 +69,12 @@ def save_tracks(tracks: Mapping[int, Boxes], folder: Path) -> None:
     frame = np.repeat(np.array([*tracks], dtype=np.int64), [len(own) for own in tracks.values()])
     arrays = {"frames": np.array([*tracks], dtype=np.int64), "frame": frame, "boxes": boxes.array()}
     arrays |= {"score": np.zeros(0) if boxes.score is None else boxes.score, "label": from_names(boxes.label.tolist())}
-    write_bytes(folder / TRACKS, pack(arrays))
+    write_bytes(folder / TRACKS, pack_arrays(arrays))
 
 
 def load_tracks(folder: Path) -> dict[int, Boxes]:
     """Return the tracks of frames, by number, in a step's folder: the inverse of `save_tracks`."""
-    arrays = unpack((folder / TRACKS).read_bytes())
+    arrays = unpack_arrays((folder / TRACKS).read_bytes())
     boxes = Boxes.from_array(arrays["boxes"], to_names(arrays["label"]), arrays["score"])
     return {i: boxes[arrays["frame"] == i] for i in arrays["frames"].tolist()}
 

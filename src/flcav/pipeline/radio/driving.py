@@ -15,9 +15,8 @@ from flcav.federation.links.metered import Outage
 from flcav.federation.modes.buffered import Buffers
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
-from flcav.network.clock.records import ClientTiming, RoundTiming
-from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
-from flcav.network.clock.work import ClientWork
+from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
+from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_round
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.pipeline.frames import Frames
@@ -124,7 +123,7 @@ def _time(
     if not clients:
         return {}
     work = [fleet.work(each) for each in clients]
-    return dict(zip(clients, time_clients(links, work, number, float(links.time_s[0]), rules), strict=True))
+    return dict(zip(clients, time_round(links, work, number, float(links.time_s[0]), rules), strict=True))
 
 
 def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, deadline_s: float) -> set[str]:
@@ -205,6 +204,6 @@ def predict_air_s(scenes: Sequence[RadioLinks], download_bytes: int, upload_byte
         present = [name for name, here in zip(links.vehicle, links.present[0].tolist(), strict=True) if here]
         if present and len(links.time_s) > 1:
             work = [ClientWork(name, download_bytes, 0.0, upload_bytes) for name in present]
-            timings = time_clients(links, work, 1, float(links.time_s[0]), RoundRules())
+            timings = time_round(links, work, 1, float(links.time_s[0]), RoundRules())
             spent += [timing.end_s - timing.start_s for timing in timings if not timing.dropped]
     return float(np.mean(spent)) if spent else None

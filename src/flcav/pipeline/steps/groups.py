@@ -13,8 +13,7 @@ from flcav.federation.links.in_process import update_bytes
 from flcav.federation.links.link import NOTHING, UNREADABLE, Ask, open_questions
 from flcav.federation.links.metered import Account
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Ledger, send_message
 from flcav.perception.objects.samples import Sample
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task
@@ -225,7 +224,7 @@ class Uplink:
     def enter(self, client: str, *messages: bytes) -> None:
         """Enter a client's messages; raises `BudgetExceeded`."""
         for message in messages:
-            send(self.book, message, stage=EDGE, task=self.task, link="wireless", direction="up", client=client)
+            send_message(self.book, message, stage=EDGE, task=self.task, link="wireless", direction="up", client=client)
 
 
 def find_units(

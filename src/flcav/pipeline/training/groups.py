@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.federation.links.link import Ask
 from flcav.federation.trainable import Trainable, Weights
-from flcav.network.ledger import Ledger
-from flcav.network.messages import send
+from flcav.network.ledger import Ledger, send_message
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
 from flcav.pipeline.recipe import EDGE, Requests
 from flcav.pipeline.training.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss
@@ -141,7 +140,7 @@ class GroupWatch:
         self.note(messages)
         for name, message in messages.items():
             about: Any = {"stage": EDGE, "task": self.members[name].task.name, "link": "wireless", "direction": "up"}
-            send(book, message, client=name, round_=number, **about)
+            send_message(book, message, client=name, round_=number, **about)
 
     @property
     def over(self) -> bool:

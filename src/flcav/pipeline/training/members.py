@@ -16,7 +16,7 @@ from safetensors import SafetensorError
 
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
 from flcav.machine.threads import use_threads
-from flcav.network.messages import from_names, pack, to_names, unpack
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.perception.client import TaskClient
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays
@@ -46,7 +46,7 @@ class Offer:
     def message(self) -> bytes:
         """Return the offer as its bytes on the radio."""
         counts = np.array([*self.labels.values()], np.int64)
-        return pack(
+        return pack_arrays(
             {
                 "samples": np.array([self.samples], np.int64),
                 "labels": from_names(self.labels),
@@ -82,7 +82,7 @@ def read_loss(message: bytes) -> float:
 def _read(message: bytes, **shapes: tuple[int, ...]) -> dict[str, NDArray[Any]]:
     """Return the arrays of a message, of which these have `shapes`."""
     try:
-        found = unpack(message)
+        found = unpack_arrays(message)
     except (SafetensorError, ValueError) as error:
         raise Unreadable(str(error)) from None
     for name, shape in shapes.items():
@@ -124,12 +124,12 @@ class Member:
             return {HELD: np.array([len(self.held)]), LOSS: np.array([loss]), ASKS: np.array([loss > self.limit])}
         if question == REQUEST:
             position = self.places[int(arrays[SCENE][0])].astype(np.float32)
-            message = pack({"position": position, "loss": np.array([self.driving_loss], np.float32)})
+            message = pack_arrays({"position": position, "loss": np.array([self.driving_loss], np.float32)})
         elif question == OFFER:
             message = self._offer().message()
         elif question == SCORE:
             loss = measure_loss(self.task, self.config, arrays, self.held, self.batch)
-            message = pack({"loss": np.array([loss], np.float32)})
+            message = pack_arrays({"loss": np.array([loss], np.float32)})
         else:
             raise ValueError(f"a question for '{question}'")
         return {MESSAGE: np.frombuffer(message, np.uint8)}

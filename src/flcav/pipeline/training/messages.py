@@ -9,8 +9,7 @@ import numpy as np
 from flcav.config import InputError
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Weights
-from flcav.network.ledger import Ledger
-from flcav.network.messages import pack, send, unpack
+from flcav.network.ledger import Ledger, pack_arrays, send_message, unpack_arrays
 from flcav.perception.client import as_shared
 from flcav.perception.distillation import SharedSamples
 from flcav.perception.errors import Registry, pack_errors, unpack_errors
@@ -28,16 +27,16 @@ def release_network(book: Ledger, task: Task, network: Any, region: str, drive: 
     """Return a network as the vehicles receive it: from the cloud to the edge server by wireline, then by wireless."""
     vehicles = sorted({drive.data.keys[i].agent for i in drive.vehicles})
     clients = [f"{region}/{vehicle}" for vehicle in vehicles]
-    from_arrays(network, unpack(send_to_vehicles(book, pack(to_arrays(network)), task, region, clients)))
+    from_arrays(network, unpack_arrays(send_to_vehicles(book, pack_arrays(to_arrays(network)), task, region, clients)))
     return network
 
 
 def send_to_vehicles(book: Ledger, message: bytes, task: Task, region: str, clients: Iterable[str]) -> bytes:
     """Return a message as a region's vehicles receive it: from the cloud by wireline, then to each by wireless."""
     about: Any = {"stage": EDGE, "task": task.name, "direction": "down"}
-    received = at_edge = send(book, message, **about, link="wireline", client=region)
+    received = at_edge = send_message(book, message, **about, link="wireline", client=region)
     for client in clients:
-        received = send(book, at_edge, **about, link="wireless", client=client)
+        received = send_message(book, at_edge, **about, link="wireless", client=client)
     return received
 
 
@@ -48,13 +47,13 @@ def report_errors(book: Ledger, task: Task, found: Registry, region: str, drive:
     """
     about: Any = {"stage": EDGE, "task": task.name, "link": "wireless", "direction": "up"}
     if found.found is None:
-        errors = unpack_errors(send(book, pack_errors(found.errors), **about, client=region))
+        errors = unpack_errors(send_message(book, pack_errors(found.errors), **about, client=region))
         return Registry(errors, found.dropped)
     received = {}
     for frame, errors in found.found.items():
         if errors:
             client = f"{region}/{drive.data.keys[frame].agent}"
-            received[frame] = unpack_errors(send(book, pack_errors(errors), **about, client=client))
+            received[frame] = unpack_errors(send_message(book, pack_errors(errors), **about, client=client))
     return Registry.of(received, dropped=found.dropped, standing=found.standing)
 
 
@@ -69,7 +68,7 @@ class SharedFrames:
         """Send the frames to a region's vehicles, and the network that they begin with to those who lack it."""
         have = {entry.client for entry in book.entries if (entry.stage, entry.direction) == (EDGE, "down")}
         if lacking := [client for client in clients if client not in have]:
-            send_to_vehicles(book, pack(to_arrays(network)), self.samples.task, region, lacking)
+            send_to_vehicles(book, pack_arrays(to_arrays(network)), self.samples.task, region, lacking)
         for message in self.messages:
             send_to_vehicles(book, message, self.samples.task, region, clients)
 
@@ -77,7 +76,9 @@ class SharedFrames:
 def send_region_network(book: Ledger, task: Task, weights: Weights, clients: Iterable[str], stage: str) -> None:
     """Send a region's network after stage II to its vehicles, who go on from it in a later `stage`."""
     for client in clients:
-        send(book, pack(weights), stage=stage, task=task.name, link="wireless", direction="down", client=client)
+        send_message(
+            book, pack_arrays(weights), stage=stage, task=task.name, link="wireless", direction="down", client=client
+        )
 
 
 def share_frames(
@@ -145,7 +146,7 @@ def upload_samples(
     about: Any = {"stage": stage, "task": task.name, "direction": "up"}
     for frame, message in zip(chosen, shared.pack_samples(pool.data, config, chosen), strict=True):
         key = pool.data.keys[frame]
-        at_edge = send(book, message, **about, link="wireless", client=f"{key.scene}/{key.agent}")
-        received.append(send(book, at_edge, **about, link="wireline", client=region))
+        at_edge = send_message(book, message, **about, link="wireless", client=f"{key.scene}/{key.agent}")
+        received.append(send_message(book, at_edge, **about, link="wireline", client=region))
     samples = shared.unpack_samples(received, config)
     return task.samples(pool.data, config, chosen) if samples is None else samples

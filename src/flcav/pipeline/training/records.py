@@ -14,7 +14,7 @@ from flcav.pipeline.results.run import Run
 from flcav.pipeline.results.saved import LEDGER
 from flcav.pipeline.results.training import FederatedRound, StageResult
 from flcav.pipeline.training.checkpoints import LAST, Checkpoint
-from flcav.storage.exchange import write_table
+from flcav.storage.records import write_any_table
 
 ROUNDS, EVENTS = "rounds.parquet", "events"  # of a run, beside its results
 SCHEMA = pa.schema(
@@ -92,7 +92,7 @@ def save_rounds(run: Run, out: Path) -> None:
 
     There is a folder of TensorBoard's event files for each arm, stage, task and server.
     """
-    write_table(rounds_table(run), out / ROUNDS)
+    write_any_table(rounds_table(run), out / ROUNDS)
     shutil.rmtree(out / EVENTS, ignore_errors=True)
     curves: dict[str, list[FederatedRound]] = {}
     for arm, stage, record in list_rounds(run):

@@ -17,8 +17,8 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.network.clock.rounds import NetworkSettings, time_clients
-from flcav.network.clock.work import ClientWork
+from flcav.network.clock.records import ClientWork
+from flcav.network.clock.rounds import NetworkSettings, time_round
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
@@ -69,7 +69,7 @@ def deliver(
         ]
         if here:
             work = [ClientWork(name, size_bytes, 0.0, 0) for name in here]
-            timings = time_clients(links, work, max(attempts.values()) + 1, now, settings.rounds)
+            timings = time_round(links, work, max(attempts.values()) + 1, now, settings.rounds)
             for each in timings:
                 attempts[each.client] += 1
                 moved[each.client] += each.downloaded_bytes

@@ -20,7 +20,7 @@ from flcav.perception.agents import POLE, kind_of
 from flcav.report import style
 from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.sensors.radar import compute_echo_directions
 from flcav.world.shapes import SHAPES
 
 HEIGHTS_M = Normalize(0.0, 4.0, clip=True)

@@ -15,9 +15,9 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
-from flcav.network.radio.coverage import Coverage
+from flcav.network.radio.budget import PathState
 from flcav.network.radio.links import RadioLinks
-from flcav.network.radio.propagation import PathState
+from flcav.network.radio.recorded import Coverage
 from flcav.report import style
 from flcav.report.pictures.maps import HALO
 from flcav.world.map.town import Town

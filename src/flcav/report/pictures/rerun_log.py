@@ -23,7 +23,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse
 from flcav.interface.progress import Report, ignore_progress
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.sensors.radar import compute_echo_directions
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.layers import MapLayers
 from flcav.world.map.relief import Relief

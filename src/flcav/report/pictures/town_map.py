@@ -14,7 +14,7 @@ from shapely.geometry import MultiPoint
 from flcav.geometry import heading_vectors
 from flcav.report import style
 from flcav.world.map.lanes import map_layers
-from flcav.world.map.paint import outline_paint
+from flcav.world.map.layers import outline_paint
 from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]

@@ -23,14 +23,12 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.constants import speed_of_light
 from scipy.special import betaincinv
 
+from flcav.arrays import Array32, Mask
 from flcav.machine.compiled import compiled
 from flcav.world.weather import Weather
-
-Floats = NDArray[np.float32]
 
 PULSE_S = 20e-9  # T, half-power width of the pulse
 SEEN_FROM_M, SEEN_WHOLLY_M = 0.9, 1.0  # ranges where the receiver's overlap x(r) leaves 0 and reaches 1
@@ -51,7 +49,7 @@ NO_FOG = np.zeros(1, np.float32), np.zeros(1, np.float32)
 
 
 @lru_cache(maxsize=64)
-def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floats, Floats]:
+def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Array32, Array32]:
     """Return the peak power of the fog's return before a surface and the range [m] of that peak, by range of surface.
 
     Both are (K,) float32; entry k is for a surface at k * STEP_M, the last for all ranges beyond. Power is relative to
@@ -73,9 +71,9 @@ def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Floa
 class Drops(NamedTuple):
     """Distribution of the power and range of the brightest rain drop in a beam of unlimited length."""
 
-    number: NDArray[np.float32]  # (POWERS,) mean number of drops brighter than `power`, ascending
-    power: NDArray[np.float32]  # (POWERS,) relative to that of a white surface at 1 m, descending
-    range_m: NDArray[np.float32]  # (POWERS, SHARES) evenly spaced quantiles of the range of a drop of that power
+    number: Array32  # (POWERS,) mean number of drops brighter than `power`, ascending
+    power: Array32  # (POWERS,) relative to that of a white surface at 1 m, descending
+    range_m: Array32  # (POWERS, SHARES) evenly spaced quantiles of the range of a drop of that power
 
 
 def rain_extinction(rain_mm_h: float) -> float:
@@ -118,11 +116,11 @@ class Air(NamedTuple):
 
     two_way_per_m: float  # twice the extinction coefficient
     range_noise: float  # standard deviation of the measured range over the range
-    soft_power: Floats  # (K,) peak of the fog's return before a surface at k * STEP_M; zero without fog
-    soft_range_m: Floats  # (K,) range of that peak
-    drop_number: Floats  # (L,) mean number of drops in a beam brighter than `drop_power`; zero without rain
-    drop_power: Floats  # (L,) descending
-    drop_range_m: Floats  # (L, SHARES) quantiles of a drop's range
+    soft_power: Array32  # (K,) peak of the fog's return before a surface at k * STEP_M; zero without fog
+    soft_range_m: Array32  # (K,) range of that peak
+    drop_number: Array32  # (L,) mean number of drops in a beam brighter than `drop_power`; zero without rain
+    drop_power: Array32  # (L,) descending
+    drop_range_m: Array32  # (L, SHARES) quantiles of a drop's range
 
 
 def compute_air(weather: Weather, divergence_rad: float, least_power: float) -> Air | None:
@@ -140,8 +138,8 @@ def compute_air(weather: Weather, divergence_rad: float, least_power: float) -> 
 
 
 def add_air_returns(
-    distance: Floats, brightness: Floats, air: Air, rng: np.random.Generator
-) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    distance: Array32, brightness: Array32, air: Air, rng: np.random.Generator
+) -> tuple[Array32, Array32, Mask]:
     """Return the strongest return of each of N rays: distance [m], brightness, whether fog or rain sent it; each (N,).
 
     `distance` and `brightness` (N,) are those in clear air: inf and 0 where a ray meets nothing. Brightness is power

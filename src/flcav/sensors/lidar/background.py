@@ -10,7 +10,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from flcav.arrays import Array32, Ints, Mask
 
 STEP_DEG = 0.1  # edge of a direction's bin: smaller than the angle between two beams
 OFFSET_DEG = 0.037  # of the bins' edges, so that beams at round angles do not fall on an edge
@@ -24,10 +25,10 @@ MARGIN_M = (
 class Background:
     """The range of the background by direction, of D directions that had a return; sensor frame."""
 
-    direction: NDArray[np.int64]  # (D,) ascending numbers of bins of STEP_DEG in azimuth and elevation
-    range_m: NDArray[np.float32]  # (D,) the farthest return
+    direction: Ints  # (D,) ascending numbers of bins of STEP_DEG in azimuth and elevation
+    range_m: Array32  # (D,) the farthest return
 
-    def in_front(self, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    def in_front(self, points: Array32) -> Mask:
         """Return (N,) whether each point (N, >= 3) lies before the background, or where none was ever seen."""
         direction, range_m = _to_polar(points)
         row = np.searchsorted(self.direction, direction)
@@ -37,7 +38,7 @@ class Background:
         return range_m < farthest - MARGIN_M
 
 
-def learn_background(sweeps: Iterable[NDArray[np.float32]]) -> Background:
+def learn_background(sweeps: Iterable[Array32]) -> Background:
     """Return the background of a LiDAR from its sweeps (N, >= 3) x, y, z [m], sensor frame, all from the same pose.
 
     With sweeps of eight scenes or more hardly any place is occupied in all of them.
@@ -49,13 +50,13 @@ def learn_background(sweeps: Iterable[NDArray[np.float32]]) -> Background:
     return found
 
 
-def _farthest(direction: NDArray[np.int64], range_m: NDArray[np.float32]) -> Background:
+def _farthest(direction: Ints, range_m: Array32) -> Background:
     order = np.argsort(direction, kind="stable")
     bins, first = np.unique(direction[order], return_index=True)
     return Background(bins, np.maximum.reduceat(range_m[order], first) if len(first) else range_m)
 
 
-def _to_polar(points: NDArray[np.float32]) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+def _to_polar(points: Array32) -> tuple[Ints, Array32]:
     """Return the bins (N,) and ranges (N,) [m] of points (N, >= 3)."""
     x, y, z = points[:, :3].astype(np.float64).T
     flat = np.hypot(x, y)

@@ -3,24 +3,102 @@
 The power received from a surface, relative to that of a white one at normal incidence at 1 m, is
 P = reflectivity * cos(incidence) / R^2; it is detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
 Rain, fog and wet roads change P; in clear weather they cost nothing and draw no random numbers.
+
+Beam patterns of LiDAR models, from their makers' data sheets, and the LiDAR returns of CARLA.
+
+Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (97-0038), VLP-32C (63-9378),
+HDL-64E (63-HDL64E), VLS-128 "Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10.
+Elevations are nominal: those of a unit differ by some hundredths of a degree.
+
+CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
+intensity exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a
+limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather plays no
+part.
 """
 
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
+from flcav.arrays import Array, Array32, Ints, Ints32, Mask
 from flcav.config import Config
 from flcav.geometry import unit_vectors
 from flcav.sensors.lidar.air import add_air_returns, compute_air
-from flcav.sensors.lidar.beams import BEAMS, CarlaReturns, carla_returns
-from flcav.sensors.lidar.returns import LEVELS, QUANTILES, Returns, cast_through_glass, compute_brightness, detect
+from flcav.sensors.lidar.returns import (
+    LEVELS,
+    QUANTILES,
+    Returns,
+    cast_through_glass,
+    compute_brightness,
+    detect_returns,
+)
 from flcav.sensors.lidar.rolling import step_sectors, time_in_spin_s
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import OFFSET_S, Scene
 from flcav.world.weather import Weather
+
+
+class Beams(NamedTuple):
+    """The beam pattern and range of a LiDAR model."""
+
+    elevations_deg: tuple[float, ...]  # of each channel, from the highest
+    azimuth_steps: int  # firings per spin
+    range_m: float  # largest range
+
+
+def _even(high: float, low: float, count: int) -> tuple[float, ...]:
+    return tuple(float(elevation) for elevation in np.linspace(high, low, count).round(3))
+
+
+_HDL64E = (*_even(2.0, 2.0 - 31 / 3, 32), *_even(-8.83, -24.33, 32))  # an upper and a lower block of lasers
+_VLP32C = (
+    *(15.0, 10.333, 7.0, 4.667, 3.333, 2.333),
+    *(1.667, 1.333, 1.0, 0.667, 0.333, 0.0, -0.333, -0.667, -1.0, -1.333, -1.667, -2.0, -2.333, -2.667, -3.0, -3.333),
+    *(-3.667, -4.0, -4.667, -5.333, -6.148, -7.254, -8.843, -11.31, -15.639, -25.0),
+)
+_VLS128 = (
+    *(15.0, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98),
+    *_even(4.83, -6.5, 104),
+    *(-6.65, -6.85, -7.15, -7.65, -8.352, -9.244, -10.346, -11.742, -13.565, -16.042, -19.582, -25.0),
+)
+
+BEAMS: dict[str, Beams] = {
+    "vlp16": Beams(_even(15.0, -15.0, 16), 1800, 100.0),
+    "hdl32e": Beams(_even(10.67, -30.67, 32), 2170, 100.0),
+    "vlp32c": Beams(_VLP32C, 1800, 200.0),
+    "hdl64e": Beams(_HDL64E, 2083, 120.0),  # as on KITTI's car
+    "os1_128": Beams(_even(22.5, -22.5, 128), 1024, 120.0),
+    "vls128": Beams(_VLS128, 1800, 245.0),
+}
+
+
+class CarlaReturns(Config):
+    """The attributes of CARLA's LiDAR, with CARLA's names and defaults."""
+
+    atmosphere_attenuation_rate: float = Field(default=0.004, ge=0, le=10)  # a of intensity = exp(-a distance) [1/m]
+    dropoff_general_rate: float = Field(default=0.45, ge=0, le=1)  # probability that any return is lost
+    dropoff_intensity_limit: float = Field(default=0.8, ge=1e-6, le=1)  # weaker returns may be lost too
+    dropoff_zero_intensity: float = Field(default=0.4, ge=0, le=1)  # probability of loss at intensity 0
+
+
+def carla_returns(
+    settings: CarlaReturns, directions: Array32, distance: Array32, noise_m: Array32, rng: np.random.Generator
+) -> tuple[Array32, Ints]:
+    """Return the point cloud of CARLA's LiDAR and the ray (M,) of each point.
+
+    Points (M, 4) are x, y, z [m] in the sensor's frame and intensity. `directions` (N, 3) are unit rays, `distance`
+    (N,) leads to the surfaces met (inf where none), `noise_m` (N,) are the errors of the measured ranges.
+    """
+    intensity = np.exp(-settings.atmosphere_attenuation_rate * distance)
+    at_zero, limit = settings.dropoff_zero_intensity, settings.dropoff_intensity_limit
+    lost = rng.random(len(distance)) < settings.dropoff_general_rate
+    lost |= rng.random(len(distance)) < np.where(intensity > limit, 0.0, at_zero * (1 - intensity / limit))
+    rays = np.flatnonzero(np.isfinite(distance) & ~lost)
+    measured = (distance[rays] + noise_m[rays])[:, None]
+    return np.concatenate((directions[rays] * measured, intensity[rays, None]), axis=1).astype(np.float32), rays
+
 
 CLEAR = Weather()
 
@@ -88,13 +166,13 @@ class Lidar(Config):
 class Scan(NamedTuple):
     """The point cloud of one spin, and the rays behind it."""
 
-    points: NDArray[np.float32]  # (M, 4) x, y, z [m] in the sensor's frame, intensity in [0, 1]
-    actor: NDArray[np.int32]  # (M,) the trace's actor that each point comes from; -1 for the town, rain and fog
-    passes: NDArray[np.bool_]  # (N,) whether each ray of the pattern passes the panes of glass that it meets
+    points: Array32  # (M, 4) x, y, z [m] in the sensor's frame, intensity in [0, 1]
+    actor: Ints32  # (M,) the trace's actor that each point comes from; -1 for the town, rain and fog
+    passes: Mask  # (N,) whether each ray of the pattern passes the panes of glass that it meets
     returns: Returns  # the surface that each ray returns from
 
 
-def build_ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
+def build_ray_pattern(lidar: Lidar) -> Array32:
     """Return the ray directions of one spin: (channels * azimuth_steps, 3) unit vectors, sensor frame; read-only.
 
     Channel after channel from the highest; within a channel, azimuth runs counter-clockwise from straight ahead.
@@ -105,7 +183,7 @@ def build_ray_pattern(lidar: Lidar) -> NDArray[np.float32]:
 @lru_cache(maxsize=16)
 def _build_ray_pattern(
     channels: int, up_deg: float, down_deg: float, elevations_deg: tuple[float, ...] | None, steps: int
-) -> NDArray[np.float32]:
+) -> Array32:
     even = np.linspace(up_deg, down_deg, channels)
     elevation = np.radians(even if elevations_deg is None else np.sort(elevations_deg)[::-1])[:, None]
     azimuth = np.arange(steps)[None] * (2 * np.pi / steps)
@@ -114,18 +192,12 @@ def _build_ray_pattern(
     return directions
 
 
-def draw_passes(lidar: Lidar, rng: np.random.Generator) -> NDArray[np.bool_]:
+def draw_passes(lidar: Lidar, rng: np.random.Generator) -> Mask:
     """Return for each ray of the pattern whether it passes all panes of glass that it meets: (N,), drawn at random."""
     return rng.random(lidar.channels * lidar.azimuth_steps, np.float32) < lidar.glass_pass
 
 
-def cast(
-    scene: Scene,
-    world_from_sensor: NDArray[np.float64],
-    lidar: Lidar,
-    passes: NDArray[np.bool_],
-    hidden: int | None = None,
-) -> Returns:
+def cast(scene: Scene, world_from_sensor: Array, lidar: Lidar, passes: Mask, hidden: int | None = None) -> Returns:
     """Return the surface within range from which each ray of one spin returns, in a world without the actor `hidden`.
 
     `passes` (N,) marks the rays that go through glass. A rolling LiDAR rides on `hidden`; it stands still where that is
@@ -133,17 +205,19 @@ def cast(
     """
     pattern, surfaces = build_ray_pattern(lidar), scene.surfaces
 
-    def part(pose: NDArray[np.float64], rays: NDArray[np.int64] | slice) -> Returns:
+    def part(pose: Array, rays: Ints | slice) -> Returns:
         directions = pattern[rays]
 
-        def trace(rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+        def trace(rays: Ints | slice, *, near_m: Array32 | None = None) -> Hits:
             return scene.cast(pose, directions[rays], near_m=near_m, far_m=lidar.range_m, hidden=hidden)
 
         return cast_through_glass(trace, passes[rays], surfaces.first, surfaces.material)
 
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))
-    steps, whole = lidar.azimuth_steps, _room_for(len(pattern))
+    steps, count = lidar.azimuth_steps, len(pattern)
+    numbers, kinds = np.empty((2, count), np.int32), np.empty((2, count), np.uint8)
+    whole = Returns(np.empty(count, np.float32), numbers[0], numbers[1], kinds[0], kinds[1])
     for columns, pose in step_sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
         rays = (np.arange(lidar.channels)[:, None] * steps + columns).ravel()
         for values, found in zip(whole, part(pose, rays)):
@@ -151,24 +225,14 @@ def cast(
     return whole
 
 
-def _room_for(rays: int) -> Returns:
-    return Returns(
-        np.empty(rays, np.float32),
-        np.empty(rays, np.int32),
-        np.empty(rays, np.int32),
-        np.empty(rays, np.uint8),
-        np.empty(rays, np.uint8),
-    )
-
-
-def measure(
+def measure_points(
     scene: Scene,
-    world_from_sensor: NDArray[np.float64],
+    world_from_sensor: Array,
     lidar: Lidar,
     echoes: Returns,
     rng: np.random.Generator,
     weather: Weather | None = None,
-) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+) -> tuple[Array32, Ints32]:
     """Return the points that the detector reports, (M, 4), and the actor (M,) each comes from: see `Scan`.
 
     `echoes` are the surfaces from which the spin's rays return, `weather` is clear by default.
@@ -194,7 +258,7 @@ def measure(
         source = np.where(aerial, -1, source)
     points = np.empty((rays, 4), np.float32)
     actor = np.empty(rays, np.int32)
-    kept = detect(
+    kept = detect_returns(
         build_ray_pattern(lidar),
         distance,
         bright,
@@ -212,7 +276,7 @@ def measure(
     return points[:kept], actor[:kept]
 
 
-def compress_intensity(points: NDArray[np.float32], lidar: Lidar) -> None:
+def compress_intensity(points: Array32, lidar: Lidar) -> None:
     """Raise the intensities of `points` (N, 4) to the sensor's gamma, in place."""
     if lidar.intensity_gamma != 1:
         points[:, 3] **= np.float32(lidar.intensity_gamma)
@@ -222,7 +286,7 @@ def compress_intensity(points: NDArray[np.float32], lidar: Lidar) -> None:
 
 def scan(
     scene: Scene,
-    world_from_sensor: NDArray[np.float64],
+    world_from_sensor: Array,
     lidar: Lidar,
     rng: np.random.Generator,
     hidden: int | None = None,
@@ -234,10 +298,10 @@ def scan(
     """
     passes = draw_passes(lidar, rng)
     returns = cast(scene, world_from_sensor, lidar, passes, hidden)
-    return Scan(*measure(scene, world_from_sensor, lidar, returns, rng, weather), passes, returns)
+    return Scan(*measure_points(scene, world_from_sensor, lidar, returns, rng, weather), passes, returns)
 
 
-def point_times_s(lidar: Lidar, points: NDArray[np.float32]) -> NDArray[np.float32]:
+def point_times_s(lidar: Lidar, points: Array32) -> Array32:
     """Return the time (N,) of each of `points` (N, >=2, sensor frame) after the middle of the spin [s].
 
     From -0.5 / `rate_hz` to 0.5 / `rate_hz` for a rolling LiDAR, else 0.

@@ -6,12 +6,12 @@ Reflectance is Lambertian, Oren-Nayar for rough surfaces, stronger for retro-ref
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.special import ndtri
 
+from flcav.arrays import Array32, Bytes, Ints, Ints32, Mask
 from flcav.machine.compiled import compiled
 from flcav.world.materials import Material
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 
 PANES = 6  # more panes than these stop a ray
 PANE_TRANSMISSION = 0.8  # of the power, both ways together
@@ -32,9 +32,9 @@ QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of t
 
 
 class CastRays(Protocol):
-    """A ray caster over a fixed set of rays, given the indices of those to cast: see `Target.trace`."""
+    """A ray caster over a fixed set of rays, given the indices of those to cast: see `embree.Hierarchy.trace`."""
 
-    def __call__(self, rays: NDArray[np.int64] | slice, *, near_m: NDArray[np.float32] | None = None) -> Hits:
+    def __call__(self, rays: Ints | slice, *, near_m: Array32 | None = None) -> Hits:
         """Return the first hits of `rays`, beyond `near_m` (one for each of them) where given."""
         ...
 
@@ -42,19 +42,14 @@ class CastRays(Protocol):
 class Returns(NamedTuple):
     """The surface from which each of N LiDAR rays returns."""
 
-    distance: NDArray[np.float32]  # (N,) [m]; inf where none
-    instance: NDArray[np.int32]  # (N,) instance of the scene; -1 where none
-    face: NDArray[np.int32]  # (N,) face of the instance's mesh
-    material: NDArray[np.uint8]  # (N,) a Material; undefined where none
-    panes: NDArray[np.uint8]  # (N,) panes of glass on the way
+    distance: Array32  # (N,) [m]; inf where none
+    instance: Ints32  # (N,) instance of the scene; -1 where none
+    face: Ints32  # (N,) face of the instance's mesh
+    material: Bytes  # (N,) a Material; undefined where none
+    panes: Bytes  # (N,) panes of glass on the way
 
 
-def cast_through_glass(
-    trace: CastRays,
-    passes: NDArray[np.bool_],
-    first: NDArray[np.int64],
-    material: NDArray[np.uint8],
-) -> Returns:
+def cast_through_glass(trace: CastRays, passes: Mask, first: Ints, material: Bytes) -> Returns:
     """Return the surface from which each of N rays returns; rays marked in `passes` (N,) go through up to PANES panes.
 
     Face f of instance i is of `material[first[i] + f]`.
@@ -157,7 +152,7 @@ def compute_wet_brightness(cosine, reflectivity):
 
 
 @compiled
-def detect(
+def detect_returns(
     directions,
     distance,
     brightness,

@@ -11,19 +11,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints
 from flcav.geometry import heading_vectors, inverse
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 SECTORS = 36
 ROUNDING = 1e-6  # of a turn: a beam straight back belongs to the beginning of the spin, not to its end
 
 
 def step_sectors(
-    scene: Scene, world_from_sensor: NDArray[np.float64], steps: int, spin_s: float, carrier: int | None
-) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    scene: Scene, world_from_sensor: Array, steps: int, spin_s: float, carrier: int | None
+) -> Iterator[tuple[Ints, Array]]:
     """Yield for each sector its columns (C,) of the ray pattern and the (4, 4) pose of the sensor at its time.
 
     `scene` is at the sector's time while the sector is in use; at the end it is moved back. `world_from_sensor` (4, 4)
@@ -32,7 +31,7 @@ def step_sectors(
     """
     index, instant_s = scene.index, scene.offset_s
 
-    def pose_now() -> NDArray[np.float64]:
+    def pose_now() -> Array:
         return world_from_sensor if carrier is None else scene.world_from_actor(carrier) @ carrier_from_sensor
 
     carrier_from_sensor = np.eye(4) if carrier is None else inverse(scene.world_from_actor(carrier)) @ world_from_sensor
@@ -46,7 +45,7 @@ def step_sectors(
         scene.move_to(index, instant_s)
 
 
-def time_in_spin_s(points: NDArray[np.float32], spin_s: float) -> NDArray[np.float32]:
+def time_in_spin_s(points: Array32, spin_s: float) -> Array32:
     """Return the time (N,) [s] of each point (N, >=2, sensor frame) after the middle of the spin, by its azimuth."""
     turned = np.arctan2(points[:, 1], points[:, 0]) / (2 * np.pi) + 0.5
     return (((turned + ROUNDING) % 1.0 - 0.5) * spin_s).astype(np.float32)

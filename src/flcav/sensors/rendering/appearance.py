@@ -7,17 +7,15 @@ from typing import NamedTuple
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array32, Bytes, Ints32
 from flcav.geometry import left_vectors
 from flcav.sensors.frame import SEMANTICS
-from flcav.sensors.rendering.facade import Facades, facades_of
+from flcav.sensors.rendering.facade import SIGN_KINDS, Facades, draw_signs, facades_of
 from flcav.sensors.rendering.ground import Markings, build_markings
 from flcav.sensors.rendering.noise import make_noise
-from flcav.sensors.rendering.signs import SIGN_KINDS, draw_signs
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.layers import MapLayers
-from flcav.world.map.town import Town
 from flcav.world.materials import (
     CLOTH_COLOURS,
     COLOUR,
@@ -55,46 +53,34 @@ _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 class Plates(NamedTuple):
     """The plates of a town's traffic signs: places, kinds and textures."""
 
-    place: NDArray[np.float32]  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
-    kind: NDArray[np.uint8]  # (S,) row of SIGN_KINDS
-    drawn: NDArray[np.float32]  # see `signs.pictures`
+    place: Array32  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
+    kind: Bytes  # (S,) row of SIGN_KINDS
+    drawn: Array32  # see `signs.pictures`
 
 
 class Appearance(NamedTuple):
     """Appearance tables of one scene with S surface rows, I instances and M materials."""
 
-    material: NDArray[np.uint8]  # (S,) by surface row
-    semantic: NDArray[np.uint8]  # (S,) one of SEMANTICS
-    thing: NDArray[np.int32]  # (S,) -(t + 1) for thing t of the town, else 0
-    part: NDArray[np.uint8]  # (S,) a Part; undefined for actors
-    part_row: NDArray[np.int32]  # (S,) see `StaticWorld.row`
+    material: Bytes  # (S,) by surface row
+    semantic: Bytes  # (S,) one of SEMANTICS
+    thing: Ints32  # (S,) -(t + 1) for thing t of the town, else 0
+    part: Bytes  # (S,) a Part; undefined for actors
+    part_row: Ints32  # (S,) see `StaticWorld.row`
     first_actor: int  # first surface row of the actors' faces; the town's come before
-    corner: NDArray[np.float32]  # (S - first_actor, 3, 3) corners of actors' faces, body frame
-    corner_normal: NDArray[np.float32]  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
-    colour: NDArray[np.float32]  # (I, M, 3) by instance and material: actors differ in paint and clothes
-    mirror: NDArray[np.float32]  # (M,) specular reflectance at normal incidence
-    gloss: NDArray[np.float32]  # (M,) exponent of the sun's highlight
+    corner: Array32  # (S - first_actor, 3, 3) corners of actors' faces, body frame
+    corner_normal: Array32  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
+    colour: Array32  # (I, M, 3) by instance and material: actors differ in paint and clothes
+    mirror: Array32  # (M,) specular reflectance at normal incidence
+    gloss: Array32  # (M,) exponent of the sun's highlight
     markings: Markings
     facades: Facades
     plates: Plates
-    noise: NDArray[np.float32]  # see `noise.clouds`
+    noise: Array32  # see `noise.clouds`
 
 
 _AS = {"van": "car", "prop": "static"}  # categories without a class of their own
 _KNOWN: WeakKeyDictionary[Scene, tuple[Surfaces, Appearance]] = WeakKeyDictionary()
-_TOWNS: WeakKeyDictionary[Solid, "_OfTown"] = WeakKeyDictionary()
-
-
-class _OfTown(NamedTuple):
-    """The tables of a town's F faces, and what else does not depend on the actors: see `Appearance`."""
-
-    semantic: NDArray[np.uint8]  # (F,)
-    thing: NDArray[np.int32]  # (F,)
-    part: NDArray[np.uint8]  # (F,)
-    part_row: NDArray[np.int32]  # (F,)
-    markings: Markings
-    facades: Facades
-    plates: Plates
+_TOWNS: WeakKeyDictionary[Solid, Appearance] = WeakKeyDictionary()  # of towns without actors
 
 
 def build_appearance(scene: Scene) -> Appearance:
@@ -102,29 +88,40 @@ def build_appearance(scene: Scene) -> Appearance:
     if scene not in _KNOWN or _KNOWN[scene][0] is not scene.surfaces:
         if scene.town_solid not in _TOWNS:
             _TOWNS[scene.town_solid] = _of_town(scene)
-        _KNOWN[scene] = scene.surfaces, _appearance(scene, _TOWNS[scene.town_solid])
+        _KNOWN[scene] = scene.surfaces, _add_actors(scene, _TOWNS[scene.town_solid])
     return _KNOWN[scene][1]
 
 
-def _of_town(scene: Scene) -> _OfTown:
+def _of_town(scene: Scene) -> Appearance:
+    """Return the appearance of a scene's town alone, whose faces come first in the scene."""
     town = scene.town
     world, signs = build_static_world(town), town.signs
     numbers = np.array([SEMANTICS[_OF_PART[TownPart(value)]] for value in range(len(TownPart))], np.uint8)
     leafy = (world.part == TownPart.CLUTTER) & (world.mesh.material == Material.LEAF)
     place = np.c_[signs.position, left_vectors(signs.yaw)].astype(np.float32)
     kinds = np.array([SIGN_KINDS.index(kind) for kind in signs.kind], np.uint8)
-    return _OfTown(
+    no_corners = np.zeros((0, 3, 3), np.float32)
+    return Appearance(
+        material=world.mesh.material,
         semantic=np.where(leafy, SEMANTICS["vegetation"], numbers[world.part]).astype(np.uint8),
         thing=-(scene.things.face + 1),
         part=world.part,
         part_row=world.row,
-        markings=_markings(town),
+        first_actor=len(world.part),
+        corner=no_corners,
+        corner_normal=no_corners,
+        colour=COLOUR[None],
+        mirror=MIRROR,
+        gloss=GLOSS,
+        markings=build_markings(map_layers(town) if town.net.exists() else MapLayers((), (), (), (), (), ())),
         facades=facades_of(town.name, town.buildings),
         plates=Plates(place, kinds, draw_signs()),
+        noise=make_noise(),
     )
 
 
-def _appearance(scene: Scene, of_town: _OfTown) -> Appearance:
+def _add_actors(scene: Scene, of_town: Appearance) -> Appearance:
+    """Return the appearance of a scene from that of its town alone."""
     surfaces, trace = scene.surfaces, scene.trace
     actors = len(of_town.part)
     beyond = (0, len(surfaces.material) - actors)  # the faces of the actors follow the town's
@@ -135,44 +132,29 @@ def _appearance(scene: Scene, of_town: _OfTown) -> Appearance:
         corners, normals = _corners(*trace.model(instance - 1))
         first = int(surfaces.first[instance])
         faces = slice(first, first + len(corners))
-        corner[first - actors : first - actors + len(corners)] = corners
-        corner_normal[first - actors : first - actors + len(corners)] = normals
+        corner[first - actors :][: len(corners)], corner_normal[first - actors :][: len(corners)] = corners, normals
         semantic[faces] = SEMANTICS[_AS.get(str(category), str(category))]
         if category in ("bicycle", "motorcycle"):
             semantic[faces][np.isin(surfaces.material[faces], _RIDER)] = SEMANTICS["rider"]
-    return Appearance(
+    return of_town._replace(
         material=surfaces.material,
         semantic=semantic,
         thing=np.pad(of_town.thing, beyond),
         part=np.pad(of_town.part, beyond),
         part_row=np.pad(of_town.part_row, beyond),
-        first_actor=actors,
         corner=corner,
         corner_normal=corner_normal,
         colour=_colours([str(name) for name in trace.actor], scene.paints),
-        mirror=MIRROR,
-        gloss=GLOSS,
-        markings=of_town.markings,
-        facades=of_town.facades,
-        plates=of_town.plates,
-        noise=make_noise(),
     )
 
 
-def _markings(town: Town) -> Markings:
-    """Return the road markings of a town; none where its net file does not exist."""
-    if not town.net.exists():
-        return build_markings(MapLayers((), (), (), (), (), ()))
-    return build_markings(map_layers(town))
-
-
 @lru_cache(maxsize=256)
-def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[Array32, Array32]:
     mesh = actor_mesh(category, shape, size)
     return mesh.vertices[mesh.faces], mesh.corner_normals()
 
 
-def _colours(names: list[str], paints_of: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
+def _colours(names: list[str], paints_of: Mapping[str, tuple[float, float, float]]) -> Array32:
     """Return the colours (I, M, 3) by instance and material, chosen by a hash of each actor's name, or its paint."""
     out = np.tile(COLOUR, (len(names) + 1, 1, 1))
     for instance, name in enumerate(names, start=1):

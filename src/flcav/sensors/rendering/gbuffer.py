@@ -3,13 +3,13 @@
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints32
 from flcav.geometry import heading_vectors
 from flcav.machine.compiled import inlined, kernel
 from flcav.machine.threads import share_among_threads
 from flcav.sensors.rendering.appearance import Appearance
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 
 LIFT_M = 0.015  # offset along the normal of secondary rays' origins
@@ -18,12 +18,12 @@ LIFT_M = 0.015  # offset along the normal of secondary rays' origins
 class GBuffer(NamedTuple):
     """G-buffer: the hits of N rays, world frame."""
 
-    ray: NDArray[np.float32]  # (N, 3) unit direction
-    distance: NDArray[np.float32]  # (N,) [m]; inf for the sky
-    instance: NDArray[np.int32]  # (N,) instance of the scene; -1 for the sky
-    row: NDArray[np.int32]  # (N,) row of the scene's surfaces; -1 for the sky
-    normal: NDArray[np.float32]  # (N, 3) unit, towards the camera; interpolated over curved surfaces of actors
-    position: NDArray[np.float32]  # (N, 3) [m], moved `LIFT_M` off the surface
+    ray: Array32  # (N, 3) unit direction
+    distance: Array32  # (N,) [m]; inf for the sky
+    instance: Ints32  # (N,) instance of the scene; -1 for the sky
+    row: Ints32  # (N,) row of the scene's surfaces; -1 for the sky
+    normal: Array32  # (N, 3) unit, towards the camera; interpolated over curved surfaces of actors
+    position: Array32  # (N, 3) [m], moved `LIFT_M` off the surface
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -35,12 +35,7 @@ class GBuffer(NamedTuple):
 
 
 def fill_gbuffer(
-    scene: Scene,
-    appearance: Appearance,
-    world_from_camera: NDArray[np.float64],
-    directions: NDArray[np.float32],
-    hits: Hits,
-    threads: int = 1,
+    scene: Scene, appearance: Appearance, world_from_camera: Array, directions: Array32, hits: Hits, threads: int = 1
 ) -> GBuffer:
     """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
     count, poses = len(directions), scene.poses()

@@ -12,15 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString, Polygon
 from shapely.ops import substring
 
+from flcav.arrays import Array, Array32, Ints32
 from flcav.geometry import heading_vectors
 from flcav.machine.compiled import inlined
 from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
-from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking
-from flcav.world.map.paint import outline_arrow, outline_stripes
+from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking, outline_arrow, outline_stripes
 
 CELL_M = 1.0  # side of the cells of the grid
 REACH_M = 0.3  # margin around a rectangle within which cells list it
@@ -35,11 +34,11 @@ JOINT_M = 0.012  # width of the joints between slabs
 class Markings(NamedTuple):
     """Road markings as K rectangles, with a grid whose cells list those nearby."""
 
-    rectangle: NDArray[np.float32]  # (K, 6) see Rectangle
-    colour: NDArray[np.float32]  # (K, 3)
-    corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
-    first: NDArray[np.int32]  # (cells along x, cells along y + 1) start of each cell's list
-    listed: NDArray[np.int32]  # lists of rows of `rectangle`, cell after cell
+    rectangle: Array32  # (K, 6) see Rectangle
+    colour: Array32  # (K, 3)
+    corner: Array  # (2,) lowest x, y of the grid
+    first: Ints32  # (cells along x, cells along y + 1) start of each cell's list
+    listed: Ints32  # lists of rows of `rectangle`, cell after cell
 
 
 def build_markings(layers: MapLayers) -> Markings:
@@ -54,7 +53,7 @@ def build_markings(layers: MapLayers) -> Markings:
 
 
 @inlined
-def find_paint(x, y, look_x, look_y, across, along, markings):
+def sample_paint(x, y, look_x, look_y, across, along, markings):
     """Return the painted share of a pixel's footprint around x, y, and the row of the rectangle that covers most of it.
 
     The footprint is `along` [m] long in the horizontal unit direction look_x, look_y, and `across` [m] wide.
@@ -90,7 +89,7 @@ def _line(marking: Marking) -> Iterator[Rectangle]:
                 yield x, y, (b[0] - a[0]) / length, (b[1] - a[1]) / length, length / 2, marking.width_m / 2
 
 
-def _box(outline: NDArray[np.float64]) -> Rectangle:
+def _box(outline: Array) -> Rectangle:
     """Return the smallest rectangle around a polygon."""
     corners = shapely.get_coordinates(shapely.minimum_rotated_rectangle(Polygon(outline)))
     one, other = corners[1] - corners[0], corners[2] - corners[1]
@@ -120,7 +119,7 @@ def _strips(kind: ArrowKind) -> tuple[tuple[float, float, float, float], ...]:
     return tuple(out)
 
 
-def _grid(rectangle: NDArray[np.float32]) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
+def _grid(rectangle: Array32) -> tuple[Array, Ints32, Ints32]:
     """Return the `corner`, `first` and `listed` of the grid of `Markings`."""
     if not len(rectangle):
         return np.zeros(2), np.zeros((1, 2), np.int32), np.zeros(0, np.int32)

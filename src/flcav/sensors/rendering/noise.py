@@ -3,8 +3,8 @@
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array32
 from flcav.machine.compiled import inlined
 from flcav.statistics.streams import stream
 
@@ -12,7 +12,7 @@ SIDE = 256  # cells along each side of a table, a power of two
 
 
 @lru_cache(maxsize=1)
-def make_noise() -> NDArray[np.float32]:
+def make_noise() -> Array32:
     """Return a table (SIDE, SIDE) of periodic fractal noise, uniformly distributed in [0, 1]: power-law spectrum."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(SIDE), np.fft.rfftfreq(SIDE), indexing="ij")) * SIDE
     amplitude = np.where(frequency > 0, np.maximum(frequency, 2.0) ** -1.7, 0.0)

@@ -1,25 +1,40 @@
 """Deferred renderer: primary rays, G-buffer, shading, wet reflections, supersampling, rain and glare, in this order.
 
-The result is the radiance of every pixel; exposure and tone mapping follow in `flcav.sensors.camera.tone`.
+The result is the radiance of every pixel; exposure and tone mapping follow in `flcav.sensors.camera`.
+
+Adaptive supersampling: further rays for pixels at visible edges and where thin distant objects may cross them.
+
+Pixels at edges get two more rays, which with the first form a pattern of three rooks; pixels that a thin distant object
+may cross get eight more, in a pattern of nine rooks. So a pole covers the share of its pixels that its width is,
+whether or not a pixel's centre hits it.
 """
 
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flcav.machine.memory import keep_freed_memory
-from flcav.machine.threads import share_among_threads
-from flcav.sensors.lens import Lens, compute_pixel_rays
-from flcav.sensors.rendering import rain, supersampling
-from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
+from flcav.arrays import Array, Array32, Bytes, Ints32, Mask
+from flcav.geometry import inverse, transform_points
+from flcav.machine.compiled import compiled
+from flcav.machine.threads import keep_freed_memory, share_among_threads
+from flcav.sensors.lens import Lens, compute_pixel_rays, project_optical
+from flcav.sensors.rendering import rain
 from flcav.sensors.rendering.appearance import Appearance, build_appearance
 from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
-from flcav.sensors.rendering.glare import add_glare, add_sun_glare
-from flcav.sensors.rendering.light import Illumination, compute_lamplight, compute_light, compute_sun_visibility, soften
+from flcav.sensors.rendering.light import (
+    Illumination,
+    compute_ambient_occlusion,
+    compute_lamplight,
+    compute_light,
+    compute_sun_visibility,
+    soften,
+)
+from flcav.sensors.rendering.rain import add_glare, add_sun_glare
 from flcav.sensors.rendering.state import Lamps, LampState, collect_lamps, compute_lamp_state, no_lamps
 from flcav.sensors.rendering.surface import mark_paint, shade
-from flcav.world.rays.hits import Hits
+from flcav.world.map.town import Town
+from flcav.world.materials import Material
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
@@ -32,10 +47,10 @@ NO_LAMPS = np.zeros((0, 3), np.float32)
 class RadianceImage(NamedTuple):
     """An image as radiance, with its exposure, G-buffer and appearance tables."""
 
-    radiance: NDArray[np.float32]  # (N, 3) of each pixel, row after row
+    radiance: Array32  # (N, 3) of each pixel, row after row
     exposure: np.float32  # factor of the radiance before tone mapping
     seen: GBuffer  # G-buffer of the primary rays
-    painted: NDArray[np.bool_]  # (N,) whether a pixel shows a road marking
+    painted: Mask  # (N,) whether a pixel shows a road marking
     appearance: Appearance
 
 
@@ -50,9 +65,9 @@ class _World(NamedTuple):
     threads: int
 
 
-def render(
+def render_radiance(
     scene: Scene,
-    world_from_camera: NDArray[np.float64],
+    world_from_camera: Array,
     lens: Lens,
     weather: Weather,
     rng: np.random.Generator,
@@ -76,12 +91,12 @@ def render(
     radiance, painted = _radiance(world, seen, open_sky, lens.width)
     if light.wetness > MIRRORS:
         _mirror(world, world_from_camera, lens, rays, seen, radiance)
-    kind = supersampling.find_edges(seen, radiance, light.exposure, appearance, lens, threads)
-    supersampling.mark_thin(kind, scene.town, world_from_camera, lens, seen)
-    further, pixel = supersampling.further_rays(rays, kind, lens)
+    kind = find_edges(seen, radiance, light.exposure, appearance, lens, threads)
+    mark_thin(kind, scene.town, world_from_camera, lens, seen)
+    further, pixel = further_rays(rays, kind, lens)
     if len(pixel):
         more = _further(world, world_from_camera, further, pixel, lens.width, seen, open_sky, radiance)
-        supersampling.average(radiance, more, pixel, np.float32(supersampling.BRIGHTEST / light.exposure))
+        average_samples(radiance, more, pixel, np.float32(BRIGHTEST / light.exposure))
     image = radiance.reshape(lens.height, lens.width, 3)
     if weather.rain_mm_h > 0:
         rain.add_streaks(image, weather.rain_mm_h, 0.75 * np.array(light.horizon) + 0.05 * np.array(light.sun), rng)
@@ -92,9 +107,9 @@ def render(
 
 
 def survey(
-    scene: Scene, world_from_camera: NDArray[np.float64], lens: Lens, *, hidden: int | None, threads: int = 1
-) -> tuple[GBuffer, NDArray[np.bool_], Appearance]:
-    """Return what the rays through the pixels' centres meet, and where that is paint (N,), as `render` does."""
+    scene: Scene, world_from_camera: Array, lens: Lens, *, hidden: int | None, threads: int = 1
+) -> tuple[GBuffer, Mask, Appearance]:
+    """Return what the rays through the pixels' centres meet, and where that is paint (N,): see `render_radiance`."""
     rays, appearance = compute_pixel_rays(lens), build_appearance(scene)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden, threads=threads)
     seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits, threads)
@@ -109,20 +124,13 @@ def survey(
     return seen, painted, appearance
 
 
-def _meet(
-    world: _World,
-    world_from_camera: NDArray[np.float64],
-    rays: NDArray[np.float32],
-    near_m: NDArray[np.float32] | None = None,
-) -> GBuffer:
+def _meet(world: _World, world_from_camera: Array, rays: Array32, near_m: Array32 | None = None) -> GBuffer:
     reach, hidden, threads = FAR_M, world.hidden, world.threads
     hits = world.scene.cast(world_from_camera, rays, near_m=near_m, far_m=reach, hidden=hidden, threads=threads)
     return fill_gbuffer(world.scene, world.appearance, world_from_camera, rays, hits, threads)
 
 
-def _radiance(
-    world: _World, seen: GBuffer, open_sky: NDArray[np.float32], width: int | None = None
-) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+def _radiance(world: _World, seen: GBuffer, open_sky: Array32, width: int | None = None) -> tuple[Array32, Mask]:
     scene, light, hidden, threads = world.scene, world.light, world.hidden, world.threads
     lit = compute_sun_visibility(scene, seen, light, hidden, threads)
     if width is not None:  # the rays are those of a whole image
@@ -141,34 +149,29 @@ def _radiance(
 
 def _further(
     world: _World,
-    world_from_camera: NDArray[np.float64],
-    rays: NDArray[np.float32],
-    pixel: NDArray[np.int32],
+    world_from_camera: Array,
+    rays: Array32,
+    pixel: Ints32,
     width: int,
     seen: GBuffer,
-    open_sky: NDArray[np.float32],
-    radiance: NDArray[np.float32],
-) -> NDArray[np.float32]:
+    open_sky: Array32,
+    radiance: Array32,
+) -> Array32:
     """Return the radiance (S, 3) of further rays, each within a `pixel` (S,): taken from a pixel nearby, or shaded."""
     scene, appearance = world.scene, world.appearance
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden, threads=world.threads)
     donor = np.empty(len(rays), np.int32)
-    supersampling.donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
+    donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
     out, rest = radiance[donor], np.flatnonzero(donor < 0)
     unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
     found = fill_gbuffer(scene, appearance, world_from_camera, rays[rest], unknown)
-    finer = world._replace(pixel_angle=world.pixel_angle / supersampling.ROOKS)
+    finer = world._replace(pixel_angle=world.pixel_angle / ROOKS)
     out[rest], _ = _radiance(finer, found, open_sky[pixel[rest]])
     return out
 
 
 def _mirror(
-    world: _World,
-    world_from_camera: NDArray[np.float64],
-    lens: Lens,
-    rays: NDArray[np.float32],
-    seen: GBuffer,
-    radiance: NDArray[np.float32],
+    world: _World, world_from_camera: Array, lens: Lens, rays: Array32, seen: GBuffer, radiance: Array32
 ) -> None:
     """Add planar reflections to wet roads: rays cast from the camera mirrored at the plane of the road, z = 0."""
     wet = rain.wet_pixels(seen, world.appearance, lens.width, lens.height)
@@ -187,3 +190,186 @@ def _mirror(
     rain.add_mirrored(
         radiance, seen, world.appearance, smeared, light.wetness, light.extinction, lens.width, lens.height
     )
+
+
+LEAF = int(Material.LEAF)
+EDGE, THIN = 1, 2  # flags of a pixel
+BEND = 0.93  # cosine between the normals of two pixels below which there is an edge
+STEP = 0.02  # distance from the other pixel's plane, over range, above which there is an edge
+CONTRAST = 0.03  # difference over sum of two pixels' radiance, below which an edge is not visible
+DARK = 0.02  # exposed light that is added to that sum: no edges in the dark
+THIN_PX = 4.0  # objects narrower than this are thin
+REACH_PX = 0.8  # margin beside thin objects
+FARTHEST_M = 220.0  # of thin objects
+POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths of thin objects
+SIGN = int(Material.SIGN)
+ROOKS = np.float32(3)  # factor by which the footprint of a further ray is narrower than its pixel
+_THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
+_NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
+BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lamps would stay jagged
+
+
+def find_edges(
+    seen: GBuffer, radiance: Array32, exposure: np.float32, appearance: Appearance, lens: Lens, threads: int = 1
+) -> Bytes:
+    """Return (N,) EDGE for pixels at visible edges, else 0, by their G-buffer and `radiance` (N, 3)."""
+    out = np.zeros(len(seen), np.uint8)
+    dark = np.float32(DARK / exposure)
+
+    def find_part(first: int, last: int) -> None:
+        _edges(seen, radiance, dark, appearance.material, lens.width, first, last, out)
+
+    share_among_threads(find_part, lens.height, threads)
+    return out
+
+
+def mark_thin(kind: Bytes, town: Town, world_from_camera: Array, lens: Lens, seen: GBuffer) -> None:
+    """Set THIN in `kind` (N,) for pixels that lamps, masts, signs or signal heads may cross with nothing nearer."""
+    bars = thin_bars(town)
+    camera_from_world = inverse(world_from_camera)
+    ends = [transform_points(camera_from_world, bars[:, part]) for part in (slice(0, 3), slice(3, 6))]
+    near = np.minimum(ends[0][:, 2], ends[1][:, 2])
+    kept = (near > 2.0) & (near < FARTHEST_M)
+    pixels = [project_optical(lens, end[kept]) for end in ends]
+    focal = lens.intrinsics()[0, 0]
+    half_px = bars[kept, 6] * focal / near[kept]
+    small = (half_px * 2 < THIN_PX) | (bars[kept, 6] > POST_M) & (half_px * 2 < 6 * THIN_PX)
+    small &= np.isfinite(pixels[0]).all(axis=1) & np.isfinite(pixels[1]).all(axis=1)
+    _draw_bars(
+        pixels[0][small],
+        pixels[1][small],
+        half_px[small],
+        near[kept][small],
+        seen.distance,
+        lens.width,
+        lens.height,
+        kind,
+    )
+
+
+def thin_bars(town: Town) -> Array:
+    """Return the thin objects of a town as bars (K, 7): both ends x, y, z, world frame, and half width [m]."""
+    rows = [(x, y, 0, x, y, height, POST_M) for x, y, height in town.lamps]
+    rows += [(x, y, 0, x, y, z, POST_M) for x, y, z in town.poles.position]
+    for x, y, z in town.signs.position:
+        rows += [(x, y, 0, x, y, z, POST_M), (x, y, z - 0.36, x, y, z + 0.36, SIGN_M)]
+    for (x, y, z), foot in zip(town.signals.position, town.signals.foot):
+        rows += [(*foot, 0, *foot, z + 0.25, POST_M), (*foot, z, x, y, z, POST_M)]
+        rows.append((x, y, z - 0.6, x, y, z + 0.6, SIGNAL_M))
+    return np.array(rows, np.float64).reshape(-1, 7)
+
+
+@compiled
+def _edges(seen, radiance, dark, material, width, first, last, out):
+    row = seen.row
+    column = 0
+    for pixel in range(max(first * width, 0), last * width):  # not negative, as the compiler can see
+        column = column + 1 if column < width else 1  # from 1 on
+        for side in range(2):
+            if side == 0 and column == width:
+                continue
+            other = pixel + (width if side else 1)
+            if other >= len(out) or row[pixel] == row[other]:
+                continue
+            edge = row[pixel] < 0 or row[other] < 0 or seen.instance[pixel] != seen.instance[other]
+            if not edge and not (material[row[pixel]] == LEAF and material[row[other]] == LEAF):
+                bend, off = np.float32(0), np.float32(0)
+                for axis in range(3):
+                    bend += seen.normal[pixel, axis] * seen.normal[other, axis]
+                    off += seen.normal[pixel, axis] * (seen.position[other, axis] - seen.position[pixel, axis])
+                edge = bend < BEND or abs(off) > STEP * min(seen.distance[pixel], seen.distance[other])
+            if edge:
+                for band in range(3):
+                    one, two = radiance[pixel, band], radiance[other, band]
+                    if abs(one - two) > np.float32(CONTRAST) * (one + two + dark):
+                        out[pixel], out[other] = EDGE, EDGE
+
+
+@compiled
+def _draw_bars(start, end, half, near, distance, width, height, kind):
+    for bar in range(len(half)):
+        along_x, along_y = end[bar, 0] - start[bar, 0], end[bar, 1] - start[bar, 1]
+        steps = int(max(abs(along_x), abs(along_y))) + 1
+        if steps > 4 * (width + height):
+            continue
+        reach = half[bar] + REACH_PX
+        for step in range(steps + 1):
+            x = start[bar, 0] + along_x * step / steps
+            y = start[bar, 1] + along_y * step / steps
+            flat = abs(along_y) < abs(along_x)
+            middle = y if flat else x
+            for aside in range(int(np.ceil(middle - reach)), int(np.floor(middle + reach)) + 1):
+                column, row = (round(x), aside) if flat else (aside, round(y))
+                if column < 0 or row < 0 or column >= width or row >= height:
+                    continue
+                pixel = row * width + column
+                if distance[pixel] > near[bar] - 1.0:
+                    kind[pixel] |= THIN
+
+
+def further_rays(rays: Array32, kind: Bytes, lens: Lens) -> tuple[Array32, Ints32]:
+    """Return further unit rays (S, 3), optical frame, for pixels flagged in `kind` (N,), and each one's pixel (S,)."""
+    flagged = kind[kind > 0]
+    total = int(np.bincount(flagged, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
+    directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
+    _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
+    return directions, pixel
+
+
+@compiled
+def donors(hits, pixel, seen, first, material, width, out):
+    """Write for each further ray the pixel `out` (S,) whose radiance it takes: its own or a neighbour of the same face.
+
+    It is -1 where no neighbour has the ray's face, and on signs, whose letters are finer than pixels; textures of other
+    faces are smooth over pixels. `first` and `material` are those of `Scene.surfaces`.
+    """
+    for sample in range(len(pixel)):
+        out[sample] = -1
+        own, instance, row = pixel[sample], hits.instance[sample], -1
+        if instance >= 0:
+            row = first[instance] + hits.face[sample]
+            if material[row] == SIGN:
+                continue
+        for step in (0, -1, 1, -width, width, -width - 1, -width + 1, width - 1, width + 1):
+            other = own + step
+            if other >= 0 and other < len(seen.row) and seen.row[other] == row and seen.instance[other] == instance:
+                out[sample] = other
+                break
+
+
+@compiled
+def average_samples(radiance, further, pixel, ceiling):
+    """Replace the `radiance` of pixels by the mean with their `further` samples (S, 3), each clamped to `ceiling`."""
+    start = 0
+    while start < len(pixel):
+        own, end = pixel[start], start
+        while end < len(pixel) and pixel[end] == own:
+            end += 1
+        for band in range(3):
+            total = min(radiance[own, band], ceiling)
+            for sample in range(start, end):
+                total += min(further[sample, band], ceiling)
+            radiance[own, band] = total / (end - start + 1)
+        start = end
+
+
+@compiled
+def _spread(rays, kind, width, height, three, nine, directions, pixel):
+    sample = 0
+    for own in range(len(kind)):
+        if kind[own] == 0:
+            continue
+        offsets = nine if kind[own] & THIN else three
+        right = own + 1 if own % width + 1 < width else own - 1
+        below = own + width if own + width < len(kind) else own - width
+        sign_x, sign_y = np.float32(right - own), np.float32(1 if below > own else -1)
+        a, b = rays[own, 0] / rays[own, 2], rays[own, 1] / rays[own, 2]
+        a_x, b_x = (rays[right, 0] / rays[right, 2] - a) * sign_x, (rays[right, 1] / rays[right, 2] - b) * sign_x
+        a_y, b_y = (rays[below, 0] / rays[below, 2] - a) * sign_y, (rays[below, 1] / rays[below, 2] - b) * sign_y
+        for number in range(len(offsets)):
+            u, v = offsets[number, 0], offsets[number, 1]
+            x, y = a + u * a_x + v * a_y, b + u * b_x + v * b_y
+            length = np.sqrt(x * x + y * y + 1)
+            directions[sample, 0], directions[sample, 1], directions[sample, 2] = x / length, y / length, 1 / length
+            pixel[sample] = own
+            sample += 1

@@ -4,8 +4,8 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Bytes, Ints32
 from flcav.geometry import heading_vectors, transform_points
 from flcav.machine.compiled import inlined, kernel
 from flcav.world.materials import Material
@@ -25,20 +25,20 @@ CELL_M = 8.0  # side of the cells of the lamps' grid
 class LampState(NamedTuple):
     """Lit signal lenses by thing of the town, and lamp brightness by instance."""
 
-    lens: NDArray[np.uint8]  # (K,) of each of the town's things: flags RED, AMBER and GREEN
-    head: NDArray[np.float32]  # (I,) brightness of the head lamps, 0 to 1
-    tail: NDArray[np.float32]  # (I,) brightness of the tail lamps, 0 to 1; brakes included
+    lens: Bytes  # (K,) of each of the town's things: flags RED, AMBER and GREEN
+    head: Array32  # (I,) brightness of the head lamps, 0 to 1
+    tail: Array32  # (I,) brightness of the tail lamps, 0 to 1; brakes included
 
 
 class Lamps(NamedTuple):
     """K lamps that illuminate the scene, and a grid whose cells list the lamps in reach."""
 
-    position: NDArray[np.float32]  # (K, 3) world [m]
-    ahead: NDArray[np.float32]  # (K, 3) unit direction of a beam; zero for a street lamp
-    colour: NDArray[np.float32]  # (K, 3) intensity straight down, or on the beam's axis
-    corner: NDArray[np.float64]  # (2,) lowest x, y of the grid
-    first: NDArray[np.int32]  # (cells along x, cells along y + 1) start of each cell's list
-    listed: NDArray[np.int32]  # lists of lamps, cell after cell
+    position: Array32  # (K, 3) world [m]
+    ahead: Array32  # (K, 3) unit direction of a beam; zero for a street lamp
+    colour: Array32  # (K, 3) intensity straight down, or on the beam's axis
+    corner: Array  # (2,) lowest x, y of the grid
+    first: Ints32  # (cells along x, cells along y + 1) start of each cell's list
+    listed: Ints32  # lists of lamps, cell after cell
 
 
 def compute_lamp_state(scene: Scene, lamps_on: float, low_sight: bool) -> LampState:
@@ -86,14 +86,12 @@ def no_lamps() -> Lamps:
 
 
 @lru_cache(maxsize=256)
-def lamp_places(
-    category: str, shape: int, size: tuple[float, ...] | None = None
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lamp_places(category: str, shape: int, size: tuple[float, ...] | None = None) -> tuple[Array, Array]:
     """Return the centres (K, 3) of an actor's head lamps and those (L, 3) of its tail lamps, body frame [m]."""
     mesh = actor_mesh(category, shape, size)
     centres = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
-    def centre(material: Material) -> NDArray[np.float64]:
+    def centre(material: Material) -> Array:
         own = centres[mesh.material == material]
         sides = [own[own[:, 1] > 0.15], own[own[:, 1] < -0.15], own[np.abs(own[:, 1]) <= 0.15]]
         return np.array([side.mean(axis=0) for side in sides if len(side)]).reshape(-1, 3)
@@ -172,9 +170,7 @@ def light_up(survey, lamps, light, most, towards, distance):
             distance[ray] = length - np.float32(0.6)
 
 
-def _grid(
-    position: NDArray[np.float64], ahead: NDArray[np.float64], reach: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]:
+def _grid(position: Array, ahead: Array, reach: Array) -> tuple[Array, Ints32, Ints32]:
     if not len(position):
         return np.zeros(2), np.zeros((1, 2), np.int32), np.zeros(0, np.int32)
     corner = (position[:, :2] - reach[:, None]).min(axis=0)

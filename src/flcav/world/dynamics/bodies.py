@@ -3,25 +3,31 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, shorten
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
-from flcav.world.actors import Actors
 from flcav.world.commands import Controls
-from flcav.world.dynamics.blueprints import VEHICLES, Blueprint
-from flcav.world.dynamics.standing import Ground
-from flcav.world.dynamics.vehicle import GRAVITY_MPS2, Motion, Pedals, Vehicles, drive, stack_blueprints
-
-Array = NDArray[np.float64]
+from flcav.world.dynamics.obstacles import TownGround
+from flcav.world.dynamics.vehicle import (
+    GRAVITY_MPS2,
+    VEHICLES,
+    BodyBlueprint,
+    Pedals,
+    PlanarMotion,
+    Vehicles,
+    drive_vehicles,
+    stack_blueprints,
+)
+from flcav.world.snapshot import Actors
 
 AT_REST = Controls()
 ON_SPRINGS = ("car", "van", "truck", "bus")
-ALOFT_M = 3.0  # who is placed so far above the ground falls, and who is so far below it stays there
-LAUNCH_MPS = 1.0  # who is pushed up by more than it climbs, and by so much, leaves the ground
+ALOFT_M = 3.0  # a body placed farther above the ground than this falls; one farther below it stays there
+LAUNCH_MPS = 1.0  # a body leaves the ground where its vertical velocity exceeds that of the slope by more than this
 PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # rad by which cars lean on their springs, for each m/s^2 ahead and aside
 FALL_MPS = 3.0  # change of velocity by a hit that nobody stands
-SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of who lies on the road
+SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of a fallen walker on the road
 MOST_LEAN_MPS2 = 10.0  # accelerations beyond are those of collisions
 WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
 
@@ -30,36 +36,36 @@ STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "ti
 
 
 @dataclass
-class Body:
-    """A body under control, but for its motion."""
+class ControlledBody:
+    """A vehicle, walker or prop under control: what does not change with its motion."""
 
     name: str
-    blueprint: Blueprint
+    blueprint: BodyBlueprint
     controls: Controls = AT_REST
     walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
     physics: bool = True
     gravity: bool = True
-    fallen: bool = False  # of a walker who was hit
+    fallen: bool = False  # of a walker: was hit, and lies on the road
     grip: float = 1.0  # share of the friction of a dry road
 
     @property
     def category(self) -> str:
-        """Return that of the blueprint."""
+        """Return the category of the blueprint."""
         return self.blueprint.category
 
 
 class Bodies:
-    """N bodies and their motion."""
+    """The N bodies under control and their motion, world frame."""
 
-    def __init__(self, ground: Ground, *, leans: bool = False) -> None:
-        """Start without any, on this ground; `leans`: cars are seen to lean on their springs."""
+    def __init__(self, ground: TownGround, *, leans: bool = False) -> None:
+        """Start without bodies on this ground; with `leans`, cars pitch and roll on their springs."""
         self._leans = leans
-        self.members: list[Body] = []
+        self.members: list[ControlledBody] = []
         self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
         self.tilt = np.zeros((0, 2))
         self.size = np.zeros((0, 3))
-        self.aloft = np.zeros(0, np.bool_)  # who has physics and gravity, and yet does not stand on the ground
+        self.aloft = np.zeros(0, np.bool_)  # (N,) bodies with physics and gravity that are not on the ground
         self._vehicles: Vehicles = stack_blueprints([])
         self._ground = ground
 
@@ -70,12 +76,12 @@ class Bodies:
                 return row
         raise InputError(f"actor {shorten(name)}: there is none of this name under control")
 
-    def find(self, name: str) -> Body:
+    def find(self, name: str) -> ControlledBody:
         """Return a body; raises `InputError` where there is none of this name."""
         return self.members[self.row(name)]
 
-    def add(self, body: Body, x: float, y: float, yaw: float, z: float | None) -> None:
-        """Add a body at rest."""
+    def add(self, body: ControlledBody, x: float, y: float, yaw: float, z: float | None) -> None:
+        """Add a body at rest at x, y [m] with this yaw [rad], its underside at `z` [m]; None: on the ground."""
         self.members.append(body)
         for name in STATE:
             array = getattr(self, name)
@@ -93,7 +99,10 @@ class Bodies:
     def place(
         self, row: int, x: float, y: float, yaw: float, z: float | None, pitch: float = 0.0, roll: float = 0.0
     ) -> None:
-        """Move a body to another pose; with physics and gravity it stands on the ground there, if that is near."""
+        """Move a body to x, y [m], yaw, pitch, roll [rad], its underside at `z` [m]; None: onto the ground.
+
+        With physics and gravity it stands on the ground there, where that is within `ALOFT_M`.
+        """
         self.position[row] = x, y, np.nan if z is None else z
         self.yaw[row] = wrap_angle(yaw)
         self.tilt[row] = pitch, roll
@@ -104,7 +113,7 @@ class Bodies:
             self.land(row)
 
     def land(self, row: int) -> None:
-        """Let a body with physics and gravity stand on the ground, unless that is too far from it."""
+        """Put a body with physics and gravity onto the ground, unless that is more than `ALOFT_M` away."""
         body = self.members[row]
         if body.physics and body.gravity:
             self.aloft[row] = abs(self._clearance(np.array([row]))[0]) > ALOFT_M
@@ -112,7 +121,7 @@ class Bodies:
                 self._stand(np.array([row]))
 
     def push(self, row: int, velocity: tuple[float, float, float]) -> None:
-        """Give a body another velocity [m/s]: one that is pushed up leaves the ground, and none goes into it."""
+        """Set the velocity [m/s] of a body: pushed up, it leaves the ground; pushed down, it stays on it."""
         self.velocity[row] = velocity
         body = self.members[row]
         if body.physics and body.gravity and not self.aloft[row]:
@@ -121,13 +130,13 @@ class Bodies:
             if not self.aloft[row]:
                 self.velocity[row, 2] = climb
 
-    def _climb(self, rows: NDArray[np.int64]) -> Array:
-        """Return the vertical velocities [m/s] by which bodies stay on the slopes that they move on."""
+    def _climb(self, rows: Ints) -> Array:
+        """Return the vertical velocities [m/s] with which bodies follow the slopes that they move on."""
         ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
         return -ahead * np.tan(self.tilt[rows, 0])
 
     def move(self, dt_s: float) -> None:
-        """Move all with physics by `dt_s` [s], as if nothing were in their way."""
+        """Move all bodies with physics by a step of `dt_s` [s], before contacts are resolved."""
         on = np.array([body.physics for body in self.members], np.bool_)
         flies = on & self.aloft
         self.position[flies] += self.velocity[flies] * dt_s
@@ -140,7 +149,10 @@ class Bodies:
             self._walk(rows, dt_s)
 
     def fall(self, change: Array) -> None:
-        """Let walkers fall whose velocity contacts `change` (N, 2) [m/s] much, in the direction of the hit."""
+        """Let walkers fall whose velocity changed by more than `FALL_MPS` in contacts, in the direction of the hit.
+
+        `change` (N, 2) [m/s] are the changes of velocity.
+        """
         for row in np.flatnonzero(np.linalg.norm(change, axis=1) > FALL_MPS).tolist():
             body = self.members[row]
             if body.category == "pedestrian" and body.physics and not body.fallen:
@@ -148,7 +160,7 @@ class Bodies:
                 self.yaw[row] = np.arctan2(change[row, 1], change[row, 0])
 
     def settle(self, dt_s: float) -> None:
-        """Let all with physics stand on the ground where they are, climbing with its slope, or fall for `dt_s` [s]."""
+        """Put bodies with physics onto the ground and its slope after contacts; let those aloft fall for `dt_s` [s]."""
         heavy = np.array([body.physics and body.gravity for body in self.members], np.bool_)
         if len(rows := np.flatnonzero(heavy & self.aloft)):
             clearance = self._clearance(rows)
@@ -160,24 +172,24 @@ class Bodies:
             self.velocity[rows, 2] = self._climb(rows)
 
     def weights(self) -> tuple[Array, Array]:
-        """Return the masses (N,) [kg] and moments of inertia (N,) [kg m^2], infinite for what nothing moves."""
+        """Return masses (N,) [kg] and moments of inertia (N,) [kg m^2]; infinite where contacts do not move a body."""
         held = np.array([not body.physics or body.category == "prop" for body in self.members], np.bool_)
         upright = np.array([body.category == "pedestrian" for body in self.members], np.bool_)
         mass = np.where(held, np.inf, self._vehicles.mass_kg)
         inertia = np.array([body.blueprint.inertia_kgm2 for body in self.members])
         return mass, np.where(held | upright, np.inf, inertia)
 
-    def find_grounded(self) -> NDArray[np.bool_]:
-        """Return who is near the ground (N,): others are in nobody's way there."""
+    def find_grounded(self) -> Mask:
+        """Return (N,) which bodies are within `ALOFT_M` of the ground; the others obstruct no traffic."""
         return np.abs(self._clearance(np.arange(len(self.members)))) <= ALOFT_M
 
-    def _clearance(self, rows: NDArray[np.int64]) -> Array:
+    def _clearance(self, rows: Ints) -> Array:
         """Return the height of bodies above the ground, or a bridge, [m]."""
         x, y, z = self.position[rows].T
         return z - self._ground.heights(x, y, z)
 
     def actors(self) -> Actors:
-        """Return the bodies as they are now."""
+        """Return the present states of the bodies."""
         return Actors(
             name=tuple(body.name for body in self.members),
             category=tuple(body.category for body in self.members),
@@ -192,9 +204,10 @@ class Bodies:
         )
 
     def _find_lean(self) -> Array:
-        """Return further pitch and roll (N, 2) [rad]: of who lies, the head ahead, and of cars on their springs.
+        """Return pitch and roll (N, 2) [rad] on top of the ground's: of fallen walkers, and of cars on their springs.
 
-        These go down ahead when they brake, and outwards in a curve.
+        A fallen walker lies with the head ahead. Cars dive when they brake, and roll outwards in a curve, both in
+        proportion to the acceleration.
         """
         lie: Array = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members)))).astype(np.float64)
         if not self._leans:
@@ -205,33 +218,29 @@ class Bodies:
         leans = np.column_stack((-PITCH_S2PM * ahead, ROLL_S2PM * aside))
         return np.asarray(lie + np.where((cars & ~self.aloft)[:, None], leans, 0.0), np.float64)
 
-    def _lie(self) -> NDArray[np.bool_]:
+    def _lie(self) -> Mask:
         return np.array([body.fallen for body in self.members], np.bool_)
 
     def _recast(self) -> None:
         self._vehicles = stack_blueprints([body.blueprint for body in self.members])
         self.size = np.array([body.blueprint.size for body in self.members], np.float64).reshape(-1, 3)
 
-    def _drive(self, rows: NDArray[np.int64], dt_s: float) -> None:
-        told = [self.members[row].controls for row in rows]
+    def _drive(self, rows: Ints, dt_s: float) -> None:
+        controls = [self.members[row].controls for row in rows]
         pedals = Pedals(
-            np.array([each.throttle for each in told]),
-            np.array([each.steer for each in told]),
-            np.array([each.brake for each in told]),
-            np.array([each.hand_brake for each in told]),
-            np.array([each.reverse for each in told]),
+            *(np.array([getattr(each, name) for each in controls]) for name in Pedals._fields),
         )
-        motion = Motion(
+        motion = PlanarMotion(
             self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]
         )
         vehicles = Vehicles(*(values[rows] for values in self._vehicles))
         grip = np.array([self.members[row].grip for row in rows])
         vehicles = vehicles._replace(grip_mps2=grip * vehicles.grip_mps2, spin_mps2=grip * vehicles.spin_mps2)
-        after = drive(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
+        after = drive_vehicles(motion, vehicles, pedals, self.tilt[rows, 0], dt_s)
         self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2] = after.position, after.yaw, after.velocity
         self.yaw_rate[rows], self.steer[rows] = after.yaw_rate, after.steer
 
-    def _walk(self, rows: NDArray[np.int64], dt_s: float) -> None:
+    def _walk(self, rows: Ints, dt_s: float) -> None:
         fallen = np.array([self.members[row].fallen for row in rows], np.bool_)
         wanted = np.where(fallen[:, None], 0.0, np.array([self.members[row].walk for row in rows]))
         able = np.where(fallen, SLIDE_MPS2, WALK_MPS2)[:, None]
@@ -243,7 +252,7 @@ class Bodies:
         self.position[rows, :2] += velocity * dt_s
         self.velocity[rows, :2], self.yaw[rows] = velocity, yaw
 
-    def _stand(self, rows: NDArray[np.int64]) -> None:
+    def _stand(self, rows: Ints) -> None:
         upright = np.array([self.members[row].category == "pedestrian" for row in rows], np.bool_)
         self.position[rows, 2], self.tilt[rows] = self._ground.stand(
             self.position[rows], self.yaw[rows], self.size[rows], upright

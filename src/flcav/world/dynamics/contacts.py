@@ -8,11 +8,9 @@ section 8).
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints
 from flcav.machine.compiled import compiled
-
-Array = NDArray[np.float64]
 
 RESTITUTION = 0.1  # speed after a collision over that before, along its normal
 PASSES = 12  # over all pairs of neighbours
@@ -22,7 +20,7 @@ UNDO_PASSES = 1000
 
 
 class Footprints(NamedTuple):
-    """N upright boxes: their footprints and levels."""
+    """Footprints and levels of N upright boxes, world frame."""
 
     place: Array  # (N, 3) x, y [m], yaw [rad] of the middle
     half: Array  # (N, 2) half of length and width [m]
@@ -32,21 +30,21 @@ class Footprints(NamedTuple):
 class Contacts(NamedTuple):
     """C contacts, each of two boxes."""
 
-    first: NDArray[np.int64]  # (C,) row of a box
-    second: NDArray[np.int64]  # (C,) row of the other; greater
+    first: Ints  # (C,) row of a box
+    second: Ints  # (C,) row of the other; greater
     normal: Array  # (C, 2) unit vector from the second towards the first
     point: Array  # (C, 2) place of the contact [m]
     impulse: Array  # (C,) along the normal, on the first [N s]
 
 
-def resolve(
+def resolve_contacts(
     boxes: Footprints, before: Array, velocity: Array, yaw_rate: Array, mass: Array, inertia: Array
 ) -> tuple[Array, Array, Array, Contacts]:
-    """Return places (N, 3), velocities (N, 2), yaw rates (N,) after all contacts of N boxes, and these.
+    """Return places (N, 3) [m, rad], velocities (N, 2) [m/s], yaw rates (N,) [rad/s] after contacts, and these.
 
     `mass` (N,) [kg] and `inertia` (N,) [kg m^2] are infinite for what nothing moves. `before` (N, 3) are the places
-    before the last motion: who still overlaps in the end goes back there, and stands still, so that boxes that did not
-    overlap there never do unless something immovable was moved into them.
+    before the last motion: a box that still overlaps in the end goes back there and stands still, so that boxes that
+    did not overlap there never do unless something immovable was moved into them.
     """
     place, velocity, yaw_rate = boxes.place.copy(), velocity.copy(), yaw_rate.copy()
     pairs = _find_neighbours(place, before, boxes.half, boxes.level, 1 / mass)
@@ -59,8 +57,8 @@ def resolve(
     return place, velocity, yaw_rate, Contacts(first, second, normal[touched], point[touched], impulse[touched])
 
 
-def find_overlaps(boxes: Footprints, others: Footprints) -> NDArray[np.int64]:
-    """Return the rows (K, 2) of each of `boxes` and of `others` that overlap."""
+def find_overlaps(boxes: Footprints, others: Footprints) -> Ints:
+    """Return the pairs (K, 2) of rows of `boxes` and of `others` that overlap."""
     both = Footprints(*(np.concatenate(pair) for pair in zip(boxes, others)))
     inverse = np.repeat((1.0, 0.0), (len(boxes.place), len(others.place)))
     pairs = _find_neighbours(both.place, both.place, both.half, both.level, inverse)
@@ -97,7 +95,7 @@ def _find_neighbours(place, before, half, level, inverse_mass):
 
 @compiled
 def _overlap(place, half, i, j):
-    """Return the least overlap [m] of two boxes, not positive where they are apart, and its axis towards i."""
+    """Return the penetration depth [m] of two boxes, not positive where they are apart, and its axis, towards box i."""
     dx, dy = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1]
     least, least_x, least_y = np.inf, 0.0, 0.0
     if np.hypot(dx, dy) > np.hypot(half[i, 0], half[i, 1]) + np.hypot(half[j, 0], half[j, 1]):
@@ -122,7 +120,7 @@ def _overlap(place, half, i, j):
 
 @compiled
 def _meet(place, before, half, i, j):
-    """Return overlap and axis as `_overlap`, but of the axis along which two boxes that came together met last.
+    """Return depth and axis as `_overlap`, but of the axis along which two moving boxes came into contact last.
 
     Fast boxes overlap deeply after a step, and the least overlap may then be sideways; it counts where they overlapped
     before, too (separating axis test of moving boxes: Ericson, Real-Time Collision Detection, 2005, section 5.5.8).
@@ -152,7 +150,7 @@ def _meet(place, before, half, i, j):
 
 @compiled
 def _find_point(place, half, i, j):
-    """Return the middle of the corners of each box that lie in the other; of the two boxes where there is none."""
+    """Return the contact point: the mean of the corners that lie in the other box; without any, of the two centres."""
     sum_x, sum_y, found = 0.0, 0.0, 0
     for own, other in ((i, j), (j, i)):
         cos, sin = np.cos(place[own, 2]), np.sin(place[own, 2])
@@ -221,7 +219,7 @@ def _resolve(
 
 @compiled
 def _strike(row, i, j, place, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point):
-    """Return the impulse [N s] by which two boxes that approach each other stop doing so, and apply it."""
+    """Apply the collision impulse to two boxes that approach each other, and return it [N s]; 0 where they part."""
     x, y = normal[row, 0], normal[row, 1]
     from_i_x, from_i_y = point[row, 0] - place[i, 0], point[row, 1] - place[i, 1]
     from_j_x, from_j_y = point[row, 0] - place[j, 0], point[row, 1] - place[j, 1]

@@ -1,19 +1,19 @@
-"""Obstacles: what stands in a town and stops vehicles and walkers, as upright boxes."""
+"""What bodies stand on and run into in a town: its ground with bridges and kerbs, and obstacles as upright boxes."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from shapely.geometry import Polygon
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.geometry import heading_vectors
-from flcav.world.actors import NOBODY, Actors
 from flcav.world.dynamics.contacts import Footprints
-from flcav.world.map.town import Town
+from flcav.world.map.relief import find_tilts
+from flcav.world.map.town import KERB_M, Town
 from flcav.world.meshes.furniture import MAST_BEHIND_M
-
-Array = NDArray[np.float64]
+from flcav.world.snapshot import NOBODY, Actors
 
 LAMP_M, POST_M, MAST_M = 0.08, 0.05, 0.09  # radius of the posts of lamps, of signs and signals, and of sensors
 CLEARANCE_M = 0.15  # what is lower, such as debris, is in nobody's way
@@ -27,13 +27,13 @@ class Obstacles(NamedTuple):
     name: tuple[str, ...]  # (S,) "kind:row", e.g. "building:3"
     tree: shapely.STRtree
 
-    def near(self, low: Array, high: Array) -> NDArray[np.int64]:
-        """Return the rows (K,), ascending, of obstacles about boxes with these corners, (N, 2) [m] each."""
+    def near(self, low: Array, high: Array) -> Ints:
+        """Return the rows (K,), ascending, of obstacles that touch any of the boxes from `low` to `high` (N, 2) [m]."""
         return np.unique(self.tree.query(shapely.box(*low.T, *high.T))[1])
 
 
 def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
-    """Return a town's buildings, trunks, clutter and posts, and the `parked` vehicles by their own names."""
+    """Return a town's buildings, trunks, clutter and posts as obstacles, and its `parked` vehicles."""
     rows, name = [np.zeros((0, 6))], []
     for kind, part in _parts(town):
         rows.append(part)
@@ -45,13 +45,13 @@ def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
         np.column_stack((length, width)) / 2,
         np.column_stack((ground - BELOW_M, ground + height)),
     )
-    boxes = join_footprints(standing, outline(parked))
+    boxes = join_footprints(standing, outline_actors(parked))
     low, high = corners(boxes)
     return Obstacles(boxes, (*name, *parked.name), shapely.STRtree(shapely.box(*low.T, *high.T)))
 
 
-def outline(actors: Actors) -> Footprints:
-    """Return the boxes of actors, upright; those who move begin above what they drive or step over."""
+def outline_actors(actors: Actors) -> Footprints:
+    """Return the upright boxes of actors, world frame [m]; those of vehicles and people from `CLEARANCE_M` up."""
     z = actors.position[:, 2]
     clear = np.where(np.array(actors.category, np.str_) == "prop", 0.0, CLEARANCE_M)
     return Footprints(actors.places, actors.size[:, :2] / 2, np.column_stack((z + clear, z + actors.size[:, 2])))
@@ -85,6 +85,48 @@ def _parts(town: Town) -> Iterator[tuple[str, Array]]:
 
 
 def _posts(foot: Array, radius: Array | float, height: Array | float) -> Array:
-    """Return posts at `foot` (K, 2) of this radius and height [m] as rows x, y, yaw, length, width, height."""
+    """Return posts at `foot` (K, 2) [m] with this radius and height [m] as rows x, y, yaw, length, width, height."""
     level = np.zeros(len(foot))
     return np.column_stack((foot, level, 2 * radius + level, 2 * radius + level, height + level))
+
+
+EDGE_M = 0.05  # a point so far beside a deck still is on it
+
+
+class TownGround:
+    """The ground of a town with its bridges and kerbs."""
+
+    def __init__(self, town: Town) -> None:
+        """Prepare the sidewalks and decks for queries."""
+        self._town = town
+        self._pavement = shapely.union_all([Polygon(outline_actors) for outline_actors in town.sidewalks])
+        shapely.prepare(self._pavement)
+        decks = () if town.relief is None else town.relief.decks
+        self._decks = [(deck, deck.outline.buffer(EDGE_M)) for deck in decks]
+        for _, area in self._decks:
+            shapely.prepare(area)
+
+    def heights(self, x: Array, y: Array, z: Array) -> Array:
+        """Return the height (N,) [m] of the ground, or of a deck there that is nearer to `z` (N,); NaN: the ground."""
+        ground = self._town.grounds(x, y)
+        for deck, area in self._decks:
+            inside = np.flatnonzero(shapely.contains_xy(area, x, y))
+            top = deck.surface.heights(x[inside], y[inside])
+            ground[inside] = np.where(np.abs(top - z[inside]) < np.abs(ground[inside] - z[inside]), top, ground[inside])
+        return ground
+
+    def stand(self, position: Array, yaw: Array, size: Array, upright: Mask) -> tuple[Array, Array]:
+        """Return height (N,) [m], pitch and roll (N, 2) [rad] of bodies of this `size` (N, 3) at `position` (N, 3) [m].
+
+        Whether a body is on a bridge or below it follows from its height; NaN: below. Bodies that are `upright` (N,)
+        do not tilt, and step onto kerbs.
+        """
+        x, y, z = position.T
+        height, tilt = np.zeros(len(x)), np.zeros((len(x), 2))
+        if self._town.relief is not None:
+            height, pitch, roll = find_tilts(lambda a, b: self.heights(a, b, z), x, y, yaw, size)
+            tilt = np.where(upright[:, None], 0.0, np.column_stack((pitch, roll)))
+            height = np.where(upright, self.heights(x, y, z), height)
+        feet = np.flatnonzero(upright)
+        height[feet] += KERB_M * shapely.contains_xy(self._pavement, x[feet], y[feet])
+        return height, tilt

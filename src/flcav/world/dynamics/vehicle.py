@@ -1,4 +1,4 @@
-"""The kinematic bicycle model with tyres of limited grip.
+"""Vehicles: their mechanical parameters, and the kinematic bicycle model with tyres of limited grip.
 
 The bicycle model turns a vehicle about a point on the line of its rear axle: at the speed u its yaw rate is
 u tan(steer) / wheelbase, and its middle moves sideways by the yaw rate times the distance to the rear axle (Rajamani,
@@ -7,15 +7,93 @@ velocity by no more than `FRICTION` times gravity: a vehicle that is too fast fo
 was hit slides and spins until they hold it again.
 """
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Mask
+from flcav.config import InputError
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
-from flcav.world.dynamics.blueprints import Blueprint
+from flcav.world.map.parameters import PROPS
+from flcav.world.map.relief import AXLE_SHARE
+from flcav.world.shapes import SHAPES
 
-Array = NDArray[np.float64]
+STEER_LIMIT_RAD = float(np.radians(70.0))  # of the inner front wheel
+
+
+class _Make(NamedTuple):
+    """Mechanical parameters that the vehicles of a category share."""
+
+    density: float  # mass over the volume of the box [kg/m^3]
+    pull: float  # greatest acceleration by the engine [m/s^2]
+    power: float  # of the engine, over the mass [W/kg]
+    drag: float  # coefficient of drag, of the frontal area
+    brake: float  # greatest deceleration by the brakes [m/s^2]
+
+
+_MAKES: dict[str, _Make] = {
+    "car": _Make(115.0, 4.0, 70.0, 0.30, 8.0),
+    "van": _Make(100.0, 3.2, 45.0, 0.35, 7.5),
+    "truck": _Make(140.0, 1.6, 15.0, 0.60, 6.0),
+    "bus": _Make(120.0, 1.4, 15.0, 0.60, 6.0),
+    "motorcycle": _Make(95.0, 5.0, 130.0, 0.60, 8.0),
+    "bicycle": _Make(47.0, 1.0, 3.0, 0.90, 4.0),
+    "pedestrian": _Make(110.0, 0.0, 0.0, 1.00, 0.0),
+    "prop": _Make(200.0, 0.0, 0.0, 1.00, 0.0),
+}
+VEHICLES = ("car", "van", "truck", "bus", "motorcycle", "bicycle")
+
+
+@dataclass(frozen=True)
+class BodyBlueprint:
+    """Category, shape and mechanical parameters of a vehicle, a walker or a prop."""
+
+    category: str  # one of `trace.CATEGORIES`, or "prop"
+    shape: int  # row of `SHAPES[category]`, or of `PROPS`
+    size: tuple[float, float, float]  # length, width, height [m]
+    mass_kg: float
+    engine_n: float  # greatest force of the engine [N]
+    power_w: float  # greatest power of the engine [W]
+    drag_area_m2: float  # coefficient of drag times frontal area
+    brake_mps2: float  # greatest deceleration by the brakes
+    wheelbase_m: float  # between the axles, which are symmetric about the box's middle
+    steer_limit_rad: float = STEER_LIMIT_RAD  # greatest angle of the front wheels
+
+    @property
+    def inertia_kgm2(self) -> float:
+        """The moment of inertia about the vertical axis [kg m^2], of a homogeneous box."""
+        length, width, _ = self.size
+        return self.mass_kg * (length**2 + width**2) / 12
+
+
+def make_blueprint(category: str, shape: int = 0, size: tuple[float, float, float] | None = None) -> BodyBlueprint:
+    """Return the blueprint of a shape; `size` is length, width, height [m], None: those of the shape.
+
+    Raises `InputError` for an unknown category or shape, and for a size that is not positive.
+    """
+    shapes = PROPS if category == "prop" else SHAPES.get(category)
+    if shapes is None:
+        raise InputError(f"category '{category}': must be one of {', '.join((*SHAPES, 'prop'))}")
+    if not 0 <= shape < len(shapes):
+        raise InputError(f"shape {shape}: category '{category}' has the shapes 0 to {len(shapes) - 1}")
+    length, width, height = size or shapes[shape][1:]
+    if not all(0.05 <= side <= 100.0 for side in (length, width, height)):
+        raise InputError(f"size {length}, {width}, {height}: must be between 0.05 and 100 m")
+    make = _MAKES[category]
+    mass = make.density * length * width * height
+    return BodyBlueprint(
+        category=category,
+        shape=shape,
+        size=(float(length), float(width), float(height)),
+        mass_kg=mass,
+        engine_n=mass * make.pull,
+        power_w=mass * make.power,
+        drag_area_m2=make.drag * width * height,
+        brake_mps2=make.brake,
+        wheelbase_m=2 * AXLE_SHARE * length,
+    )
+
 
 GRAVITY_MPS2 = 9.81
 FRICTION = 0.9  # of tyres on a dry road
@@ -27,7 +105,7 @@ STEER_RADPS = 2.5  # how fast the front wheels turn
 REVERSE_MPS = 8.0  # the engine drives backwards no faster
 
 
-class Motion(NamedTuple):
+class PlanarMotion(NamedTuple):
     """The motion of N bodies in plan, world frame."""
 
     position: Array  # (N, 2) middle of the box [m]
@@ -38,7 +116,7 @@ class Motion(NamedTuple):
 
 
 class Vehicles(NamedTuple):
-    """The parameters of N vehicles: see `Blueprint`."""
+    """The parameters of N vehicles: see `BodyBlueprint`."""
 
     mass_kg: Array
     engine_n: Array
@@ -52,16 +130,16 @@ class Vehicles(NamedTuple):
 
 
 class Pedals(NamedTuple):
-    """What the drivers of N vehicles do."""
+    """Controls of N vehicles."""
 
     throttle: Array  # (N,) 0 to 1
     steer: Array  # (N,) -1 to 1, share of the limit, positive to the left
     brake: Array  # (N,) 0 to 1
-    hand_brake: NDArray[np.bool_]  # (N,)
-    reverse: NDArray[np.bool_]  # (N,)
+    hand_brake: Mask  # (N,)
+    reverse: Mask  # (N,)
 
 
-def stack_blueprints(blueprints: list[Blueprint]) -> Vehicles:
+def stack_blueprints(blueprints: list[BodyBlueprint]) -> Vehicles:
     """Return the parameters of vehicles as arrays."""
     rows = [
         (
@@ -75,8 +153,8 @@ def stack_blueprints(blueprints: list[Blueprint]) -> Vehicles:
     return Vehicles(*np.array(rows, np.float64).reshape(-1, len(Vehicles._fields)).T)
 
 
-def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> Motion:
-    """Return the motion of N vehicles `dt_s` later, on slopes of this `pitch` (N,) [rad], positive downhill."""
+def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> PlanarMotion:
+    """Return the motion of N vehicles `dt_s` [s] later, on slopes of this `pitch` (N,) [rad], positive downhill."""
     ahead = heading_vectors(motion.yaw)
     speed = (motion.velocity * ahead).sum(axis=1)
     wanted = np.clip(pedals.steer, -1, 1) * vehicles.steer_limit_rad
@@ -94,11 +172,11 @@ def drive(motion: Motion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s
         1.0, vehicles.grip_mps2[:, None] * dt_s / np.maximum(needed, 1e-12)
     )
     position = motion.position + (motion.velocity + velocity) / 2 * dt_s
-    return Motion(position, wrap_angle(yaw), velocity, yaw_rate, steer)
+    return PlanarMotion(position, wrap_angle(yaw), velocity, yaw_rate, steer)
 
 
 def _accelerate(speed: Array, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> Array:
-    """Return the speed ahead (N,) [m/s] after `dt_s`: engine, drag and slope; then the brakes, at most to rest."""
+    """Return the longitudinal speed (N,) [m/s] after `dt_s` [s]: engine, drag, slope, then brakes, at most to rest."""
     force = np.minimum(vehicles.engine_n, vehicles.power_w / np.maximum(np.abs(speed), 1e-3))
     force = np.clip(pedals.throttle, 0, 1) * np.where(pedals.reverse, -1 * (speed > -REVERSE_MPS), 1) * force
     drag = AIR_KGPM3 / 2 * vehicles.drag_area_m2 * speed * np.abs(speed)

@@ -7,14 +7,12 @@ around candidate sites, the criterion of conventional sensor placement.
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.arrays import Array
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 
 def measure_traffic_density(sites: Array, traces: Trace | Sequence[Trace], range_m: float) -> Array:

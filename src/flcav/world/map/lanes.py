@@ -1,22 +1,40 @@
-"""The lane-level map of a town: vector layers (`map_layers`) and their bird's-eye raster (`rasterise`)."""
+"""The lane-level map of a town: vector layers (`map_layers`), road markings, and a bird's-eye raster (`rasterise`).
 
-from collections.abc import Iterator, Sequence
+Road markings of a SUMO net, after the practice of European towns.
+
+Lane lines are dashed, and solid before a controlled junction. The directions of a street are separated by a dashed
+line, and by a double solid line where they have more than two driving lanes together. Solid lines separate bicycle and
+parking lanes; edge lines mark streets without a kerb and fast ones. Approaches end in a stop line or a give-way line.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from typing import get_args
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
-from shapely.geometry import LineString, Polygon
+from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
+from shapely.ops import substring
 
-from flcav.world.map.imported import paint_spaces
-from flcav.world.map.layers import Arrow, ArrowKind, Crossing, MapLane, MapLayers
-from flcav.world.map.markings import generate_markings
-from flcav.world.map.paint import ARROW_M, list_outlines, outline_arrow, outline_dashes, outline_stripes
-from flcav.world.map.roads import Edge, Lane, RoadNet, read_net
+from flcav.arrays import Array, Ints, Mask
+from flcav.world.map.layers import (
+    ARROW_M,
+    Arrow,
+    ArrowKind,
+    Crossing,
+    MapLane,
+    MapLayers,
+    Marking,
+    MarkingKind,
+    list_outlines,
+    outline_arrow,
+    outline_dashes,
+    outline_stripes,
+)
+from flcav.world.map.roads import CARRIAGEWAY, Edge, Lane, RoadNet, read_net
+from flcav.world.map.street_furniture import paint_spaces
 from flcav.world.map.town import Town
-
-Array = NDArray[np.float64]
 
 RASTER_LAYERS: tuple[str, ...] = (
     "road",  # drivable surface
@@ -33,9 +51,7 @@ WAYS: dict[str, ArrowKind] = {kind: kind for kind in get_args(ArrowKind)}
 ARROWS_BEFORE_M = (8.0, 28.0)  # from the end of the lane back to an arrow's middle
 
 
-def rasterise(
-    layers: MapLayers, world_from_patch: Array, size_m: tuple[float, float], resolution_m: float
-) -> NDArray[np.bool_]:
+def rasterise(layers: MapLayers, world_from_patch: Array, size_m: tuple[float, float], resolution_m: float) -> Mask:
     """Return the bird's-eye raster (len(RASTER_LAYERS), H, W) of a patch: which pixel centres lie in each layer.
 
     `world_from_patch` (4, 4) is the pose of the patch's middle, x forward and y left; `size_m` its extents along x, y
@@ -47,7 +63,7 @@ def rasterise(
     patch_from_world = np.linalg.inv(world_from_patch)
     corner = np.array(size_m) / 2
 
-    def layer(polygons: Sequence[Array]) -> NDArray[np.bool_]:
+    def layer(polygons: Sequence[Array]) -> Mask:
         if not polygons:
             return np.zeros(shape, np.bool_)
         counts = [len(polygon) for polygon in polygons]
@@ -57,7 +73,7 @@ def rasterise(
     return np.stack([layer(polygons) for polygons in _polygons(layers).values()])
 
 
-def fill_polygons(points: Array, counts: NDArray[np.int64], shape: tuple[int, int]) -> NDArray[np.bool_]:
+def fill_polygons(points: Array, counts: Ints, shape: tuple[int, int]) -> Mask:
     """Return the mask (H, W) of pixels whose centres (i + 0.5, j + 0.5) lie in any of the polygons.
 
     Scan-line fill by the nonzero winding rule, vectorised over all edges. `points` (N, 2) are the polygons' vertices as
@@ -187,3 +203,192 @@ def _along(edge: Edge, lane: Lane, way: ArrowKind) -> Iterator[Arrow]:
         a, b = (line.interpolate(middle + side * ARROW_M / 2) for side in (-1, 1))
         at = line.interpolate(middle)
         yield Arrow(way, at.x, at.y, float(np.arctan2(b.y - a.y, b.x - a.x)), lane.id)
+
+
+LINE_M = 0.12  # width of a line
+BICYCLE_LINE_M = 0.25
+DASH_M, GAP_M = 3.0, 6.0  # of a dashed lane line
+YIELD_DASH_M, YIELD_GAP_M, YIELD_LINE_M = 0.5, 0.25, 0.5
+STOP_LINE_M = 0.5
+TO_STOP_M = 0.35  # from the middle of a stop line to the end of its lane
+APPROACH_M = 18.0  # lane lines are solid over this length before a controlled junction
+DOUBLE_M = 0.12  # from the middle of the road to each line of a double line
+INSET_M = 0.2  # from the edge of the lane to an edge line
+FAST = 13.0  # [m/s] from this speed limit on, streets have edge lines even along a kerb
+SHORTEST_M = 0.3  # shorter pieces of a line are left out
+SAME_LINE_M = 0.7  # left sides of two edges nearer than this are one line: the directions of one street
+
+
+def generate_markings(
+    net: RoadNet, roads: BaseGeometry, crossings: BaseGeometry, stop_lines: Mapping[str, float]
+) -> Iterator[Marking]:
+    """Yield the road markings of a net, clipped to `roads` and left out on `crossings`.
+
+    Both areas are shapely geometry in the world frame [m]. Lanes with a key in `stop_lines` have one so far before
+    their ends [m]; their edges have no other one.
+    """
+    paper = roads.buffer(-0.01).difference(crossings)
+    shapely.prepare(paper)
+    for marking in _generate_unclipped(net, stop_lines):
+        width = marking.width_m / 2
+        inside = paper.buffer(-width) if width > LINE_M else paper  # wide ones lie wholly on the road
+        for part in _lines(LineString(marking.line).intersection(inside)):
+            if part.length >= SHORTEST_M:
+                line = np.asarray(part.coords)
+                yield Marking(marking.kind, line, marking.width_m, marking.dash_m, marking.gap_m, marking.colour)
+
+
+def _generate_unclipped(net: RoadNet, stop_lines: Mapping[str, float]) -> Iterator[Marking]:
+    """Yield all markings of a net before they are clipped, edge by edge."""
+    bends = _bends(net)
+    facing: dict[tuple[str, str], list[Edge]] = {}
+    for edge in net.edges.values():
+        if edge.function == "normal":
+            facing.setdefault((edge.start, edge.end), []).append(edge)
+        elif edge.id in bends:
+            facing.setdefault(("", bends[edge.id]), []).append(edge)
+    for edge in net.edges.values():
+        inside = edge.id in bends
+        if edge.function != "normal" and not inside:
+            continue
+        lanes = [lane for lane in edge.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
+        if not lanes:
+            continue
+        approach = APPROACH_M if not inside and _is_controlled(net, edge) else 0.0
+        yield from _between_lanes(lanes, approach, net.side)
+        across = facing.get(("", bends[edge.id]) if inside else (edge.end, edge.start), [])
+        yield from _left_side(edge, lanes, across, approach, net.side)
+        kerb = any(lane.kind == "sidewalk" for lane in edge.lanes) and lanes[0].speed < FAST
+        if not kerb and not inside and lanes[0].kind == "driving":
+            yield Marking("edge", _beside(lanes[0], INSET_M - lanes[0].width / 2, net.side), LINE_M, 0.0, 0.0)
+        if not inside:
+            known = [lane for lane in edge.lanes if lane.id in stop_lines]
+            yield from (_stop_line(lane, stop_lines[lane.id], net.side) for lane in known)
+            if not known:
+                yield from _entry(net, edge)
+
+
+def _between_lanes(lanes: list[Lane], approach: float, side: int) -> Iterator[Marking]:
+    """Yield the lines between neighbouring lanes (from the kerb to the middle); `approach` is as in `_broken`."""
+    for right, left in pairwise(lanes):
+        line = _beside(right, right.width / 2, side)
+        if right.kind == left.kind == "driving":
+            yield from _broken(line, approach)
+        else:
+            wide = {right.kind, left.kind} == {"bicycle", "driving"}
+            yield Marking("solid", line, BICYCLE_LINE_M if wide else LINE_M, 0.0, 0.0)
+
+
+def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: float, side: int) -> Iterator[Marking]:
+    """Yield the centre line towards that edge of `across` (the opposite direction) which adjoins, else an edge line."""
+    line = _beside(lanes[-1], lanes[-1].width / 2, side)
+    for other in across:
+        theirs = [lane for lane in other.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
+        if other is edge or not theirs or not _coincide(line, _beside(theirs[-1], theirs[-1].width / 2, side)):
+            continue
+        if edge.id > other.id:
+            return  # the other direction has it
+        if len([lane for lane in (*lanes, *theirs) if lane.kind == "driving"]) > 2:
+            for aside in (-DOUBLE_M, DOUBLE_M):
+                yield Marking("solid", _beside(lanes[-1], lanes[-1].width / 2 + aside, side), LINE_M, 0.0, 0.0)
+        else:
+            yield from _broken(line, approach, both_ends=True)
+        return
+    if edge.function == "normal":
+        yield Marking("edge", _beside(lanes[-1], lanes[-1].width / 2 - INSET_M, side), LINE_M, 0.0, 0.0)
+
+
+def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterator[Marking]:
+    """Yield a dashed line that is solid over its last `approach` metres, or over both ends; a third of it at most."""
+    whole = LineString(line)
+    approach = min(approach, whole.length / 3)
+    start = approach if both_ends else 0.0
+    pieces: list[tuple[MarkingKind, float, float]] = [("dashed", start, whole.length - approach)]
+    pieces.append(("solid", 0.0, start))
+    pieces.append(("solid", whole.length - approach, whole.length))
+    for kind, low, high in pieces:
+        if high - low > SHORTEST_M:
+            dash, gap = (DASH_M, GAP_M) if kind == "dashed" else (0.0, 0.0)
+            yield Marking(kind, np.asarray(substring(whole, low, high).coords), LINE_M, dash, gap)
+
+
+def _stop_line(lane: Lane, before_end_m: float, side: int) -> Marking:
+    """Return the stop line across one lane; beyond the lane's end its direction goes straight on."""
+    line = LineString(lane.shape)
+    at = line.length - before_end_m
+    near = max(min(at, line.length) - 0.5, 0.0)
+    a, b = (np.array(line.interpolate(where).coords[0]) for where in (near, min(near + 0.5, line.length)))
+    forward = (b - a) / max(float(np.hypot(*(b - a))), 1e-9)
+    left = side * np.array([-forward[1], forward[0]])
+    middle = a + (at - near) * forward
+    return Marking("stop_line", middle + np.outer((-0.5, 0.5), lane.width * left), STOP_LINE_M, 0.0, 0.0)
+
+
+def _entry(net: RoadNet, edge: Edge) -> Iterator[Marking]:
+    """Yield the stop line or give-way line across the driving and bicycle lanes at the end of an edge."""
+    states = set(net.right_of_way.get(edge.id, ""))
+    lanes = [lane for lane in edge.lanes if lane.kind in ("driving", "bicycle") and len(lane.shape) > 1]
+    if not lanes or not states:
+        return
+    stops = net.junctions[edge.end].kind.startswith("traffic_light") or "s" in states
+    if not stops and states != {"m"}:
+        return
+    ends = []
+    for lane, side in ((lanes[0], -0.5), (lanes[-1], 0.5)):
+        a, b = lane.shape[-2], lane.shape[-1]
+        forward = (b - a) / np.hypot(*(b - a))
+        inset = 0.1 if len(lanes) == 1 or side < 0 else 0.15
+        left = net.side * np.array([-forward[1], forward[0]])
+        ends.append(b - TO_STOP_M * forward + (side * lane.width - np.sign(side) * inset) * left)
+    line = np.array(ends)
+    if stops:
+        yield Marking("stop_line", line, STOP_LINE_M, 0.0, 0.0)
+    else:
+        yield Marking("yield_line", line, YIELD_LINE_M, YIELD_DASH_M, YIELD_GAP_M)
+
+
+def _is_controlled(net: RoadNet, edge: Edge) -> bool:
+    """Return whether an edge leads to a traffic light, a stop sign or a give-way sign."""
+    junction = net.junctions.get(edge.end)
+    return junction is not None and (
+        junction.kind.startswith("traffic_light") or bool(set(net.right_of_way.get(edge.id, "")) & {"s", "m"})
+    )
+
+
+def _bends(net: RoadNet) -> dict[str, str]:
+    """Return the internal edges that continue one street through a node with two neighbours: edge -> junction."""
+    neighbours: dict[str, set[str]] = {}
+    for edge in net.streets:
+        neighbours.setdefault(edge.end, set()).add(edge.start)
+        neighbours.setdefault(edge.start, set()).add(edge.end)
+    through = {name for name, others in neighbours.items() if len(others) == 2}
+    straight = {
+        connection.via.rpartition("_")[0] for connection in net.connections if connection.turn in ("s", "L", "R")
+    }
+    return {
+        edge.id: name
+        for edge in net.edges.values()
+        if edge.function == "internal" and edge.id in straight
+        for name in [edge.id[1:].rpartition("_")[0]]
+        if name in through and not net.junctions[name].kind.startswith("traffic_light")
+    }
+
+
+def _beside(lane: Lane, left_m: float, side: int) -> Array:
+    """Return the line `left_m` to the left of a lane's middle, with left-hand traffic (`side` -1) to the right."""
+    line = LineString(lane.shape).offset_curve(side * left_m, join_style="mitre")
+    parts = _lines(line)
+    return np.asarray(max(parts, key=lambda part: part.length).coords) if parts else lane.shape
+
+
+def _coincide(one: Array, other: Array) -> bool:
+    """Return whether two polylines (K, 2) coincide within `SAME_LINE_M`, at three points of the other."""
+    line = LineString(one)
+    whole = LineString(other)
+    inner = [whole.interpolate(share, normalized=True) for share in (0.25, 0.5, 0.75)]
+    return max(line.distance(Point(at)) for at in inner) < SAME_LINE_M
+
+
+def _lines(shape: BaseGeometry) -> list[LineString]:
+    parts = getattr(shape, "geoms", [shape])
+    return [part for part in parts if isinstance(part, LineString) and not part.is_empty]

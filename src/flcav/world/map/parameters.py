@@ -1,5 +1,6 @@
 """Parameters of a town: the schema of `town.yaml`, from which buildings, furniture and traffic are drawn."""
 
+from collections.abc import Iterable
 from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field, model_validator
@@ -55,11 +56,6 @@ def _extent(value: tuple[float, float]) -> tuple[float, float]:
     return _interval(value)
 
 
-def _vehicle_mix(value: dict[str, float]) -> dict[str, float]:
-    allowed = [name for name in SHAPES if name != "pedestrian"]
-    return _mix(value, allowed)
-
-
 def _mix(value: dict[str, float], allowed: list[str]) -> dict[str, float]:
     if unknown := sorted(set(value) - set(allowed)):
         raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(allowed)}{suggest(unknown[0], allowed)}")
@@ -79,25 +75,19 @@ def _rare_kinds(value: dict[str, float]) -> dict[str, float]:
     return value
 
 
-def _clutter_mix(value: dict[str, float]) -> dict[str, float]:
-    return _mix(value, list(CLUTTER))
-
-
-def _boundary_mix(value: dict[str, float]) -> dict[str, float]:
-    return _mix(value, list(BOUNDARIES)) if value else value
-
-
-def _kerbside_mix(value: dict[str, float]) -> dict[str, float]:
-    return _mix(value, list(KERBSIDE)) if value else value
+def _mix_of(allowed: Iterable[str], *, empty: bool = False) -> AfterValidator:
+    """Return the check of weights by kind, one of `allowed`; `empty`: there may be none."""
+    kinds = list(allowed)
+    return AfterValidator(lambda value: value if empty and not value else _mix(value, kinds))
 
 
 Interval = Annotated[tuple[float, float], AfterValidator(_interval)]
 Extent = Annotated[tuple[float, float], AfterValidator(_extent)]
 RareKinds = Annotated[dict[str, float], AfterValidator(_rare_kinds)]
-VehicleMix = Annotated[dict[str, float], AfterValidator(_vehicle_mix)]
-ClutterMix = Annotated[dict[str, float], AfterValidator(_clutter_mix)]
-BoundaryMix = Annotated[dict[str, float], AfterValidator(_boundary_mix)]
-KerbsideMix = Annotated[dict[str, float], AfterValidator(_kerbside_mix)]
+VehicleMix = Annotated[dict[str, float], _mix_of(name for name in SHAPES if name != "pedestrian")]
+ClutterMix = Annotated[dict[str, float], _mix_of(CLUTTER)]
+BoundaryMix = Annotated[dict[str, float], _mix_of(BOUNDARIES, empty=True)]
+KerbsideMix = Annotated[dict[str, float], _mix_of(KERBSIDE, empty=True)]
 
 
 class StreetParameters(Config):

@@ -11,15 +11,14 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import shapely
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.spatial import Delaunay, QhullError
 from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array, Ints, Ints32
 from flcav.config import InputError
 from flcav.machine.compiled import compiled
-from flcav.storage.parquet import read_parquet
-
-Array = NDArray[np.float64]
+from flcav.storage.files import read_parquet
 
 PLACE = ("deck", "section")  # columns of a town's heights with bridges
 AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # from the middle of a vehicle to its wheels, of its length and width
@@ -46,7 +45,7 @@ class Relief:
         return {"points": self.points, "decks": self.decks}
 
     @cached_property
-    def triangles(self) -> NDArray[np.int32]:
+    def triangles(self) -> Ints32:
         """Return the triangles (F, 3), rows of `points`, counter-clockwise."""
         return self._tin.simplices
 
@@ -76,7 +75,7 @@ class Relief:
         return out
 
     def above(self, points: Array) -> Array:
-        """Return how high (N,) [m] points (N, 3), world frame [m], are above the ground, or the deck below them."""
+        """Return the height (N,) [m] of points (N, 3), world frame [m], above the ground, or a deck below them."""
         x, y, z = points.T
         foot = self.heights(x, y)
         for deck in self.decks:
@@ -183,7 +182,7 @@ def find_tilts(
     return height, pitch, np.arctan2(bank * np.cos(pitch), 2 * aside)
 
 
-def _split_sections(points: Array, section: NDArray[np.int64]) -> list[Array]:
+def _split_sections(points: Array, section: Ints) -> list[Array]:
     """Return the cross-sections of points (N, 3) with these numbers (N,), in the order of the rows."""
     return np.split(points, np.flatnonzero(np.diff(section)) + 1)
 

@@ -4,15 +4,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.arrays import Array
 from flcav.geometry import left_vectors
 from flcav.world.map.parameters import SignalParameters, StreetParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 
-Array = NDArray[np.float64]
 Head = tuple[tuple[float, float, float], float, tuple[float, float], str]  # position, yaw, foot, link
 
 KERB_HEAD_M = 2.9  # height of the centre of a head beside the road

@@ -1,22 +1,32 @@
-"""Procedural placement along the streets of a town: buildings, trees, clutter, lamps, signs and candidate poles.
+"""Procedural placement along the streets of a town: buildings, trees, clutter, fences, lamps, signs, candidate poles.
 
 Positions and yaws are in the world frame [m, rad]. The same random generator gives the same placement.
+
+Procedural placement of what encloses plots (hedges, walls, fences) and of small objects at the kerb.
+
+Both are clutter: rows (K, 6) x, y, yaw, length, width, height by kind, in the world frame [m, rad].
+
+Parking spaces, and objects beside the roads, of the map that a town was imported from.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Literal
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString, Point, Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array
 from flcav.geometry import heading_vectors
+from flcav.world.map.layers import Marking
 from flcav.world.map.parameters import (
     CLUTTER,
     Interval,
+    ObjectParameters,
+    ParkingParameters,
     PoleParameters,
     SignParameters,
     StreetParameters,
@@ -24,8 +34,6 @@ from flcav.world.map.parameters import (
 )
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.surfaces import GroundSurfaces, make_footprint
-
-Array = NDArray[np.float64]
 
 CORNER_M = 9.0  # a row of buildings may begin and end this far beyond its edge's ends
 STEP_M = 1.0  # shift along the street to the next try where something did not fit
@@ -112,20 +120,23 @@ def list_verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
 
 
 def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Array:
-    """Return the buildings (B, 6) x, y, yaw, length, width, height: rows along every verge, with drawn gaps."""
+    """Return the buildings (B, 6) x, y, yaw, length, width, height [m, rad]: rows along every verge with drawn gaps."""
     out = []
     for verge in rows:
         street = verge.street
         along = -CORNER_M
         while along < verge.line.length + CORNER_M:
-            length, width = draw(random, street.building_length_m), draw(random, street.building_depth_m)
-            height = draw(random, street.building_height_m)
-            right = verge.half_width + street.frontage_m + draw(random, street.setback_m) + width / 2
+            length, width = (
+                draw_uniform(random, street.building_length_m),
+                draw_uniform(random, street.building_depth_m),
+            )
+            height = draw_uniform(random, street.building_height_m)
+            right = verge.half_width + street.frontage_m + draw_uniform(random, street.setback_m) + width / 2
             for candidate in (length, street.building_length_m[0]):
                 x, y, yaw = verge.at(along + candidate / 2, right)
                 if plot.build(make_footprint(x, y, yaw, candidate, width)):
                     out.append((x, y, yaw, candidate, width, height))
-                    along += candidate + max(CLEARANCE_M, draw(random, street.building_gap_m))
+                    along += candidate + max(CLEARANCE_M, draw_uniform(random, street.building_gap_m))
                     break
             else:
                 along += STEP_M
@@ -134,16 +145,15 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
 
 def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) -> tuple[tuple[str, Array], ...]:
     """Return the clutter just behind the sidewalks by kind: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
-    out: dict[str, list[tuple[float, ...]]] = {}
+    pieces: list[Piece] = []
     for verge in rows:
-        kinds, weights = list(verge.street.clutter), np.array(list(verge.street.clutter.values()))
         for along in list_stations(verge, verge.street.clutter_spacing_m, random):
-            kind = kinds[int(random.choice(len(kinds), p=weights / weights.sum()))]
+            kind = _choose(verge.street.clutter, random)
             length, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
             x, y, yaw = verge.at(along, verge.half_width + 0.15 + width / 2)
             if plot.build(make_footprint(x, y, yaw, length, width)):
-                out.setdefault(kind, []).append((x, y, yaw, float(length), float(width), float(height)))
-    return tuple((kind, _rows(out[kind], 6)) for kind in sorted(out))
+                pieces.append((kind, (x, y, yaw, length, width, height)))
+    return _by_kind(pieces)
 
 
 def place_trees(rows: list[Verge], ground: GroundSurfaces, plot: Plot, random: np.random.Generator) -> Array:
@@ -191,7 +201,9 @@ def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) 
 def place_poles(
     net: RoadNet, parameters: tuple[PoleParameters, ...]
 ) -> list[tuple[int, tuple[float, float, float], float, str]]:
-    """Return id, position, yaw and kind of each candidate site, by id; raises `KeyError` for an edge the net lacks.
+    """Return id, position [m], yaw [rad] and kind of each candidate site, by id.
+
+    Raises `KeyError` for an edge that the net lacks.
 
     A straight site faces across the road, another one its junction or the middle of its roundabout.
     """
@@ -212,7 +224,7 @@ def place_poles(
 def place_signs(
     net: RoadNet, known: tuple[SignParameters, ...] = (), *, limits_known: bool = False
 ) -> list[tuple[tuple[float, float, float], float, str]]:
-    """Return position, yaw and kind of each traffic sign: give way and stop before junctions, the limit after them.
+    """Return position [m], yaw [rad] and kind of each sign: give way and stop before junctions, the limit after them.
 
     Where some are `known`, these stand instead: signs of right of way, or speed limits. With `limits_known` there is no
     speed limit but these, even where there are none.
@@ -253,10 +265,120 @@ def list_stations(verge: Verge, spacing_m: float, random: np.random.Generator) -
         along += spacing_m * random.uniform(0.7, 1.3)
 
 
-def draw(random: np.random.Generator, interval: Interval) -> float:
+def draw_uniform(random: np.random.Generator, interval: Interval) -> float:
     """Return a number drawn uniformly from an interval."""
     return float(random.uniform(*interval))
 
 
 def _rows(rows: list[tuple[float, ...]], columns: int) -> Array:
     return np.array(rows, dtype=np.float64).reshape(-1, columns)
+
+
+Clutter = tuple[tuple[str, Array], ...]  # rows (K, 6) by kind
+Piece = tuple[str, tuple[float, ...]]  # kind and row
+
+PIECE_M = 4.0  # longest straight piece of a boundary
+JOINT_M = 0.02  # between two pieces of a stretch
+
+
+def place_boundaries(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Clutter:
+    """Return hedges, walls and fences along the verges whose streets have them.
+
+    A stretch is of one kind, height and setback, and made of straight pieces; pieces without room are left out.
+    """
+    pieces: list[Piece] = []
+    for verge in rows:
+        street = verge.street
+        along = draw_uniform(random, street.boundary_gap_m) if street.boundary else np.inf
+        while along < verge.line.length:
+            end = min(along + draw_uniform(random, street.boundary_length_m), verge.line.length)
+            pieces += _stretch(verge, along, end, plot, random)
+            along = end + max(draw_uniform(random, street.boundary_gap_m), 0.1)
+    return _by_kind(pieces)
+
+
+def _stretch(verge: Verge, start: float, end: float, plot: Plot, random: np.random.Generator) -> Iterator[Piece]:
+    """Yield the pieces of one stretch of a boundary from `start` to `end` along the verge [m]."""
+    kind = _choose(verge.street.boundary, random)
+    _, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
+    setback = draw_uniform(random, verge.street.boundary_setback_m)
+    edges = np.linspace(start, end, max(1, int(np.ceil((end - start) / PIECE_M))) + 1)
+    for first, last in pairwise(edges.tolist()):
+        x, y, yaw = verge.at((first + last) / 2, verge.half_width + setback + width / 2)
+        if plot.build(make_footprint(x, y, yaw, last - first - JOINT_M, width), apart_m=0.0):
+            yield kind, (x, y, yaw, last - first - JOINT_M, width, height * random.uniform(0.95, 1.05))
+
+
+def place_kerbside(rows: list[Verge], random: np.random.Generator) -> Clutter:
+    """Return the small objects at the kerb of the streets that have them."""
+    pieces: list[Piece] = []
+    for verge in (verge for verge in rows if verge.street.kerbside):
+        for along in list_stations(verge, verge.street.kerbside_spacing_m, random):
+            kind = _choose(verge.street.kerbside, random)
+            length, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
+            x, y, yaw = verge.at(along, KERBSIDE_M - verge.half_width)
+            pieces.append((kind, (x, y, yaw, length, width, height)))
+    return _by_kind(pieces)
+
+
+def join_clutter(*parts: Clutter) -> Clutter:
+    """Return the clutter of all `parts`, by kind."""
+    return _by_kind([(kind, tuple(row)) for part in parts for kind, rows in part for row in rows.tolist()])
+
+
+def _choose(mix: dict[str, float], random: np.random.Generator) -> str:
+    weights = np.array(list(mix.values()))
+    return list(mix)[int(random.choice(len(mix), p=weights / weights.sum()))]
+
+
+def _by_kind(pieces: list[Piece]) -> Clutter:
+    kinds = sorted({kind for kind, _ in pieces})
+    return tuple((kind, np.array([row for own, row in pieces if own == kind], np.float64)) for kind in kinds)
+
+
+LINE_M = 0.12  # width of the lines
+
+
+def outline_space(space: ParkingParameters) -> Polygon:
+    """Return the outline of a parking space, world frame [m]."""
+    return make_footprint(space.x, space.y, np.radians(space.yaw_deg), space.length_m, space.width_m)
+
+
+def paint_spaces(spaces: Sequence[ParkingParameters]) -> Iterator[Marking]:
+    """Yield the lines around parking spaces, inside their outlines."""
+    for space in spaces:
+        inner = outline_space(space).buffer(-LINE_M / 2, join_style="mitre")
+        corners = np.asarray(inner.exterior.coords)
+        for i in range(4):
+            yield Marking("solid", corners[i : i + 2], LINE_M, 0.0, 0.0)
+
+
+def outline_objects(objects: Sequence[ObjectParameters]) -> list[Polygon]:
+    """Return the footprints of objects, world frame [m]; those of trees are as wide as their crowns."""
+    return [make_footprint(each.x, each.y, np.radians(each.yaw_deg), each.length_m, each.width_m) for each in objects]
+
+
+def list_buildings(objects: Sequence[ObjectParameters]) -> Array:
+    """Return the buildings (B, 6) among objects: x, y, yaw, length, width, height [m, rad]."""
+    return _list_rows(objects, "building")
+
+
+def list_trees(objects: Sequence[ObjectParameters]) -> Array:
+    """Return the trees (T, 4) among objects: x, y, height, crown radius [m]."""
+    rows = _list_rows(objects, "tree")
+    return np.column_stack((rows[:, 0], rows[:, 1], rows[:, 5], rows[:, 3:5].mean(axis=1) / 2))
+
+
+def list_clutter(objects: Sequence[ObjectParameters]) -> tuple[tuple[str, Array], ...]:
+    """Return all other objects by kind of clutter: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
+    kinds = sorted({each.kind for each in objects} - {"building", "tree"})
+    return tuple((kind, _list_rows(objects, kind)) for kind in kinds)
+
+
+def _list_rows(objects: Sequence[ObjectParameters], kind: str) -> Array:
+    rows = [
+        (each.x, each.y, float(np.radians(each.yaw_deg)), each.length_m, each.width_m, each.height_m)
+        for each in objects
+        if each.kind == kind
+    ]
+    return np.array(rows, dtype=np.float64).reshape(-1, 6)

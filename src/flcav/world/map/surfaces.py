@@ -5,16 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.errors import GEOSException
 from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 from shapely.ops import linemerge, split
 
+from flcav.arrays import Array
 from flcav.geometry import heading_vectors
 from flcav.world.map.roads import CARRIAGEWAY, RoadNet
-
-Array = NDArray[np.float64]
 
 GRID_M = 1e-3
 SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter lanes left out: artefacts of the net
@@ -59,9 +57,9 @@ def build_ground_surfaces(
             paved.append(area.buffer(frontage, join_style="mitre"))
     inside = [Polygon(junction.shape).buffer(0) for junction in net.junctions.values() if len(junction.shape) > 2]
     driven_area, walked_area = unite(driven), unite(walked)
-    roads = add(driven_area, subtract(unite(inside), walked_area))
+    roads = join_areas(driven_area, cut_area(unite(inside), walked_area))
     roads = MultiPolygon([part for part in _clean(roads).geoms if part.intersects(driven_area)])
-    sidewalks = subtract(unite(paved), roads)
+    sidewalks = cut_area(unite(paved), roads)
     islands = MultiPolygon(
         [
             hole
@@ -69,7 +67,7 @@ def build_ground_surfaces(
             if not hole.intersects(walked_area.buffer(-SLIVER_M)) and hole.buffer(-ISLAND_M).is_empty
         ]
     )
-    return GroundSurfaces(roads, _clean(add(sidewalks, islands)), islands)
+    return GroundSurfaces(roads, _clean(join_areas(sidewalks, islands)), islands)
 
 
 def unite(areas: Sequence[BaseGeometry]) -> BaseGeometry:
@@ -80,7 +78,7 @@ def unite(areas: Sequence[BaseGeometry]) -> BaseGeometry:
         return shapely.union_all([_snap(area) for area in areas], grid_size=GRID_M)
 
 
-def add(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
+def join_areas(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
     """Return the union of two areas, as `unite` does."""
     try:
         return shapely.union(area, other)
@@ -88,7 +86,7 @@ def add(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
         return shapely.union(_snap(area), _snap(other), grid_size=GRID_M)
 
 
-def subtract(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
+def cut_area(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
     """Return `area` without `other`; where exact coordinates defeat GEOS, on a grid of `GRID_M`."""
     try:
         return shapely.difference(area, other)

@@ -3,25 +3,25 @@
 import hashlib
 import os
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import lru_cache
+from itertools import compress
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, read_config, read_file, shorten
 from flcav.interface.wording import suggest
 from flcav.statistics.streams import stream
-from flcav.world.map import boundaries, imported, street_furniture
+from flcav.world.map import street_furniture
 from flcav.world.map.parameters import GeoReference, TownParameters
 from flcav.world.map.relief import Relief
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.map.signals import Signals, place_signals
-from flcav.world.map.surfaces import add, build_ground_surfaces, find_kerbs, split_into_polygons, unite
-
-Array = NDArray[np.float64]
+from flcav.world.map.surfaces import build_ground_surfaces, find_kerbs, join_areas, split_into_polygons, unite
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
 HILLY: dict[str, str] = {f"hilly_{name}": name for name in TOWNS}  # the same towns with slopes and camber
@@ -38,7 +38,7 @@ MARGIN_M = 5.0  # from the outermost surface or building to the bounds
 class Poles:
     """The P candidate sites of a roadside sensor."""
 
-    id: NDArray[np.int64]  # (P,) site numbers, from 1
+    id: Ints  # (P,) site numbers, from 1
     position: Array  # (P, 3) mount of the sensor, world [m]
     yaw: Array  # (P,) direction the mount faces: the road or the junction, world [rad]
     kind: tuple[str, ...]  # (P,) straight | cross | tee | roundabout
@@ -51,6 +51,9 @@ class Signs:
     position: Array  # (S, 3) plate centre, world [m]
     yaw: Array  # (S,) direction of the plate's front normal, world [rad]
     kind: tuple[str, ...]  # (S,) stop | yield | speed_30 | speed_60 | speed_90
+
+
+Placed = TypeVar("Placed", Poles, Signs, Signals)
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,7 @@ class Town:
     lamps: Array  # (L, 3) street lamps: x, y of the foot, height above it [m]
     geo: GeoReference = field(default_factory=GeoReference)  # geodetic position of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
-    posts: Array = field(
-        default_factory=lambda: np.zeros((0, 3))
-    )  # (K, 3) poles of a map: x, y of the foot, height [m]
+    posts: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (K, 3) poles of a map: x, y of foot, height [m]
     relief: Relief | None = None  # heights of the ground; None: it is level, at z = 0
 
     def grounds(self, x: Array, y: Array) -> Array:
@@ -144,8 +145,8 @@ def _build_town(folder: Path, files: str) -> Town:
 def _raise_hills(name: str, folder: Path) -> Town:
     """Return the level town of a folder of flcav with its slopes and camber, under another name."""
     level = load_town(folder)
-    told = f"{level.parameters.description.rstrip('.')}; with slopes and camber."
-    named = replace(level, name=name, parameters=level.parameters.model_copy(update={"description": told}))
+    description = f"{level.parameters.description.rstrip('.')}; with slopes and camber."
+    named = replace(level, name=name, parameters=level.parameters.model_copy(update={"description": description}))
     return lift_town(named, Relief.load(folder / HILLS))
 
 
@@ -209,10 +210,10 @@ def _clear_bridges(town: Town, relief: Relief) -> Town:
     taken = shapely.union_all([deck.outline for deck in relief.decks]).buffer(BESIDE_BRIDGE_M)
     shapely.prepare(taken)
 
-    def is_free(feet: Array) -> NDArray[np.bool_]:
+    def is_free(feet: Array) -> Mask:
         return ~shapely.contains_xy(taken, *feet[:, :2].T)
 
-    def is_clear(rows: Array) -> NDArray[np.bool_]:
+    def is_clear(rows: Array) -> Mask:
         return ~shapely.intersects(taken, [street_furniture.make_footprint(*row[:5]) for row in rows])
 
     signals = town.signals
@@ -223,25 +224,18 @@ def _clear_bridges(town: Town, relief: Relief) -> Town:
         clutter=tuple((kind, rows[is_clear(rows)]) for kind, rows in town.clutter),
         lamps=town.lamps[is_free(town.lamps)],
         posts=town.posts[is_free(town.posts)],
-        poles=Poles(
-            town.poles.id[poles],
-            town.poles.position[poles],
-            town.poles.yaw[poles],
-            tuple(kind for kind, kept in zip(town.poles.kind, poles) if kept),
-        ),
-        signs=Signs(
-            town.signs.position[signs],
-            town.signs.yaw[signs],
-            tuple(kind for kind, kept in zip(town.signs.kind, signs) if kept),
-        ),
-        signals=Signals(
-            signals.position[heads],
-            signals.yaw[heads],
-            signals.foot[heads],
-            tuple(link for link, kept in zip(signals.link, heads) if kept),
-            int(heads[len(heads) - signals.walkers :].sum()),
-        ),
+        poles=_pick(town.poles, poles),
+        signs=_pick(town.signs, signs),
+        signals=replace(_pick(signals, heads), walkers=int(heads[len(heads) - signals.walkers :].sum())),
     )
+
+
+def _pick(record: Placed, kept: Mask) -> Placed:
+    """Return the rows of a record's arrays and tuples for which `kept` (N,) is true."""
+    columns = {field.name: getattr(record, field.name) for field in fields(record)}
+    arrays = {name: column[kept] for name, column in columns.items() if isinstance(column, np.ndarray)}
+    words = {name: tuple(compress(column, kept)) for name, column in columns.items() if isinstance(column, tuple)}
+    return replace(record, **arrays, **words)
 
 
 def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
@@ -250,27 +244,26 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
     Ground first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
     """
     frontage = {kind: street.frontage_m for kind, street in parameters.streets.items()}
-    ground = build_ground_surfaces(net, frontage, [imported.outline_space(space) for space in parameters.parking])
+    ground = build_ground_surfaces(
+        net, frontage, [street_furniture.outline_space(space) for space in parameters.parking]
+    )
     rows = list(street_furniture.list_verges(net, parameters))
-    paved = add(ground.roads, ground.sidewalks)
+    paved = join_areas(ground.roads, ground.sidewalks)
     land = street_furniture.Plot(paved)
-    for shape in (given := imported.outline_objects(parameters.objects)):
+    for shape in (given := street_furniture.outline_objects(parameters.objects)):
         land.build(shape, 0.0)
-    buildings = imported.list_buildings(parameters.objects)
+    buildings = street_furniture.list_buildings(parameters.objects)
     if not len(buildings):
         buildings = street_furniture.place_buildings(rows, land, stream(parameters.seed, "buildings"))
     walked = unite([verge.line.buffer(verge.half_width, cap_style="flat") for verge in rows])
-    facades = [
-        street_furniture.make_footprint(x, y, yaw, length, width).buffer(0.1)
-        for x, y, yaw, length, width, _ in buildings
-    ]
+    facades = [street_furniture.make_footprint(*row[:5]).buffer(0.1) for row in buildings]
     open_land = street_furniture.Plot(unite([ground.roads, walked, *facades]))
     for shape in given:
         open_land.build(shape, 0.0)
     clutter = street_furniture.place_clutter(rows, open_land, stream(parameters.seed, "clutter"))
-    enclosing = boundaries.place_boundaries(rows, open_land, stream(parameters.seed, "boundaries"))
-    kerbside = boundaries.place_kerbside(rows, stream(parameters.seed, "kerbside"))
-    trees = imported.list_trees(parameters.objects)
+    enclosing = street_furniture.place_boundaries(rows, open_land, stream(parameters.seed, "boundaries"))
+    kerbside = street_furniture.place_kerbside(rows, stream(parameters.seed, "kerbside"))
+    trees = street_furniture.list_trees(parameters.objects)
     if not len(trees):
         trees = street_furniture.place_trees(rows, ground, open_land, stream(parameters.seed, "trees"))
     poles = street_furniture.place_poles(net, parameters.poles)
@@ -289,7 +282,9 @@ def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters
         kerbs=find_kerbs(ground),
         buildings=buildings,
         trees=trees,
-        clutter=boundaries.join_clutter(imported.list_clutter(parameters.objects), clutter, enclosing, kerbside),
+        clutter=street_furniture.join_clutter(
+            street_furniture.list_clutter(parameters.objects), clutter, enclosing, kerbside
+        ),
         poles=Poles(
             id=np.array([row[0] for row in poles], dtype=np.int64),
             position=mounts,

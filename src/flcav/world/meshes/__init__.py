@@ -7,16 +7,16 @@ from flcav.world.map.parameters import PROPS
 from flcav.world.meshes.furniture import make_clutter
 from flcav.world.meshes.mesh import Mesh, bow_ends, fit_to_size
 from flcav.world.meshes.people import bicycle, motorcycle, pedestrian
-from flcav.world.meshes.vehicles import bus, car, truck
+from flcav.world.meshes.vehicles import make_bus, make_car, make_truck
 from flcav.world.shapes import SHAPES, Shape
 
 __all__ = ["Mesh", "actor_mesh"]
 
 MAKERS: dict[str, Callable[[Shape], Mesh]] = {
-    "car": car,
-    "van": car,
-    "truck": truck,
-    "bus": bus,
+    "car": make_car,
+    "van": make_car,
+    "truck": make_truck,
+    "bus": make_bus,
     "motorcycle": motorcycle,
     "bicycle": bicycle,
     "pedestrian": pedestrian,

@@ -3,12 +3,11 @@
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.world.materials import Material
 from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, ellipsoid, join_meshes, sheet, transform_mesh
 
-Array = NDArray[np.float64]
 Outline = tuple[tuple[float, float], ...]
 
 MIRROR_M = 0.05  # width of a mirror beside the body
@@ -170,8 +169,7 @@ def _cabin_side(profile: Profile, lower: _Lower, length: float, height: float) -
 
     share = np.array((0.0, 0.10, 0.86, 1.0))
     side = np.stack(
-        [np.stack((x, waist + (shoulder - waist) * part, belt + (top - belt) * part), axis=1) for part in share],
-        axis=1,
+        [np.stack((x, waist + (shoulder - waist) * part, belt + (top - belt) * part), axis=1) for part in share], axis=1
     )
     side_material = np.full((len(x) - 1, 3), Material.PAINT, np.uint8)
     side_material[glazed, 1] = Material.GLASS

@@ -1,16 +1,22 @@
-"""Triangle meshes, their primitives and operations. Body frame: x forward, y left, z up, metres."""
+"""Triangle meshes, their primitives, and draping over a relief. Body frame: x forward, y left, z up, metres.
+
+Draping over a relief: polygons and lines are cut along the relief's triangles, and then lifted.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+import shapely
 from numpy.typing import ArrayLike, NDArray
+from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array, Array32, Bytes, Ints32, Mask
 from flcav.geometry import rotations_about_z
+from flcav.world.map.relief import Relief
 from flcav.world.materials import Material
 
-Array = NDArray[np.float64]
 BOWED_M = 0.6  # of a vehicle's front and rear that curve in plan
 _BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32)
@@ -21,18 +27,18 @@ _BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
 class Mesh:
     """A triangle mesh with one material per face."""
 
-    vertices: NDArray[np.float32]  # (V, 3) [m]
-    faces: NDArray[np.int32]  # (F, 3) rows of `vertices`
-    material: NDArray[np.uint8]  # (F,) a Material
+    vertices: Array32  # (V, 3) [m]
+    faces: Ints32  # (F, 3) rows of `vertices`
+    material: Bytes  # (F,) a Material
 
-    def normals(self) -> NDArray[np.float32]:
+    def normals(self) -> Array32:
         """Return the unit normals of the faces (F, 3), of either sign; zero where a face has no area."""
         a, b, c = (self.vertices[self.faces[:, i]].astype(np.float64) for i in range(3))
         normal = np.cross(b - a, c - a)
         length = np.linalg.norm(normal, axis=1, keepdims=True)
         return (normal / np.maximum(length, 1e-12)).astype(np.float32)
 
-    def corner_normals(self, crease_deg: float = 40.0) -> NDArray[np.float32]:
+    def corner_normals(self, crease_deg: float = 40.0) -> Array32:
         """Return the area-weighted unit normals at each face's corners (F, 3, 3), for smooth shading.
 
         The normal at a corner averages the faces that share it and differ from this face by less than `crease_deg`.
@@ -91,7 +97,7 @@ def fit_to_size(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
 
 
 def bow_ends(mesh: Mesh, bow_m: float) -> Mesh:
-    """Return a vehicle's mesh whose front and rear curve in plan: their corners lie `bow_m` behind their middles.
+    """Return a vehicle's mesh whose front and rear curve in plan: their corners lie `bow_m` [m] behind their middles.
 
     The last `BOWED_M` of either end are drawn in by the cube of the distance from the middle, as bumpers are.
     """
@@ -103,7 +109,7 @@ def bow_ends(mesh: Mesh, bow_m: float) -> Mesh:
     return Mesh(vertices, mesh.faces, mesh.material)
 
 
-def sheet(points: ArrayLike, material: Material | NDArray[np.uint8]) -> Mesh:
+def sheet(points: ArrayLike, material: Material | Bytes) -> Mesh:
     """Return the surface through a grid of points (A, B, 3) [m], two triangles per cell.
 
     `material` is one for all, or one per cell (A - 1, B - 1).
@@ -157,3 +163,78 @@ def ellipsoid(center: ArrayLike, radii: ArrayLike, material: Material, sides: in
         (np.sin(polar) * np.cos(around), np.sin(polar) * np.sin(around), np.cos(polar) + 0 * around), axis=-1
     )
     return sheet(unit * np.asarray(radii) + np.asarray(center), material)
+
+
+FLAT_M = 0.01  # by which a wall may differ from the relief between its corners
+GRID_M = 1e-3  # of coordinates, where exact ones defeat GEOS
+FEW = 64  # triangles, or corners of an area, that are intersected at once
+BESIDE_M = 1.0  # around triangles, of the part of an area with which they are intersected
+
+
+def drape_polygon(polygon: Array, relief: Relief, above_m: float, material: Material) -> Mesh:
+    """Return the part of a relief inside a polygon (K, 2) [m], raised by `above_m`: exact, plane in each triangle."""
+    return drape_area(shapely.make_valid(shapely.Polygon(polygon)), relief, above_m, material)
+
+
+def drape_area(area: BaseGeometry, relief: Relief, above_m: float, material: Material) -> Mesh:
+    """Return the part of a relief inside a valid area, which may have holes: see `drape_polygon`."""
+    shapely.prepare(area)
+    near = relief.tree.geometries[relief.tree.query(area, predicate="intersects")]
+    parts = shapely.get_parts(_cut(near, area))
+    parts = parts[(shapely.get_type_id(parts) == shapely.GeometryType.POLYGON) & (shapely.area(parts) > 0)]
+    triangles = shapely.get_parts(shapely.constrained_delaunay_triangles(parts))
+    corners = shapely.get_coordinates(triangles).reshape(-1, 4, 2)[:, :3].reshape(-1, 2)
+    vertices = np.c_[corners, relief.heights(*corners.T) + above_m].astype(np.float32)
+    faces = np.arange(len(vertices), dtype=np.int32).reshape(-1, 3)
+    return Mesh(vertices, faces, np.full(len(faces), material, np.uint8))
+
+
+def _cut(triangles: NDArray[np.object_], area: BaseGeometry) -> NDArray[np.object_]:
+    """Return what of each of `triangles` (F,) is inside an area.
+
+    An intersection takes time with all corners of the area: for many triangles, it is first halved, and halved again.
+    """
+    if len(triangles) <= FEW or shapely.get_num_coordinates(area) <= FEW:
+        try:
+            return shapely.intersection(triangles, area)
+        except shapely.GEOSException:
+            return shapely.intersection(triangles, area, grid_size=GRID_M)
+    bounds = shapely.bounds(triangles)
+    middle = bounds[:, :2] + bounds[:, 2:]
+    rank = np.argsort(middle[:, np.ptp(middle, axis=0).argmax()], kind="stable")
+    out = np.empty(len(triangles), object)
+    for half in np.array_split(rank, 2):
+        low, high = bounds[half, :2].min(axis=0) - BESIDE_M, bounds[half, 2:].max(axis=0) + BESIDE_M
+        out[half] = _cut(triangles[half], shapely.intersection(area, shapely.box(*low, *high)))
+    return out
+
+
+def drape_wall(ring: Array, relief: Relief, between_m: tuple[float, float], material: Material) -> Mesh:
+    """Return an upright wall along a closed ring (K + 1, 2) [m], between two heights above the relief.
+
+    It is exact at the ring's corners, and to `FLAT_M` at the edges of triangles between them.
+    """
+    line = shapely.LineString(ring)
+    near = relief.tree.geometries[relief.tree.query(line, predicate="intersects")]
+    cuts = shapely.get_coordinates(shapely.intersection(shapely.boundary(near), line))
+    corners = np.concatenate(([0.0], np.cumsum(np.hypot(*np.diff(ring, axis=0).T))))
+    along = np.unique(np.concatenate((corners, shapely.line_locate_point(line, shapely.points(cuts)))))
+    points = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
+    ground = relief.heights(*points.T)
+    kept = np.flatnonzero(_find_bends(along, ground, np.isin(along, corners)))
+    points, ground = points[kept], ground[kept]
+    return sheet(np.stack([np.c_[points, ground + above] for above in between_m]), material)
+
+
+def _find_bends(along: Array, height: Array, corner: Mask) -> Mask:
+    """Return (N,) the corners and those between which `height` is linear to `FLAT_M` (Douglas-Peucker)."""
+    kept, waiting = corner.copy(), list(pairwise(np.flatnonzero(corner).tolist()))
+    while waiting:
+        first, last = waiting.pop()
+        chord = np.interp(along[first : last + 1], along[[first, last]], height[[first, last]])
+        error = np.abs(height[first : last + 1] - chord)
+        worst = first + int(error.argmax())
+        if error.max() > FLAT_M:
+            kept[worst] = True
+            waiting += [(first, worst), (worst, last)]
+    return kept

@@ -136,7 +136,7 @@ _BUS = Profile(
 )
 
 
-def car(shape: Shape) -> Mesh:
+def make_car(shape: Shape) -> Mesh:
     """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
     if shape.name in _MAKERS:
         return _MAKERS[shape.name](shape)
@@ -146,7 +146,7 @@ def car(shape: Shape) -> Mesh:
     return vehicle_body(PROFILES[shape.name], shape.length, shape.width, shape.height)
 
 
-def truck(shape: Shape) -> Mesh:
+def make_truck(shape: Shape) -> Mesh:
     """Return the truck `shape`, in its body frame: a cab, and a closed box or an open tipper behind it."""
     length, width, height = shape[1:]
     cab_height = min(2.75, height - 0.15)
@@ -168,7 +168,7 @@ def truck(shape: Shape) -> Mesh:
     return join_meshes(parts)
 
 
-def bus(shape: Shape) -> Mesh:
+def make_bus(shape: Shape) -> Mesh:
     """Return the bus `shape`, in its body frame, with rows of seats behind its windows."""
     length, width, height = shape[1:]
     parts = [vehicle_body(_BUS, length, width, height)]
@@ -225,7 +225,7 @@ _MAKERS: dict[str, Callable[[Shape], Mesh]] = {
     "trailer_car": _trailer_car,
     "overturned": _overturned,
     "ladder_van": _ladder_van,
-    "box_van": lambda shape: truck(shape),
+    "box_van": lambda shape: make_truck(shape),
 }
 
 

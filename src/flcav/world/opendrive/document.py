@@ -80,7 +80,7 @@ def read_map(path: Path) -> ElementTree.Element:
 
 
 def drop_namespaces(root: ElementTree.Element) -> None:
-    """Leave the names of elements without their namespace: version 1.8 has one, earlier ones do not."""
+    """Remove the namespace from the names of elements, in place: version 1.8 has one, earlier versions have none."""
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
 

@@ -98,7 +98,7 @@ def _keep_signals(root: ElementTree.Element, kept: set[str]) -> None:
 
 
 def _part_types(root: ElementTree.Element) -> None:
-    """Let driving lanes lead through junctions to driving lanes alone, since cars cannot take others.
+    """Remove links through junctions from driving lanes to lanes of other types, which cars cannot use.
 
     A lane across a junction that begins at a lane for bicycles is one for bicycles; netconvert calls it a driving lane.
     """

@@ -1,5 +1,8 @@
-"""Parameters of an imported town: defaults by street type, traffic by lane length, and candidate sites of sensors."""
+"""Parameters of an imported town: what its map has along the roads, defaults by street type, traffic, sensor sites."""
 
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
@@ -9,12 +12,72 @@ from shapely.geometry import LineString
 from flcav.world.map.parameters import (
     GeoReference,
     MapSource,
+    ObjectParameters,
+    ParkingParameters,
     PoleParameters,
+    PostParameters,
+    SignalParameters,
+    SignParameters,
+    StopLineParameters,
     StreetParameters,
     TownParameters,
 )
 from flcav.world.map.roads import Edge, RoadNet
-from flcav.world.opendrive.objects.taken import MapObjects
+from flcav.world.opendrive.objects.signal_heads import count_controllers, find_heads
+from flcav.world.opendrive.objects.signs import find_map_poles, find_signs
+from flcav.world.opendrive.objects.standing import find_parking, find_standing_objects
+from flcav.world.opendrive.objects.stop_lines import add_crossing_lines, find_stop_lines, stop_at_lines
+
+
+@dataclass(frozen=True)
+class MapObjects:
+    """The objects and signals of a map in town coordinates, and notes on how many there are."""
+
+    signs: tuple[SignParameters, ...]
+    limits: bool  # whether there are speed-limit signs in the map, among `signs` or left out
+    posts: tuple[PostParameters, ...]
+    objects: tuple[ObjectParameters, ...]
+    signals: tuple[SignalParameters, ...]
+    stop_lines: tuple[StopLineParameters, ...]
+    parking: tuple[ParkingParameters, ...]
+    notes: tuple[str, ...]  # sentences
+
+
+def take_objects(
+    root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet, path: Path, *, crosswalks: bool
+) -> MapObjects:
+    """Return what a map has along the roads of `net`, and write where vehicles stop into its file, `path`.
+
+    Town = map + `offset_m` [m]; `crosswalks` are those of the map.
+    """
+    heads = find_heads(root, offset_m, net)
+    parking = find_parking(root, offset_m, net)
+    objects = find_standing_objects(root, offset_m, net)
+    signs, posts = find_signs(root, offset_m), find_map_poles(root, offset_m)
+    found = find_stop_lines(root, offset_m, net)
+    lines = add_crossing_lines(net, found.found) if crosswalks else found.found
+    stop_at_lines(path, lines)
+    several, alike = count_controllers(heads.found, path)
+    switched = f"Controllers with several of these heads: {several}; switched alike here: {alike}."
+    return MapObjects(
+        signs=signs.found,
+        limits=signs.limits,
+        posts=posts.found,
+        objects=objects.found,
+        signals=heads.found,
+        stop_lines=lines,
+        parking=parking.found,
+        notes=(
+            *signs.notes("Signs"),
+            *posts.notes("Poles"),
+            *heads.notes("Signal heads"),
+            *found.notes("Stop lines"),
+            *parking.notes("Parking spaces"),
+            *objects.notes("Buildings, plants, barriers and obstacles"),
+            *([switched] if several else []),
+        ),
+    )
+
 
 VEHICLES_PER_KM = 9.0  # of driving lane
 PEDESTRIANS_PER_KM = 10.0  # of sidewalk
@@ -54,13 +117,7 @@ MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05,
 
 
 def furnish(
-    net: RoadNet,
-    *,
-    description: str,
-    seed: int,
-    geo: GeoReference,
-    source: MapSource,
-    found: MapObjects,
+    net: RoadNet, *, description: str, seed: int, geo: GeoReference, source: MapSource, found: MapObjects
 ) -> TownParameters:
     """Return the parameters of a town on `net` with the objects `found` in its map.
 

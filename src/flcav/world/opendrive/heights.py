@@ -1,24 +1,112 @@
 """Sampling of the surface of an OpenDRIVE map as points of a terrain (`flcav.world.map.relief`)."""
 
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import KDTree
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, shorten
 from flcav.world.map.relief import Relief
-from flcav.world.opendrive.bridges import CLEAR_M, Borders, Spans, find_bridges
 from flcav.world.opendrive.document import OPEN_ROADS, describe_map
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.opendrive.standard import FARTHEST_M
 from flcav.world.opendrive.streets import SIDEWALK_M, WALKED
 
-Array = NDArray[np.float64]
+BRIDGE_M = 2.5  # a road at least this far above another one passes over it
+CLEAR_M = 4.0  # from the end of a deck to the road below, seen from above
+JOINT_M = 0.5  # pieces of roads no farther apart than this go on as one bridge
+NEAR_M = 12.0  # the ground is sampled closely so far around a deck
+BATCH = 20_000  # pieces of roads that are compared with all others at a time
+
+
+class Borders(NamedTuple):
+    """Both ends of the K cross-sections of a road."""
+
+    right: Array  # (K, 3) [m]
+    left: Array  # (K, 3) [m]
+
+
+class Spans(NamedTuple):
+    """The bridges of one road with K cross-sections."""
+
+    decks: tuple[slice, ...]  # the cross-sections of each deck, those at both ends included
+    near: Mask  # (K,) cross-sections that the ground keeps, since they are within `NEAR_M` of a deck of any road
+
+
+def find_bridges(roads: Sequence[Borders]) -> list[Spans]:
+    """Return the bridges of each road: where it lies `BRIDGE_M` or more above another road, or above itself.
+
+    A deck begins and ends `CLEAR_M` before the road below, and goes on over joints of roads.
+    """
+    counts = [max(len(road.right) - 1, 0) for road in roads]
+    pieces = _join_corners(roads)
+    over, near = np.zeros((2, len(pieces)), np.bool_)
+    if len(pieces) and np.ptp(pieces[..., 2]) >= BRIDGE_M:
+        corners = shapely.multipoints(pieces[..., :2].reshape(-1, 2), indices=np.repeat(np.arange(len(pieces)), 4))
+        areas = np.asarray(shapely.convex_hull(corners))
+        tree = shapely.STRtree(areas)
+        above, crossing = np.zeros((2, len(pieces)), np.bool_)
+        low, high = pieces[..., 2].min(axis=1), pieces[..., 2].max(axis=1)
+        for upper, lower in _batches(tree, areas, np.arange(len(areas)), CLEAR_M):
+            passing = low[upper] - high[lower] >= BRIDGE_M
+            upper, lower = upper[passing], lower[passing]
+            above[upper] = True
+            crossing[upper[shapely.intersects(areas[upper], areas[lower])]] = True
+        raised = np.flatnonzero(above)
+        over[raised] = _find_joined(areas[raised], low[raised], high[raised], crossing[raised])
+        for _, close in _batches(tree, areas, np.flatnonzero(over), NEAR_M):
+            near[close] = True
+    splits = np.cumsum(counts)[:-1]
+    return [_span(*parts) for parts in zip(np.split(over, splits), np.split(near, splits))]
+
+
+def _join_corners(roads: Sequence[Borders]) -> Array:
+    """Return the corners (N, 4, 3) of the pieces of all roads, each between two neighbouring cross-sections."""
+    pieces = [np.stack((road.right[:-1], road.right[1:], road.left[1:], road.left[:-1]), axis=1) for road in roads]
+    return np.concatenate(pieces) if pieces else np.zeros((0, 4, 3))
+
+
+def _batches(tree: shapely.STRtree, areas: NDArray, rows: Ints, within_m: float) -> Iterator[tuple[Ints, Ints]]:
+    """Yield pairs of rows of `areas`: some of `rows`, and those of the tree within `within_m` of them."""
+    for first in range(0, len(rows), BATCH):
+        some = rows[first : first + BATCH]
+        one, other = tree.query(areas[some], predicate="dwithin", distance=within_m)
+        yield some[one], other
+
+
+def _find_joined(areas: NDArray, low: Array, high: Array, crossing: Mask) -> Mask:
+    """Return which of N pieces of roads are `crossing`, or connected with such a piece, directly or through others.
+
+    `low` and `high` (N,) are their heights [m].
+    """
+    if not crossing.any():
+        return crossing
+    links = [np.zeros((2, 0), np.int64)]
+    for one, other in _batches(shapely.STRtree(areas), areas, np.arange(len(areas)), JOINT_M):
+        alike = np.maximum(low[one] - high[other], low[other] - high[one]) < BRIDGE_M
+        links.append(np.stack((one[alike], other[alike])))
+    rows = np.concatenate(links, axis=1)
+    graph = coo_array((np.ones(rows.shape[1]), tuple(rows)), shape=(len(areas), len(areas)))
+    group = connected_components(graph, directed=False)[1]
+    return np.isin(group, group[crossing])
+
+
+def _span(over: Mask, near: Mask) -> Spans:
+    """Return the bridges of a road, given which of its K - 1 pieces are `over` another one and which are `near`."""
+    edges = np.flatnonzero(np.diff(np.concatenate(([False], over, [False]))))
+    decks = tuple(slice(int(first), int(last) + 1) for first, last in edges.reshape(-1, 2))
+    return Spans(decks, np.concatenate((near, [False])) | np.concatenate(([False], near)))
+
 
 HIGHEST_M = 10_000.0
 STEP_M = 1.0  # between two cross-sections, of which those are kept that are needed
@@ -115,8 +203,8 @@ def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tup
     return [tuple(sections[deck]) for deck in spans.decks if (width[deck] > NARROW_M).any()]
 
 
-def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> NDArray[np.bool_]:
-    """Return which of a road's K cross-sections a terrain leaves by more than `STRAY_M`.
+def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> Mask:
+    """Return at which of a road's K cross-sections the terrain differs from the road by more than `STRAY_M`.
 
     Those on decks, and those that the ground keeps already, are left out.
     """
@@ -126,7 +214,7 @@ def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> NDArray[n
     return (np.concatenate(errors) > STRAY_M) & ~_find_raised(spans) & ~spans.near
 
 
-def _find_raised(spans: Spans) -> NDArray[np.bool_]:
+def _find_raised(spans: Spans) -> Mask:
     """Return which of a road's K cross-sections are on decks alone.
 
     Where a deck ends within the road, its last cross-section is the ground's, too.
@@ -145,7 +233,7 @@ def _sample_terrain(strips: list[list[Strip]], spans: list[Spans]) -> Array:
     room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
     aside = aside[distance > np.tile(room, len(aside) // len(room))]
     merged = _merge(np.concatenate((surface, aside)))
-    return np.concatenate((merged, surround(merged))).round(4)
+    return np.concatenate((merged, surround_terrain(merged))).round(4)
 
 
 def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
@@ -180,7 +268,7 @@ def _fill_across(points: Array) -> Array:
     return np.concatenate(out)
 
 
-def _find_needed(points: Array, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
+def _find_needed(points: Array, fixed: Mask) -> Ints:
     """Return the columns of points (T, K, 3) between which the others are linear, to `TOLERANCE_M` (Douglas-Peucker).
 
     Rows are in the order of t. Height errors count in full; errors in plan as far as the cross-section is tilted, and
@@ -210,14 +298,14 @@ def _find_needed(points: Array, fixed: NDArray[np.bool_]) -> NDArray[np.int64]:
 
 
 def _merge(points: Array) -> Array:
-    """Return points (M, 3) of which no two lie in one cell: the means of those that did."""
+    """Return one point for each cell that holds any of the points (N, 3): their mean, (M, 3)."""
     cells = np.unique(np.floor(points[:, :2] / CELL_M), axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(cells)
     return np.stack([np.bincount(cells, column) / count for column in points.T], axis=1)
 
 
-def surround(points: Array, far_m: float = FAR_M) -> Array:
-    """Return points (K, 3) on a frame `far_m` around, at the height of the nearest point."""
+def surround_terrain(points: Array, far_m: float = FAR_M) -> Array:
+    """Return points (K, 3) [m] on a frame `far_m` around `points` (N, 3), each at the height of the nearest of them."""
     low, high = points[:, :2].min(axis=0) - far_m, points[:, :2].max(axis=0) + far_m
     share = np.linspace(0.0, 1.0, 9)
     x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])

@@ -3,11 +3,8 @@
 The first pass splits the map into nodes, edges and connections; the second joins these, rewritten, to a net.
 """
 
-import copy
-import re
 import shutil
 import tempfile
-import xml.etree.ElementTree as ElementTree
 import zlib
 from collections import Counter
 from dataclasses import dataclass, replace
@@ -25,99 +22,18 @@ from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet
 from flcav.world.map.town import HEIGHTS, Town, check_town_name, load_town
 from flcav.world.opendrive.document import describe_map, read_map
-from flcav.world.opendrive.furnishing import furnish
+from flcav.world.opendrive.furnishing import furnish, take_objects
 from flcav.world.opendrive.georeference import locate_origin
 from flcav.world.opendrive.heights import sample_heights
-from flcav.world.opendrive.mending.maps import mend_map, name_safely
-from flcav.world.opendrive.mending.roads import mend_roads
-from flcav.world.opendrive.mirror import mirror_map, mirror_parts
-from flcav.world.opendrive.netconvert import run_netconvert
-from flcav.world.opendrive.objects.crossings import take_crosswalks
-from flcav.world.opendrive.objects.crosswalks import Crosswalk, find_crosswalks
-from flcav.world.opendrive.objects.taken import take_objects, tell
+from flcav.world.opendrive.mending import mend_map, mend_roads
+from flcav.world.opendrive.netconvert import join_parts, name_safely, split_map
+from flcav.world.opendrive.objects.crossings import find_crosswalks
+from flcav.world.opendrive.objects.places import note_taken
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # farthest that a street is from the middle of the town
 GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
 STRETCHED = 0.01  # difference between lengths of the map and on the ground that is worth a word
-PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
-OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
-JOINING = {
-    "offset.disable-normalization": "true",
-    "no-turnarounds.except-deadend": "true",
-    "walkingareas": "true",
-    "junctions.corner-detail": "8",
-    "junctions.internal-link-detail": "12",
-    "roundabouts.guess": "true",
-    "tls.default-type": "static",
-    "tls.cycle.time": "60",
-}
-FIRST = {
-    "geometry.remove": "true",  # merge the edges at a node of one street,
-    "geometry.remove.min-length": "40",  # and a short edge even where it differs a little
-    "geometry.remove.width-tolerance": "1",
-    "crossings.guess": "true",
-    "crossings.guess.speed-threshold": "20",
-}
-
-
-def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_hand: bool) -> None:
-    """Split the map below `root`: write its `PARTS` as `prefix.nod.xml` and so on, and its net as `prefix.net.xml`.
-
-    They are plane: heights are read on their own. netconvert knows no left-hand traffic in OpenDRIVE; such a map is
-    mirrored for it, and its parts are mirrored back. Raises `InputError` naming `origin` where netconvert is missing or
-    refuses the map.
-    """
-    plan = copy.deepcopy(root)
-    for road in plan.iterfind("road"):
-        for objects in road.findall("objects"):
-            road.remove(objects)
-    for header in plan.iterfind("header"):
-        for reference in header.findall("geoReference"):  # netconvert refuses one that PROJ does not know
-            header.remove(reference)
-    if left_hand:
-        mirror_map(plan)
-    xodr = prefix.with_suffix(".xodr")
-    ElementTree.ElementTree(plan).write(xodr, encoding="utf-8", xml_declaration=True)
-    options = {
-        "opendrive-files": xodr.name,
-        "opendrive.import-all-lanes": "true",
-        "opendrive.internal-shapes": "true",  # lanes inside junctions are the connecting roads
-        "opendrive.curve-resolution": "1",  # [m] between the points of a curve
-        "flatten": "true",
-        "offset.disable-normalization": "true",
-        "plain-output-prefix": prefix.name,
-        "output-file": f"{prefix.name}.net.xml",
-    }
-    run_netconvert(options, prefix.parent, origin)
-    if left_hand:
-        mirror_parts(prefix)
-
-
-def join_parts(
-    prefix: Path, net: Path, origin: Path, *, left_hand: bool, crosswalks: tuple[Crosswalk, ...] = ()
-) -> int:
-    """Join the `PARTS` beside `prefix` to the net file `net`; return how many of a map's crosswalks are its crossings.
-
-    Without `crosswalks` netconvert guesses where crossings are. Raises `InputError` naming `origin` where that fails.
-    """
-    side = {"lefthand": "true"} if left_hand else {}
-    plain, made = prefix.with_name("joined"), prefix.with_name("joined.net.xml")
-    side |= {"output-file": made.name}
-    also = {"plain-output-prefix": plain.name} if crosswalks else {}
-    run_netconvert(_name_parts(prefix) | JOINING | FIRST | side | also, prefix.parent, origin)
-    taken = 0
-    if crosswalks:
-        taken = take_crosswalks(plain, made, crosswalks)
-        run_netconvert(_name_parts(plain) | JOINING | side, prefix.parent, origin)
-    text = made.read_text(encoding="utf-8")
-    net.write_text(re.sub(r"<!--.*?-->\s*", "", text, flags=re.DOTALL), encoding="utf-8")  # no dates and paths
-    return taken
-
-
-def _name_parts(prefix: Path) -> dict[str, str]:
-    """Return netconvert's options for reading the `PARTS` beside `prefix`."""
-    return {OPTIONS[part]: f"{prefix.name}.{part}.xml" for part in PARTS}
 
 
 def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
@@ -193,7 +109,7 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
         roads_m = sum(float(road.attrib["length"]) for road in root.iterfind("road"))
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
         nowhere = Counter({"no street between two sidewalks there": len(crosswalks.found) - crossed})
-        notes += tell("Crosswalks", crossed, crosswalks.left + nowhere)
+        notes += note_taken("Crosswalks", crossed, crosswalks.left + nowhere)
         found = take_objects(root, streets.offset_m, net, folder / "town.net.xml", crosswalks=crossed > 0)
         notes += found.notes
         dx, dy = streets.offset_m

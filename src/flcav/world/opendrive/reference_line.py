@@ -1,13 +1,16 @@
-"""Reference lines of OpenDRIVE roads in the plane (OpenDRIVE 1.8, 9): line, arc, spiral, poly3 and paramPoly3."""
+"""Reference lines of OpenDRIVE roads in plan (OpenDRIVE 1.8, 9): their geometry elements, and the joints of these."""
 
+import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from flcav.arrays import Array
+from flcav.geometry import wrap_angle
+
 Curve = Callable[[Array], tuple[Array, Array, Array]]  # length along it -> u, v [m], direction [rad], in its own frame
 
 NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # of the integrals of spirals
@@ -17,7 +20,7 @@ LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # by which the length of a curve or road may
 
 
 @dataclass(frozen=True)
-class Piece:
+class GeometryPiece:
     """One <geometry>: a curve from a place in the map."""
 
     s: float  # where it begins along the road [m]
@@ -57,7 +60,7 @@ class ReferenceLine:
         return out
 
 
-def list_pieces(rows: Iterable[ElementTree.Element]) -> list[Piece]:
+def list_pieces(rows: Iterable[ElementTree.Element]) -> list[GeometryPiece]:
     """Return the curves of <geometry> elements that keep to `standard`."""
     return [_piece(row) for row in rows]
 
@@ -79,10 +82,10 @@ def is_by_length(shape: ElementTree.Element, length: float) -> bool:
     return said if by_length == by_share else by_length
 
 
-def _piece(row: ElementTree.Element) -> Piece:
+def _piece(row: ElementTree.Element) -> GeometryPiece:
     s, x, y, heading, length = (float(row.attrib[name]) for name in ("s", "x", "y", "hdg", "length"))
     shape = next(child for child in row if child.tag in CURVES)
-    return Piece(s, length, x, y, heading, CURVES[shape.tag](shape, length))
+    return GeometryPiece(s, length, x, y, heading, CURVES[shape.tag](shape, length))
 
 
 def _line(_shape: ElementTree.Element, _length: float) -> Curve:
@@ -128,7 +131,7 @@ def _param_poly3(shape: ElementTree.Element, length: float) -> Curve:
 
 
 def _cubic(u: tuple[float, ...], v: tuple[float, ...], length: float, *, by_length: bool) -> Curve:
-    """Return the curve of two cubic polynomials in p: p is s itself, or with `by_length` where s has been gone."""
+    """Return the curve of two cubic polynomials in p; p is s, or with `by_length` the parameter at arc length s."""
     along, across = np.polynomial.Polynomial(u), np.polynomial.Polynomial(v)
     slope_u, slope_v = along.deriv(), across.deriv()
 
@@ -150,3 +153,103 @@ CURVES: dict[str, Callable[[ElementTree.Element, float], Curve]] = {
     "poly3": _poly3,
     "paramPoly3": _param_poly3,
 }
+
+
+SHORTEST_M = 1e-3  # a shorter element is left out
+WIDEST_GAP_M = 1.0  # of a gap that is closed
+NOTED_M, NOTED_RAD = 0.02, math.radians(5.0)  # smallest gap and kink worth a word
+SHARPEST_RAD = math.radians(60.0)  # of a kink; the sharpest of 84 maps of others has 45°
+EASE = 10.0  # length over which a gap is closed, as a multiple of it
+STEP_M = 1.0  # length of the straight elements there, at most
+
+
+@dataclass(frozen=True)
+class Joint:
+    """The joint before a geometry element: how far it begins from where the one before it ends."""
+
+    s: float  # [m]
+    gap_m: float  # in plan or along s, whichever is larger
+    kink_rad: float  # between their headings, from 0 to pi
+
+
+def order_geometry(road: ElementTree.Element) -> list[ElementTree.Element]:
+    """Return the geometry elements of a <road> in the order of s, without those that have no length.
+
+    The longest is among them in any case.
+    """
+    lengths = [(float(row.attrib["length"]), row) for row in road.iterfind("planView/geometry")]
+    least = min(SHORTEST_M, max((length for length, _ in lengths), default=0.0))
+    return sorted((row for length, row in lengths if length >= least), key=lambda row: float(row.attrib["s"]))
+
+
+def measure_joints(rows: list[ElementTree.Element]) -> list[Joint]:
+    """Return the joint before each geometry element, the first of which begins at s = 0 and has no kink."""
+    pieces = list_pieces(rows)
+    out = [Joint(piece.s, abs(piece.s), 0.0) for piece in pieces[:1]]
+    for before, after in pairwise(pieces):
+        x, y, heading = before.at(np.array([before.length]))[0].tolist()
+        along = abs(before.s + before.length - after.s)
+        turn = abs(float(wrap_angle(after.at(np.zeros(1))[0, 2] - heading)))
+        begins = after.at(np.zeros(1))[0]
+        out.append(Joint(after.s, max(along, math.hypot(begins[0] - x, begins[1] - y)), turn))
+    return out
+
+
+def close_gaps(road: ElementTree.Element) -> list[Joint]:
+    """Rewrite the plan view of a <road> in place without gaps of `NOTED_M` or more; return the joints to report.
+
+    Each element begins where the file says, at its s. One that overlaps the next ends there, and the last metres before
+    a gap are shifted towards the next element, in proportion to s.
+    """
+    rows = order_geometry(road)
+    joints = [joint for joint in measure_joints(rows) if joint.gap_m >= NOTED_M or joint.kink_rad >= NOTED_RAD]
+    out = rows[:1]
+    out[0].set("s", "0")
+    for row in rows[1:]:
+        before = out[-1]
+        start, room = float(row.attrib["s"]), float(row.attrib["s"]) - float(before.attrib["s"])
+        if any(joint.s == start and joint.gap_m >= NOTED_M for joint in joints):
+            shorten_geometry(before, min(float(before.attrib["length"]), room))
+            out[-1:] = _ease(before, row, room)
+        out.append(row)
+    view = road.find("planView")
+    assert view is not None, "a road that keeps to the standard has a plan view"
+    view[:] = out
+    return joints
+
+
+def shorten_geometry(row: ElementTree.Element, length: float) -> None:
+    """Cut a geometry element at `length` [m], in place; up to there its shape stays."""
+    whole = float(row.attrib["length"])
+    spiral, cubic = row.find("spiral"), row.find("paramPoly3")
+    if spiral is not None:
+        first, last = (float(spiral.attrib[name]) for name in ("curvStart", "curvEnd"))
+        spiral.set("curvEnd", repr(first + (last - first) * length / whole))
+    if cubic is not None and not is_by_length(cubic, whole):
+        for i, name in enumerate("abcd"):
+            for axis in "UV":
+                cubic.set(name + axis, repr(float(cubic.attrib[name + axis]) / whole**i))
+        cubic.set("pRange", "arcLength")
+    row.set("length", repr(length))
+
+
+def _ease(before: ElementTree.Element, row: ElementTree.Element, room: float) -> list[ElementTree.Element]:
+    """Return elements that replace `before` over `room` [m] of s, and end where `row` begins."""
+    (one, other), start = list_pieces([before, row]), float(before.attrib["s"])
+    gap = other.at(np.zeros(1))[0, :2] - one.at(np.array([room]))[0, :2]
+    over = min(EASE * max(float(np.hypot(*gap)), room - one.length), room)
+    if over < NOTED_M:
+        return [before]
+    first = room - over
+    share = np.linspace(0.0, 1.0, math.ceil(over / STEP_M) + 1)
+    points = one.at(first + share * (min(one.length, room) - first))[:, :2] + share[:, None] * gap
+    out = [before] if first > SHORTEST_M else []
+    if out:
+        shorten_geometry(before, first)
+    for i, (dx, dy) in enumerate(np.diff(points, axis=0).tolist()):
+        place = {"s": start + first + share[i] * over, "x": points[i, 0], "y": points[i, 1], "hdg": math.atan2(dy, dx)}
+        values = place | {"length": over * share[1]}
+        out.append(ElementTree.Element("geometry", {name: repr(float(value)) for name, value in values.items()}))
+        straight = {name + axis: "0" for name in "abcd" for axis in "UV"} | {"bU": repr(math.hypot(dx, dy))}
+        ElementTree.SubElement(out[-1], "paramPoly3", straight | {"pRange": "normalized"})
+    return out

@@ -7,11 +7,9 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterable, Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.world.opendrive.reference_line import ReferenceLine
-
-Array = NDArray[np.float64]
 
 
 class Cubics:

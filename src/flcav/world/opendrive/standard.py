@@ -11,8 +11,15 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError, shorten
-from flcav.world.opendrive.plan_view import SHARPEST_RAD, WIDEST_GAP_M, measure_joints, order_geometry
-from flcav.world.opendrive.reference_line import LENGTH_M, LENGTH_SHARE, list_pieces
+from flcav.world.opendrive.reference_line import (
+    LENGTH_M,
+    LENGTH_SHARE,
+    SHARPEST_RAD,
+    WIDEST_GAP_M,
+    list_pieces,
+    measure_joints,
+    order_geometry,
+)
 
 LINES, ROADS = "9.2", "10.1"  # clauses
 ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11.4", "12.2"

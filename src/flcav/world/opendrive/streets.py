@@ -190,7 +190,7 @@ def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None
 
 
 def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> None:
-    """Connect every lane of a short edge to every edge that any of its lanes leads to.
+    """Connect each lane of a short edge to all edges that any lane of it leads to.
 
     Without room to change lanes, two vehicles that each need the other's lane would block each other for ever.
     `length` is that of each edge [m].

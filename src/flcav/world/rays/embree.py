@@ -2,46 +2,158 @@
 
 There is one Embree device per process. It builds the bounding volume hierarchies on one thread, so that they are the
 same from run to run.
+
+Loader of the Embree 4 C library in the embreex wheel, with typed entry points through ctypes.
+
+API: https://github.com/RenderKit/embree/blob/v4.4.0/README.md (chapter "Embree API").
 """
 
 import ctypes
+import importlib
+import importlib.util
+import platform
 import weakref
 from collections.abc import Sequence
+from ctypes import POINTER, c_char_p, c_float, c_int, c_size_t, c_uint, c_void_p
 from functools import lru_cache
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints, Ints32, Mask
 from flcav.geometry import pose
 from flcav.machine.threads import share_among_threads
-from flcav.world.rays import loader as c
-from flcav.world.rays.hits import Hits
-from flcav.world.rays.packets import LANES, occlude_packets, trace_groups, trace_packets
+from flcav.world.rays.packets import LANES, Hits, occlude_packets, trace_groups, trace_packets
 
-_ARGUMENTS = c.IntersectArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
-_BLOCK_ARGUMENTS = c.OccludedArguments(flags=c.QUERY_COHERENT, feature_mask=0xFFFFFFFF)
+GEOMETRY_TRIANGLE = 0
+GEOMETRY_INSTANCE = 121
+BUFFER_INDEX = 0
+BUFFER_VERTEX = 1
+FORMAT_UINT3 = 0x5003
+FORMAT_FLOAT3 = 0x9003
+FORMAT_FLOAT3X4_COLUMN_MAJOR = 0x9234
+BUILD_QUALITY_HIGH = 2
+SCENE_DYNAMIC = 1
+QUERY_COHERENT = 1 << 16
+
+SIGNATURES: dict[str, tuple[object, list[object]]] = {
+    "rtcNewDevice": (c_void_p, [c_char_p]),
+    "rtcGetDeviceError": (c_int, [c_void_p]),
+    "rtcNewScene": (c_void_p, [c_void_p]),
+    "rtcReleaseScene": (None, [c_void_p]),
+    "rtcCommitScene": (None, [c_void_p]),
+    "rtcSetSceneFlags": (None, [c_void_p, c_int]),
+    "rtcSetSceneBuildQuality": (None, [c_void_p, c_int]),
+    "rtcNewGeometry": (c_void_p, [c_void_p, c_int]),
+    "rtcReleaseGeometry": (None, [c_void_p]),
+    "rtcCommitGeometry": (None, [c_void_p]),
+    "rtcAttachGeometry": (c_uint, [c_void_p, c_void_p]),
+    "rtcEnableGeometry": (None, [c_void_p]),
+    "rtcDisableGeometry": (None, [c_void_p]),
+    "rtcSetSharedGeometryBuffer": (None, [c_void_p, c_int, c_uint, c_int, c_void_p, c_size_t, c_size_t, c_size_t]),
+    "rtcSetGeometryInstancedScene": (None, [c_void_p, c_void_p]),
+    "rtcSetGeometryTransform": (None, [c_void_p, c_uint, c_int, POINTER(c_float)]),
+    "rtcIntersect16": (None, [c_void_p, c_void_p, c_void_p, c_void_p]),
+    "rtcOccluded16": (None, [c_void_p, c_void_p, c_void_p, c_void_p]),
+}
 
 
-class Solid:
+class QueryArguments(ctypes.Structure):
+    """`RTCIntersectArguments`, and `RTCOccludedArguments`, which has the same layout."""
+
+    _fields_ = (
+        ("flags", c_uint),
+        ("feature_mask", c_uint),
+        ("context", c_void_p),
+        ("filter", c_void_p),
+        ("callback", c_void_p),
+        ("min_width_distance_factor", c_float),
+    )
+
+
+@lru_cache(maxsize=1)
+def embree_library() -> ctypes.CDLL:
+    """Return the Embree library, loaded once per process; raises `OSError` where it is not installed."""
+    spec = importlib.util.find_spec("embreex")
+    if spec is None or spec.origin is None:
+        raise OSError(
+            f"the ray caster needs Embree, and the package embreex is not installed "
+            f"(it has no wheel for every machine: this one is {platform.system()} {platform.machine()})"
+        )
+    package = Path(spec.origin).parent
+    folders = (package.parent / "embreex.libs", package / ".dylibs", package)
+    for thread_library in _matching(folders, "tbb"):  # TBB must be in memory before Embree is loaded
+        ctypes.CDLL(str(thread_library), mode=getattr(ctypes, "RTLD_GLOBAL", 0))
+    candidates = _matching(folders, "embree4")
+    if not candidates:
+        raise OSError(f"the package embreex at {package} carries no Embree 4 library; flcav needs embreex 4.4")
+    library = ctypes.CDLL(str(candidates[0]))
+    for name, (result, arguments) in SIGNATURES.items():
+        function = getattr(library, name)
+        function.restype, function.argtypes = result, arguments
+    return library
+
+
+def _matching(folders: tuple[Path, ...], stem: str) -> list[Path]:
+    """Return the library files of a name, with or without the prefix "lib", sorted."""
+    return sorted(path for folder in folders for prefix in ("lib", "") for path in folder.glob(f"{prefix}{stem}*.*"))
+
+
+_ARGUMENTS = QueryArguments(flags=QUERY_COHERENT, feature_mask=0xFFFFFFFF)
+
+
+class Hierarchy:
+    """A bounding volume hierarchy of Embree that rays are traced through: a scene in Embree's terms."""
+
+    handle: int
+
+    def trace(
+        self,
+        target_from_rays: Array,
+        directions: Array32,
+        *,
+        near_m: Array32 | None = None,
+        far_m: float = np.inf,
+        threads: int = 1,
+    ) -> Hits:
+        """Return the first hit of each ray beyond `near_m` (N,) [m], by default 0, and before `far_m` [m].
+
+        All rays start at the origin of one frame: `target_from_rays` (4, 4) is its pose in the hierarchy's frame,
+        `directions` (N, 3) are unit vectors in it. Each of `threads` threads traces whole packets. Raises `ValueError`
+        where `near_m` is not of the rays' number.
+        """
+        rays, near, hits = _buffers(directions, near_m)
+        origin = target_from_rays[:3, 3].astype(np.float32)
+        rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
+        frame = (_address("rtcIntersect16"), self.handle, ctypes.addressof(_ARGUMENTS), origin, rotation)
+
+        def part(first: int, last: int) -> None:
+            trace_packets(*frame, rays, near, np.float32(far_m), first, last, *hits)
+
+        share_among_threads(part, len(rays), threads, whole=LANES)
+        return hits
+
+
+class Solid(Hierarchy):
     """A triangle mesh with its bounding volume hierarchy, in the mesh's own frame."""
 
-    def __init__(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> None:
+    def __init__(self, vertices: Array32, faces: Ints32) -> None:
         """Build the hierarchy of vertices (V, 3) [m] and faces (F, 3).
 
         Raises `ValueError` for an empty mesh, `OSError` where Embree is missing or fails.
         """
         if not len(faces):
             raise ValueError("a solid needs at least one face")
-        api, device = c.embree_library(), _device()
+        api, device = embree_library(), _device()
         # Embree reads 16 bytes at the last 12-byte vertex: one more vertex keeps that inside the buffer.
         self._vertices = np.concatenate((vertices, vertices[-1:])).astype(np.float32)
         self._faces = np.ascontiguousarray(faces, np.uint32)
-        self.handle: int = api.rtcNewScene(device)
-        api.rtcSetSceneBuildQuality(self.handle, c.BUILD_QUALITY_HIGH)
-        geometry = api.rtcNewGeometry(device, c.GEOMETRY_TRIANGLE)
+        self.handle = api.rtcNewScene(device)
+        api.rtcSetSceneBuildQuality(self.handle, BUILD_QUALITY_HIGH)
+        geometry = api.rtcNewGeometry(device, GEOMETRY_TRIANGLE)
         for kind, form, array, count in (
-            (c.BUFFER_VERTEX, c.FORMAT_FLOAT3, self._vertices, len(vertices)),
-            (c.BUFFER_INDEX, c.FORMAT_UINT3, self._faces, len(faces)),
+            (BUFFER_VERTEX, FORMAT_FLOAT3, self._vertices, len(vertices)),
+            (BUFFER_INDEX, FORMAT_UINT3, self._faces, len(faces)),
         ):
             api.rtcSetSharedGeometryBuffer(geometry, kind, 0, form, array.ctypes.data, 0, 12, count)
         api.rtcCommitGeometry(geometry)
@@ -51,31 +163,19 @@ class Solid:
         _check("building a mesh")
         weakref.finalize(self, api.rtcReleaseScene, self.handle)
 
-    def trace(
-        self,
-        target_from_rays: NDArray[np.float64],
-        directions: NDArray[np.float32],
-        *,
-        near_m: NDArray[np.float32] | None = None,
-        far_m: float = np.inf,
-        threads: int = 1,
-    ) -> Hits:
-        """Return the first hit of each ray with the mesh alone: see `Assembly.trace`."""
-        return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
 
-
-class Assembly:
+class Assembly(Hierarchy):
     """Instances of solids, placed by rigid transforms: the upper level of the hierarchy."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
         """Make one instance of each of `solids`, none placed yet; instance i is of solid i."""
-        api, device = c.embree_library(), _device()
+        api, device = embree_library(), _device()
         self._solids = tuple(solids)  # kept alive as long as their instances
-        self.handle: int = api.rtcNewScene(device)
-        api.rtcSetSceneFlags(self.handle, c.SCENE_DYNAMIC)
+        self.handle = api.rtcNewScene(device)
+        api.rtcSetSceneFlags(self.handle, SCENE_DYNAMIC)
         self._instances: list[int] = []
         for solid in solids:
-            instance = api.rtcNewGeometry(device, c.GEOMETRY_INSTANCE)
+            instance = api.rtcNewGeometry(device, GEOMETRY_INSTANCE)
             api.rtcSetGeometryInstancedScene(instance, solid.handle)
             api.rtcCommitGeometry(instance)
             api.rtcAttachGeometry(self.handle, instance)
@@ -85,14 +185,14 @@ class Assembly:
         _check("placing meshes")
         weakref.finalize(self, api.rtcReleaseScene, self.handle)
 
-    def place(self, instance: int, target_from_body: NDArray[np.float64] | None) -> None:
-        """Place an instance by a (4, 4) rigid transform, or remove it (None); takes effect with `commit`."""
-        api, geometry = c.embree_library(), self._instances[instance]
+    def place(self, instance: int, target_from_body: Array | None) -> None:
+        """Place an instance by its pose (4, 4), with a translation in metres, or remove it (None), as of `commit`."""
+        api, geometry = embree_library(), self._instances[instance]
         if target_from_body is None:
             api.rtcDisableGeometry(geometry)
             return
         columns = (ctypes.c_float * 12)(*target_from_body[:3].T.ravel())
-        api.rtcSetGeometryTransform(geometry, 0, c.FORMAT_FLOAT3X4_COLUMN_MAJOR, columns)
+        api.rtcSetGeometryTransform(geometry, 0, FORMAT_FLOAT3X4_COLUMN_MAJOR, columns)
         api.rtcEnableGeometry(geometry)
         api.rtcCommitGeometry(geometry)
 
@@ -101,33 +201,10 @@ class Assembly:
 
         Not to be called while another thread traces.
         """
-        c.embree_library().rtcCommitScene(self.handle)
+        embree_library().rtcCommitScene(self.handle)
         _check("placing meshes")
 
-    def trace(
-        self,
-        target_from_rays: NDArray[np.float64],
-        directions: NDArray[np.float32],
-        *,
-        near_m: NDArray[np.float32] | None = None,
-        far_m: float = np.inf,
-        threads: int = 1,
-    ) -> Hits:
-        """Return the first hit of each ray beyond `near_m` (N,) [m], by default 0, and before `far_m` [m].
-
-        All rays start at the origin of one frame: `target_from_rays` (4, 4) is its pose in the assembly's frame,
-        `directions` (N, 3) are unit vectors in it. Raises `ValueError` where `near_m` is not of the rays' number.
-        """
-        return _trace(self.handle, target_from_rays, directions, near_m, far_m, threads)
-
-    def find_occluded(
-        self,
-        origins: NDArray[np.float32],
-        directions: NDArray[np.float32],
-        far_m: NDArray[np.float32],
-        *,
-        threads: int = 1,
-    ) -> NDArray[np.bool_]:
+    def find_occluded(self, origins: Array32, directions: Array32, far_m: Array32, *, threads: int = 1) -> Mask:
         """Return (N,) whether each ray is occluded before its end `far_m` (N,) [m]; never where that is not positive.
 
         `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the assembly's frame.
@@ -135,7 +212,7 @@ class Assembly:
         start, towards, far = (np.ascontiguousarray(each, np.float32) for each in (origins, directions, far_m))
         out = np.empty(len(far), np.bool_)
         cast = np.flatnonzero(far > 0)
-        arguments = ctypes.addressof(_BLOCK_ARGUMENTS)
+        arguments = ctypes.addressof(_ARGUMENTS)
 
         def part(first: int, last: int) -> None:
             at = slice(cast[first] if first else 0, cast[last] if last < len(cast) else len(far))
@@ -146,55 +223,37 @@ class Assembly:
         return out
 
 
-class Embree:
-    """The Embree engine."""
+def trace_each(
+    solids: Sequence[Solid],
+    solid_from_rays: Array,
+    ends: Ints,
+    directions: Array32,
+    *,
+    near_m: Array32 | None = None,
+    far_m: float = np.inf,
+) -> Hits:
+    """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group's number.
 
-    def __init__(self) -> None:
-        """Test the library, once per process; raises `OSError` where it is missing or traces a known scene wrongly."""
-        _self_test()
-
-    def solid(self, vertices: NDArray[np.float32], faces: NDArray[np.int32]) -> Solid:
-        """Return a mesh with its bounding volume hierarchy: see `Solid`."""
-        return Solid(vertices, faces)
-
-    def assembly(self, solids: Sequence[Solid]) -> Assembly:
-        """Return an assembly of `solids`, none placed yet: see `Assembly`."""
-        return Assembly(solids)
-
-    def trace_each(
-        self,
-        solids: Sequence[Solid],
-        solid_from_rays: NDArray[np.float64],
-        ends: NDArray[np.int64],
-        directions: NDArray[np.float32],
-        *,
-        near_m: NDArray[np.float32] | None = None,
-        far_m: float = np.inf,
-    ) -> Hits:
-        """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group's number.
-
-        Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose pose in its solid's frame is
-        `solid_from_rays[k]` (4, 4). `near_m` and `far_m` are as in `Assembly.trace`.
-        """
-        rays, near, hits = _buffers(directions, near_m)
-        trace_groups(
-            _address("rtcIntersect16"),
-            np.array([solid.handle for solid in solids], np.int64),
-            ctypes.addressof(_ARGUMENTS),
-            np.ascontiguousarray(solid_from_rays[:, :3, 3], np.float32),
-            np.ascontiguousarray(solid_from_rays[:, :3, :3], np.float32),
-            rays,
-            near,
-            np.float32(far_m),
-            ends,
-            *hits,
-        )
-        return hits
+    Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose pose in its solid's frame is
+    `solid_from_rays[k]` (4, 4). `near_m` and `far_m` are as in `Assembly.trace`.
+    """
+    rays, near, hits = _buffers(directions, near_m)
+    trace_groups(
+        _address("rtcIntersect16"),
+        np.array([solid.handle for solid in solids], np.int64),
+        ctypes.addressof(_ARGUMENTS),
+        np.ascontiguousarray(solid_from_rays[:, :3, 3], np.float32),
+        np.ascontiguousarray(solid_from_rays[:, :3, :3], np.float32),
+        rays,
+        near,
+        np.float32(far_m),
+        ends,
+        *hits,
+    )
+    return hits
 
 
-def _buffers(
-    directions: NDArray[np.float32], near_m: NDArray[np.float32] | None
-) -> tuple[NDArray[np.float32], NDArray[np.float32], Hits]:
+def _buffers(directions: Array32, near_m: Array32 | None) -> tuple[Array32, Array32, Hits]:
     """Return directions (N, 3) and near distances (N,) or (1,) as Embree takes them, and unset hits.
 
     Raises `ValueError` where `near_m` is not of the rays' number.
@@ -208,43 +267,10 @@ def _buffers(
     return rays, near, Hits(np.empty(count, np.float32), np.empty(count, np.int32), np.empty(count, np.int32))
 
 
-def _trace(
-    handle: int,
-    target_from_rays: NDArray[np.float64],
-    directions: NDArray[np.float32],
-    near_m: NDArray[np.float32] | None,
-    far_m: float,
-    threads: int,
-) -> Hits:
-    """Return the first hit of each ray with the Embree scene `handle`, in whole packets by each thread."""
-    rays, near, hits = _buffers(directions, near_m)
-    origin = target_from_rays[:3, 3].astype(np.float32)
-    rotation = np.ascontiguousarray(target_from_rays[:3, :3], np.float32)
-    arguments = ctypes.addressof(_ARGUMENTS)
-
-    def part(first: int, last: int) -> None:
-        trace_packets(
-            _address("rtcIntersect16"),
-            handle,
-            arguments,
-            origin,
-            rotation,
-            rays,
-            near,
-            np.float32(far_m),
-            first,
-            last,
-            *hits,
-        )
-
-    share_among_threads(part, len(rays), threads, whole=LANES)
-    return hits
-
-
 @lru_cache(maxsize=1)
 def _device() -> int:
     """Return the Embree device of this process; raises `OSError` where it cannot start."""
-    device = c.embree_library().rtcNewDevice(b"threads=1")
+    device = embree_library().rtcNewDevice(b"threads=1")
     if not device:
         raise OSError("Embree could not start on this machine")
     return device
@@ -253,19 +279,22 @@ def _device() -> int:
 @lru_cache(maxsize=2)
 def _address(function: str) -> int:
     """Return the address of a function of the Embree library."""
-    return ctypes.cast(getattr(c.embree_library(), function), ctypes.c_void_p).value or 0
+    return ctypes.cast(getattr(embree_library(), function), ctypes.c_void_p).value or 0
 
 
 def _check(doing: str) -> None:
     """Raise `OSError` where the device reports an error since the last check."""
-    code = c.embree_library().rtcGetDeviceError(_device())
+    code = embree_library().rtcGetDeviceError(_device())
     if code:
         raise OSError(f"Embree failed with error {code} while {doing}")
 
 
 @lru_cache(maxsize=1)
-def _self_test() -> None:
-    """Raise `OSError` unless known rays hit a known mesh, alone and as a rotated and translated instance."""
+def check_embree() -> None:
+    """Raise `OSError` where Embree is missing, or known rays miss a known mesh, alone or as a moved instance.
+
+    It is done once per process.
+    """
     vertices = np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
     forward = np.array([[1, 0, 0]], np.float32)

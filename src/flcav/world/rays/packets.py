@@ -1,14 +1,17 @@
-"""Compiled loops over ray packets of 16 for Embree's `rtcIntersect16` and `rtcOccluded16`.
+"""First hits of rays, and compiled loops over ray packets of 16 for Embree's `rtcIntersect16` and `rtcOccluded16`.
 
 Embree's function is called by its address, an integer argument, so that Numba can cache the compiled code on disk; a
 kernel that closes over a ctypes function cannot be cached.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
+from flcav.arrays import Array32, Ints32
 from flcav.machine.compiled import compiled
 
 # Rows of an RTCRayHit16, seen as a (32, 16) array of float32 or int32.
@@ -31,6 +34,25 @@ def call_c(typing_context, address, first, second, third, fourth):
 
 
 @compiled
+def _allocate_packet():
+    """Return a ray packet (ROWS, LANES) as float32 and as int32, and its mask of valid rays (LANES,).
+
+    Embree requires them to be aligned to 64 bytes. Time, mask, id and flags of the rays are set.
+    """
+    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
+    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4
+    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
+    words = packet.view(np.int32)
+    spare_words = np.empty(2 * LANES, np.int32)
+    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
+    packet[TIME, :] = 0
+    words[MASK, :] = -1
+    words[RAY_ID, :] = 0
+    words[FLAGS, :] = 0
+    return packet, words, spare_words[skipped : skipped + LANES]
+
+
+@compiled
 def trace_packets(
     intersect, scene, arguments, origin, rotation, directions, near, far, first_ray, last_ray, distance, instance, face
 ):
@@ -41,23 +63,13 @@ def trace_packets(
     frame in the scene, `directions` (N, 3) unit vectors in it. `near` is (N,), or (1,) for all; `far` is a scalar [m].
     Distance is inf, and instance and face are -1, where nothing is hit.
     """
-    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
-    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4  # Embree requires 64-byte alignment
-    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
-    packet_words = packet.view(np.int32)
-    spare_words = np.empty(2 * LANES, np.int32)
-    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
-    valid = spare_words[skipped : skipped + LANES]
+    packet, packet_words, valid = _allocate_packet()
     near_step = 1 if len(near) > 1 else 0
     r00, r01, r02 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r10, r11, r12 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r20, r21, r22 = rotation[2, 0], rotation[2, 1], rotation[2, 2]
     for axis in range(3):
         packet[ORIGIN + axis, :] = origin[axis]
-    packet[TIME, :] = 0
-    packet_words[MASK, :] = -1
-    packet_words[RAY_ID, :] = 0
-    packet_words[FLAGS, :] = 0
     for start in range(first_ray, last_ray, LANES):
         lanes = min(LANES, last_ray - start)
         for lane in range(LANES):
@@ -114,20 +126,10 @@ def occlude_packets(occluded, scene, arguments, origins, directions, far, blocke
     `occluded`, `scene` and `arguments` are addresses. `origins` (N, 3) and unit `directions` (N, 3), or (1, 3) for all,
     are in the scene's frame.
     """
-    spare_floats = np.empty(ROWS * LANES + LANES, np.float32)
-    skipped = ((64 - spare_floats.ctypes.data % 64) % 64) // 4
-    packet = spare_floats[skipped : skipped + ROWS * LANES].reshape(ROWS, LANES)
-    packet_words = packet.view(np.int32)
-    spare_words = np.empty(2 * LANES, np.int32)
-    skipped = ((64 - spare_words.ctypes.data % 64) % 64) // 4
-    valid = spare_words[skipped : skipped + LANES]
+    packet, _, valid = _allocate_packet()
     rays = np.empty(LANES, np.int64)
     direction_step = 1 if len(directions) > 1 else 0
     packet[NEAR, :] = 0
-    packet[TIME, :] = 0
-    packet_words[MASK, :] = -1
-    packet_words[RAY_ID, :] = 0
-    packet_words[FLAGS, :] = 0
     lanes = 0
     for ray in range(len(far)):
         blocked[ray] = False
@@ -145,3 +147,14 @@ def occlude_packets(occluded, scene, arguments, origins, directions, far, blocke
             for lane in range(lanes):
                 blocked[rays[lane]] = packet[FAR, lane] < 0
             lanes = 0
+
+
+MISS = -1  # instance and face of a ray that hits nothing
+
+
+class Hits(NamedTuple):
+    """The first hit of each of N rays."""
+
+    distance: Array32  # (N,) range along the unit direction [m]; inf where nothing is hit
+    instance: Ints32  # (N,) number of the instance; 0 for a solid alone; MISS where nothing is hit
+    face: Ints32  # (N,) row of that solid's faces; MISS where nothing is hit

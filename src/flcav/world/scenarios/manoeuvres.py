@@ -7,7 +7,7 @@ from typing import NamedTuple
 from flcav.world.map.roads import Lane
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage
-from flcav.world.shapes import SHAPES
+from flcav.world.shapes import SHAPES, Shape
 
 CLOSE_M = 7.0  # largest gap between the bumpers at a cut-in
 NARROW_M = 1.5  # and least gap
@@ -50,7 +50,7 @@ def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
         if spot.left < ROOM_M or stage.state(ego)[3] > TOO_FAST or stage.find_leader(ego, 25.0):
             continue
         kind = scenario.actors.get("car", DEFAULT_CAR)
-        x, y, _ = stage.point(spot.lane, _stands_at(spot, kind), _kerb(spot.lane, kind))
+        x, y, _ = stage.point(spot.lane, _stands_at(spot, kind), kerb_offset(spot.lane, kind))
         if spot.lane is spot.edge.lanes_of("driving")[0] and stage.is_untouched(x, y, CLEAR_M):
             return CutIn(ego, spot, None)
     return None
@@ -95,19 +95,19 @@ def _beside(stage: Stage, ego: Spot) -> str | None:
 
 def _stands_at(ego: Spot, kind: str) -> float:
     """Return the place of the front of a car at the kerb along the lane, `CLOSE_M` ahead of the ego [m]."""
-    return ego.along + CLOSE_M + length_of(kind)
+    return ego.along + CLOSE_M + shape_of(kind).length
 
 
-def _kerb(lane: Lane, kind: str) -> float:
+def kerb_offset(lane: Lane, kind: str) -> float:
     """Return the lateral offset from a lane's middle of a vehicle parked at its right side, left positive [m]."""
-    return -(lane.width / 2 + KERB_GAP_M + width_of(kind) / 2)
+    return -(lane.width / 2 + KERB_GAP_M + shape_of(kind).width / 2)
 
 
 def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
     """Let a car that has stood at the kerb pull out ahead of the vehicle under test and drive on with the traffic."""
     kind = scenario.actors.get("car", DEFAULT_CAR)
     name, lane, along = stage.cast(kind), roles.spot.lane, _stands_at(roles.spot, kind)
-    aside = _kerb(lane, kind)
+    aside = kerb_offset(lane, kind)
     stage.place_from_start(name, *stage.point(lane, along, aside))
     speed = 0.7 * stage.state(roles.ego)[3]
     stage.enter(name, kind, (lane, along), stage.list_remaining_edges(roles.ego), 1.0)
@@ -162,20 +162,10 @@ def run_the_light(stage: Stage, scenario: Scenario, runner: Runner) -> Generator
         vehicle.setSpeed(name, -1.0)
 
 
-def length_of(kind: str) -> float:
-    """Return the length of a vehicle type, "category.shape" [m]."""
-    return _shape(kind)[0]
-
-
-def width_of(kind: str) -> float:
-    """Return the width of a vehicle type, "category.shape" [m]."""
-    return _shape(kind)[1]
-
-
-def _shape(kind: str) -> tuple[float, float]:
-    """Return length and width of a vehicle type [m]."""
+def shape_of(kind: str) -> Shape:
+    """Return the shape of a vehicle type, "category.shape"."""
     category, _, name = kind.partition(".")
-    return next((shape.length, shape.width) for shape in SHAPES[category] if shape.name == name)
+    return next(shape for shape in SHAPES[category] if shape.name == name)
 
 
 def ease(share: float) -> tuple[float, float]:

@@ -5,7 +5,7 @@ from collections.abc import Generator
 from typing import NamedTuple
 
 from flcav.geometry import rotate
-from flcav.world.scenarios.manoeuvres import ease, length_of
+from flcav.world.scenarios.manoeuvres import ease, shape_of
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State, braking_m
 
@@ -108,7 +108,7 @@ def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[N
     """Let a new car follow the slow vehicle, pull out, pass and move back into the traffic; oncoming traffic brakes."""
     vehicle, slow, lane = stage.sumo.vehicle, roles.slow, roles.spot.lane
     kind = scenario.actors.get("car", KIND)
-    name, length = stage.cast(kind), length_of(kind)
+    name, length = stage.cast(kind), shape_of(kind).length
     way = stage.list_remaining_edges(slow)  # from this lane on; the slow vehicle may leave it first
     slow_length = vehicle.getLength(slow)
     for step, (x, y, angle, speed) in stage.trail(slow, BEHIND_M + slow_length):

@@ -5,7 +5,7 @@ from collections.abc import Generator
 from typing import NamedTuple
 
 from flcav.world.map.roads import Edge
-from flcav.world.scenarios.manoeuvres import KERB_GAP_M, length_of, width_of
+from flcav.world.scenarios.manoeuvres import kerb_offset, shape_of
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import CAREFUL_MPS2, STEP_S, Spot, Stage
 
@@ -38,15 +38,11 @@ def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
         along = spot.along + min(max(AHEAD_M[0], 3.2 * speed), AHEAD_M[1])
         if along + 12.0 > spot.along + spot.left or stage.find_leader(ego, along - spot.along + 6.0):
             continue
-        x, y, _ = stage.point(spot.lane, along - BEFORE_VAN_M - length_of(kinds[0]) / 2, _beside(spot, kinds[0]))
+        middle = along - BEFORE_VAN_M - shape_of(kinds[0]).length / 2
+        x, y, _ = stage.point(spot.lane, middle, kerb_offset(spot.lane, kinds[0]))
         if stage.is_untouched(x, y, CLEAR_M):
             return BehindVan(ego, spot, along, kinds)
     return None
-
-
-def _beside(spot: Spot, van: str) -> float:
-    """Return the lateral offset of the van from the lane's middle, left positive: it stands to the right [m]."""
-    return -(spot.lane.width / 2 + KERB_GAP_M + width_of(van) / 2)
 
 
 def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[None, None, None]:
@@ -56,7 +52,7 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
     """
     lane, vehicle = roles.spot.lane, stage.sumo.vehicle
     van, pedestrian = (stage.cast(kind) for kind in roles.kinds)
-    hidden = _beside(roles.spot, roles.kinds[0])
+    hidden = kerb_offset(lane, roles.kinds[0])
     stands = stage.point(lane, roles.along - BEFORE_VAN_M, hidden)
     stage.place_from_start(van, *stands)
     stage.place_from_start(pedestrian, *_walker(stage, roles, hidden))

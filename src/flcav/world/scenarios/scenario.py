@@ -24,21 +24,20 @@ ROLES: dict[str, tuple[str, ...]] = {  # role of an actor created for a scenario
 LONGEST_S = 36_000.0
 NEAR_M = 50.0  # from `Scenario.position` to the vehicle under test, at most
 
+Ego = Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")]
+Duration = Annotated[float, Field(ge=0.1, le=LONGEST_S)]
+
 
 class Scenario(Config):
     """One corner case of a recipe: it begins as soon after `at_s` as the traffic around `near` allows."""
 
     kind: Kind  # kind of corner case
     at_s: Annotated[float, Field(gt=0, le=LONGEST_S)]  # earliest start, since the start of the traffic run
-    near: Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")] | None = (
-        None  # vehicle that it happens to; default: the first possible
-    )
+    near: Ego | None = None  # vehicle that it happens to; default: the first possible
     position: tuple[float, float] | None = (
         None  # x, y of the world [m]; it starts only while the vehicle is within 50 m
     )
-    lasts_s: Annotated[float, Field(ge=0.1, le=LONGEST_S)] | None = (
-        None  # standstill of a `stalled_vehicle`; default: for ever
-    )
+    lasts_s: Duration | None = None  # standstill of a `stalled_vehicle`; default: for ever
     actors: dict[str, str] = Field(default={})  # shapes by role, e.g. van: van.high_van
 
     @model_validator(mode="after")

@@ -10,18 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array, Mask
 from flcav.geometry import heading_vectors
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet, read_net
 
-Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
-
-REACH_M = 15.0  # half a long vehicle, and the way of .3 s: so far beside a deck actors are told to be on it
+REACH_M = 15.0  # half a long vehicle, and the way of .3 s: nearer to a deck, actors are on it or below it
 ALONG = np.cos(np.pi / 4)  # lanes that lead over a deck keep to its direction
 TURNED_M = 6.0  # distance that counts as much as a right angle between an actor and a lane
 BATCH = 1000  # actors that are compared with all lanes at a time
@@ -37,7 +34,7 @@ class Segments(NamedTuple):
 
 
 def find_footing(relief: Relief, net: Path, centre: Array, yaw: Array) -> Callable[[Array, Array], Array]:
-    """Return the heights [m], at x, y (T, A) [m], of what each actor stands on: the ground or a deck.
+    """Return the function from x, y (T, A) [m] to the height [m] of the surface below each actor: ground or deck.
 
     The actors are at `centre` (T, A, 2) [m] with `yaw` (T, A) [rad], NaN where absent; `net` is the streets' file.
     """
@@ -60,7 +57,7 @@ def find_footing(relief: Relief, net: Path, centre: Array, yaw: Array) -> Callab
 
 
 def _find_on(deck: Deck, net: RoadNet, centre: Array, yaw: Array) -> Mask:
-    """Return (T, A) whether an actor near a deck is on it, or about to be: the same while it stays near the deck."""
+    """Return (T, A) whether each actor is on a deck or enters it; constant while an actor stays near the deck."""
     zone = deck.outline.buffer(REACH_M)
     shapely.prepare(zone)
     out = shapely.contains_xy(zone, centre[..., 0], centre[..., 1])
@@ -112,7 +109,10 @@ def _join(parts: list[Segments]) -> Segments:
 
 
 def _misfit(lanes: Segments, place: Array, ahead: Array) -> Array:
-    """Return (N,) [m] how far bodies at `place` (N, 2) that look `ahead` (N, 2) are from the lane that fits best."""
+    """Return (N,) [m] the distance, in place and direction, of bodies from the lane that fits best.
+
+    Bodies are at `place` (N, 2) [m] with the headings `ahead` (N, 2), unit vectors.
+    """
     if not len(lanes.start):
         return np.full(len(place), np.inf)
     length = np.maximum(np.linalg.norm(lanes.along, axis=1), 1e-9)

@@ -11,36 +11,36 @@ from pathlib import Path
 from typing import Any
 
 from flcav.world.traffic.demand import Demand
-from flcav.world.traffic.simulation import NET, ROUTES, Job, Request, States
+from flcav.world.traffic.simulation import NET, ROUTES, States, StepRequest, TrafficJob
 
-SERVE = "flcav.world.traffic.process:serve"  # what that process runs
+SERVE = "flcav.world.traffic.process:serve_traffic"  # what that process runs
 ROOT = str(Path(__file__).parents[3])  # where flcav is, installed or not
 
 _idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a run, with the id of their parent
 
 
-def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> Job:
+def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> TrafficJob:
     """Return the job of a run, whose files are in `folder` until it has begun."""
     (folder / NET).symlink_to(net.absolute())
     (folder / ROUTES).write_text(demand.routes, encoding="utf-8")
-    return Job(str(folder.absolute()), seed, demand.followers)
+    return TrafficJob(str(folder.absolute()), seed, demand.followers)
 
 
 class Sumo:
-    """A SUMO run in a process beside this one, which it has until it is closed."""
+    """A SUMO run in a child process, which it keeps until it is closed."""
 
-    def __init__(self, job: Job, failure: str = "SUMO failed") -> None:
+    def __init__(self, job: TrafficJob, failure: str = "SUMO failed") -> None:
         """Start a run; where SUMO fails, now or later, that is a `RuntimeError` that begins with `failure`."""
         self._failure = failure
         self._process: subprocess.Popen[str] | None = _take_process()
         self.begun: States = self._ask(job._asdict())
 
-    def step(self, request: Request) -> States:
-        """Make a step, and return the states after it."""
+    def step(self, request: StepRequest) -> States:
+        """Advance by a step that obeys the request, and return the states after it."""
         return self._ask({"step": request._asdict()})
 
     def record(self, steps: Sequence[int], out: Path) -> None:
-        """Record a run that has made no step yet, see `recording.record`."""
+        """Record a run that has made no step yet, see `process.record_traffic`."""
         self._ask({"record": {"steps": steps, "out": str(out.absolute())}})
 
     def close(self) -> None:
@@ -101,6 +101,6 @@ def _stop() -> None:
 
 
 def _end(process: subprocess.Popen[str]) -> None:
-    """Kill a process, without waiting for its run, which ends when it would answer."""
+    """Kill a process; its run ends by itself at its next answer."""
     with contextlib.suppress(BrokenPipeError), process:
         process.kill()

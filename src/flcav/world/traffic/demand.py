@@ -10,20 +10,16 @@ from xml.etree.ElementTree import Element, SubElement, tostring
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.arrays import Array, Mask
 from flcav.geometry import wrap_angle
 from flcav.statistics.streams import stream
-from flcav.world.map.imported import outline_space
 from flcav.world.map.parameters import TownParameters
 from flcav.world.map.roads import Edge, RoadNet
-from flcav.world.map.street_furniture import Verge
+from flcav.world.map.street_furniture import Verge, outline_space
 from flcav.world.shapes import ANGLED, RARE, SHAPES
-from flcav.world.traffic.passages import find_passages
-from flcav.world.traffic.reach import find_driven, find_walked
-
-Array = NDArray[np.float64]
+from flcav.world.traffic.passages import find_driven, find_passages, find_walked
 
 FROM_JUNCTION_M = 6.0  # kept free at both ends of a parking lane
 KERB_GAP_M = (0.1, 0.3)  # limits of the gap between wheels and kerb
@@ -234,7 +230,7 @@ def find_middles(edges: Sequence[Edge]) -> Array:
 def draw_tour(
     edges: Sequence[Edge],
     middle: Array,
-    reach: NDArray[np.bool_],
+    reach: Mask,
     weight: Array,
     length_m: float,
     random: np.random.Generator,

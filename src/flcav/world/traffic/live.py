@@ -1,40 +1,43 @@
-"""The traffic of a live world: SUMO's, between the steps of SUMO."""
+"""The traffic of a live world: SUMO's actors between the steps of SUMO, and the traffic lights.
+
+Traffic lights: the programs of a SUMO net, phases of fixed durations that repeat, and what overrides them.
+
+Format: https://sumo.dlr.de/docs/Simulation/Traffic_Lights.html
+"""
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.config import InputError, read_xml, shorten
 from flcav.geometry import heading_vectors, left_vectors, wrap_angle
 from flcav.statistics.streams import derive_seed, stream
-from flcav.world.actors import NOBODY, Actors
-from flcav.world.dynamics.blueprints import VEHICLES
-from flcav.world.dynamics.standing import Ground
+from flcav.world.dynamics.obstacles import TownGround
+from flcav.world.dynamics.vehicle import VEHICLES
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town
 from flcav.world.scenarios.stage import STEP_S
 from flcav.world.shapes import SHAPES
+from flcav.world.snapshot import NOBODY, Actors
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
-from flcav.world.traffic.simulation import Body, Job, Request
+from flcav.world.traffic.simulation import Body, StepRequest, TrafficJob
 from flcav.world.traffic.traffic import number_of
-
-Array = NDArray[np.float64]
 
 FILL_S = 20.0  # all actors have departed by then
 WARM_UP_S = 30.0  # time of SUMO at the start of a live world
 TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
 SLOW_MPS = 1.0  # traffic brakes for a slower vehicle wherever it stands, and for a faster one in its lane
 DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its middle
-SOON_S = 0.7  # so far ahead traffic looks at who crosses its way
+SOON_S = 0.7  # for so long ahead traffic considers crossing vehicles
 BERTH_M = 1.0  # half the width of a vehicle that passes
 
 
-def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> Job:
+def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> TrafficJob:
     """Return the job of a live world's run, whose files are in `folder`.
 
     Raises `InputError` as `write_demand`.
@@ -53,16 +56,16 @@ def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedest
 
 
 class SumoTraffic:
-    """SUMO's traffic in a town, with a SUMO process of its own until it is closed."""
+    """SUMO's traffic in a town, in a SUMO process that it keeps until it is closed."""
 
-    def __init__(self, town: Town, ground: Ground, *, seed: int, vehicles: int, pedestrians: int) -> None:
+    def __init__(self, town: Town, ground: TownGround, *, seed: int, vehicles: int, pedestrians: int) -> None:
         """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
         self.ticks = 0  # steps of SUMO since the start
         self._actors = NOBODY  # those present before and after the step of SUMO under way, at their last places
         self._ground, self._town = ground, town
         self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
         self._lights: dict[str, str] = {}
-        self._gone: list[str] = []  # who left since the last step of SUMO
+        self._gone: list[str] = []  # actors removed since the last step of SUMO
         with tempfile.TemporaryDirectory(prefix="flcav_live_") as folder:
             job = write_live_job(town, Path(folder), seed=seed, vehicles=vehicles, pedestrians=pedestrians)
             self._sumo = Sumo(job)
@@ -70,14 +73,14 @@ class SumoTraffic:
         self.advance(NOBODY, {}, [])
 
     def advance(self, bodies: Actors, lights: Mapping[str, str], halted: Sequence[str]) -> None:
-        """Let SUMO make its next step, in which its traffic sees the `bodies` under control.
+        """Advance SUMO by a step, in which its traffic reacts to the `bodies` under control.
 
         `lights` are the letters of each junction's links. Vehicles that are `halted` stand for a while. Raises
         `RuntimeError` where SUMO fails.
         """
         changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
         self._lights |= changed
-        request = Request(_list_vehicles(bodies), _list_dangers(bodies), changed, halted, self._gone)
+        request = StepRequest(_list_vehicles(bodies), _list_dangers(bodies), changed, halted, self._gone)
         self._before, self._after = self._after, self._sumo.step(request)
         self._gone = []
         self.ticks += 1
@@ -90,7 +93,7 @@ class SumoTraffic:
         self._line_up()
 
     def _line_up(self) -> None:
-        """Take those who are there both before and after the step of SUMO under way."""
+        """Keep the actors that are present both before and after SUMO's present step."""
         names = sorted((name for name in self._before if name in self._after), key=number_of)
         self._ends = tuple(
             np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)
@@ -100,9 +103,9 @@ class SumoTraffic:
             self._recast(names)
 
     def at(self, time_s: float) -> Actors:
-        """Return those present at a time since the start, within the step of SUMO under way: linear in it.
+        """Return the actors at a time [s] since the start within SUMO's present step, interpolated linearly.
 
-        Times must ascend, since who is on a bridge stays on it.
+        Times must ascend, since an actor stays on the bridge, or below it, where it was.
         """
         share = time_s / STEP_S - (self.ticks - 1)
         first, last = self._ends
@@ -129,7 +132,7 @@ class SumoTraffic:
         return self._actors
 
     def _recast(self, names: Sequence[str]) -> None:
-        """Take over these actors; those who come are on the ground, or on the bridge that their lane leads over."""
+        """Set up these actors; new ones stand on the ground, or on the bridge that their lane leads over."""
         kinds = [self._kinds[self._after[name][0]] for name in names]
         size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], np.float64).reshape(-1, 3)
         count = len(names)
@@ -193,7 +196,7 @@ def _list_dangers(bodies: Actors) -> list[list[float]]:
     return np.column_stack((np.concatenate(places), np.tile(row, (len(places), 1)))).tolist()
 
 
-def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:
+def stand_parked(town: Town, ground: TownGround, seed: int) -> Actors:
     """Return the vehicles parked along a town's streets, the same as in a recording with this seed."""
     cars = park(read_net(town.net), town.parameters, stream(seed, "parked")) if town.net.exists() else []
     if not cars:
@@ -208,3 +211,79 @@ def stand_parked(town: Town, ground: Ground, seed: int) -> Actors:
         *(tuple(f"parked{i}" for i in range(count)), tuple(car.category for car in cars)),
         *(np.array([car.shape for car in cars], np.int64), size, position, yaw, still, still, np.zeros(count), tilt),
     )
+
+
+LETTERS = frozenset("GgyruosO")  # SUMO's states of a link
+
+
+@dataclass(frozen=True)
+class LightProgram:
+    """The program of one junction's lights."""
+
+    junction: str
+    durations_s: tuple[float, ...]  # of each phase
+    states: tuple[str, ...]  # of each phase, one of `LETTERS` for each link
+    offset_s: float  # the first phase begins at this time
+
+    def at(self, time_s: float) -> str:
+        """Return the letters of the links at a time [s]."""
+        left = (time_s - self.offset_s) % sum(self.durations_s)
+        for duration, state in zip(self.durations_s, self.states):
+            if left < duration - 1e-6:
+                return state
+            left -= duration
+        return self.states[0]
+
+
+class TrafficLights:
+    """The lights of a town, which follow their programs unless they are set or frozen."""
+
+    def __init__(self, programs: tuple[LightProgram, ...], time_s: float) -> None:
+        """Start at a time of the programs [s]."""
+        self.frozen = False
+        self._programs = {each.junction: each for each in programs}
+        self._time_s = time_s
+        self._set: dict[str, str] = {}
+
+    def advance(self, dt_s: float) -> None:
+        """Let the programs go on by `dt_s` [s], unless they are frozen."""
+        if not self.frozen:
+            self._time_s += dt_s
+
+    def states(self) -> dict[str, str]:
+        """Return the letters of the links of each junction."""
+        return {name: self._set.get(name) or each.at(self._time_s) for name, each in self._programs.items()}
+
+    def set(self, junction: str, state: str | None) -> None:
+        """Let a junction show these letters, or its program again (None); raises `InputError` for others."""
+        if junction not in self._programs:
+            raise InputError(f"light {shorten(junction)}: the town has no such junction with lights")
+        if state is None:
+            self._set.pop(junction, None)
+            return
+        links = len(self._programs[junction].states[0])
+        if len(state) != links or not set(state) <= LETTERS:
+            letters = "".join(sorted(LETTERS))
+            raise InputError(f"light {shorten(junction)}: {shorten(state)} must be {links} of the letters {letters}")
+        self._set[junction] = state
+
+
+def read_light_programs(net: Path) -> tuple[LightProgram, ...]:
+    """Return the first program of each junction with lights; none where there is no net file.
+
+    Phases of programs that react to traffic keep their nominal durations. Raises `InputError` for a damaged net.
+    """
+    if not net.exists():
+        return ()
+    found: dict[str, LightProgram] = {}
+    try:
+        for row in read_xml(net, "a SUMO net").iterfind("tlLogic"):
+            name, phases = row.attrib["id"], row.findall("phase")
+            durations = tuple(float(phase.attrib["duration"]) for phase in phases)
+            states = tuple(phase.attrib["state"] for phase in phases)
+            if not 0 < sum(durations) < 1e6 or len({len(state) for state in states}) != 1:
+                raise ValueError(f"the phases of light {name}")
+            found.setdefault(name, LightProgram(name, durations, states, float(row.get("offset", "0"))))
+    except (LookupError, ValueError) as error:
+        raise InputError(f"{net}: not a SUMO net ({type(error).__name__}: {error})") from None
+    return tuple(found[name] for name in sorted(found))

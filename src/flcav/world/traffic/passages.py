@@ -1,17 +1,14 @@
-"""Passages: routes through a road net with open ends, from where vehicles enter it to where they leave it."""
+"""Reachability in a road net, and passages: routes from where vehicles enter an open net to where they leave it."""
 
 from dataclasses import dataclass, replace
 
 import networkx
 import numpy as np
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.arrays import Array, Mask
 from flcav.config import InputError
 from flcav.world.map.roads import Edge, RoadNet
-from flcav.world.traffic.reach import make_drive_graph
-
-Array = NDArray[np.float64]
 
 HASTE = 1.2  # highest speed of a car, as a multiple of the limit
 ENTERING_S = 1.0  # a vehicle enters with its whole length on the first edge, and leaves with its front
@@ -28,10 +25,8 @@ class Passages:
     edges: list[Edge]
     onward: list[list[int]]  # per edge, the rows of those that follow it
     time_s: Array  # (N,) on each edge at the limit
-    left_s: (
-        Array  # (N,) longest from the beginning of each edge to where the net ends; infinite where there is a circle
-    )
-    entries: NDArray[np.bool_]  # (N,) whether nothing leads to it
+    left_s: Array  # (N,) longest from the beginning of each edge to where the net ends; infinite on a circle
+    entries: Mask  # (N,) whether nothing leads to it
 
     def slow_down(self, least_s: float) -> tuple["Passages", float | None]:
         """Return the passages at the speed at which the longest way takes `least_s` [s], and its share of the limit.
@@ -105,3 +100,58 @@ def find_passages(net: RoadNet, edges: list[Edge]) -> Passages:
 def measure_edge(edge: Edge) -> float:
     """Return the length of an edge's outermost driving lane [m]."""
     return LineString(edge.lanes_of("driving")[0].shape).length
+
+
+def make_drive_graph(net: RoadNet, edges: list[Edge]) -> networkx.DiGraph:
+    """Return the graph of the edges that vehicles can drive on, the `edges` first, and which leads to which."""
+    graph = networkx.DiGraph()
+    graph.add_nodes_from(edge.id for edge in edges)
+    driven = {lane.id for edge in net.edges.values() for lane in edge.lanes_of("driving")}
+    for way in net.connections:
+        if way.start in driven and way.end in driven:
+            graph.add_edge(_edge(way.start), _edge(way.end))
+    return graph
+
+
+def find_driven(net: RoadNet, edges: list[Edge]) -> Mask:
+    """Return (N, N) whether a vehicle can drive from each of the `edges` to each of them; in a circle to itself."""
+    graph = make_drive_graph(net, edges)
+    row = {edge.id: i for i, edge in enumerate(edges)}
+    whole = networkx.condensation(graph)
+    out = np.zeros((len(edges), len(edges)), np.bool_)
+    onward: dict[int, Mask] = {}  # of each strongly connected part, the edges from there on
+    for part in reversed(list(networkx.topological_sort(whole))):
+        members = whole.nodes[part]["members"]
+        mask = np.zeros(len(edges), np.bool_)
+        for following in whole.successors(part):
+            mask |= onward[following]
+        cyclic = len(members) > 1 or any(graph.has_edge(name, name) for name in members)
+        own = [row[name] for name in members if name in row]
+        mask[own] |= cyclic
+        out[own] = mask
+        mask = mask.copy()
+        mask[own] = True
+        onward[part] = mask
+    return out
+
+
+def find_walked(net: RoadNet, edges: list[Edge]) -> Mask:
+    """Return (N, N) whether a pedestrian can walk between each two of the `edges`, by sidewalks and crossings."""
+    graph = networkx.Graph()
+    graph.add_nodes_from(edge.id for edge in edges)
+    walked = {
+        lane.id
+        for edge in net.edges.values()
+        for lane in edge.lanes
+        if lane.kind in ("sidewalk", "crossing", "walkingarea")
+    }
+    for way in net.connections:
+        if way.start in walked and way.end in walked:
+            graph.add_edge(_edge(way.start), _edge(way.end))
+    part = {name: i for i, names in enumerate(networkx.connected_components(graph)) for name in names}
+    number = np.array([part[edge.id] for edge in edges], np.int64)
+    return number[:, None] == number
+
+
+def _edge(lane: str) -> str:
+    return lane.rpartition("_")[0]

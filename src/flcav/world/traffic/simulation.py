@@ -1,9 +1,17 @@
 """Stepped traffic: a SUMO run that is the same for recordings and for live worlds, and reacts to what is driven there.
 
-A step of `STEP_S` obeys a `Request`: the vehicles under control are placed, SUMO's brake for what is in their way, and
-then all move. Nobody is under control in a recording.
+A step of `STEP_S` obeys a `StepRequest`: the vehicles under control are placed, SUMO's brake for what is in their way,
+and then all move. Nobody is under control in a recording.
+
+Pedestrians of limited speed.
+
+In SUMO's "striping" model they jump: up to three stripes aside in one step, and from one end of a junction's corner to
+the other where they wait for one crossing and another turns green. Here a pedestrian who falls behind follows the path
+of SUMO's pedestrian at no more than `HURRY_MPS` until caught up. Nothing of later steps is used.
 """
 
+import math
+from collections import deque
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -11,7 +19,6 @@ from typing import Any, NamedTuple
 from flcav.world.scenarios.director import Director
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Brakes, Danger, State
-from flcav.world.traffic.walkers import Walkers
 
 OWN = "own:"  # begins the names of vehicles under control
 NEAR_LANE_M = 5.0  # a vehicle under control is on a lane whose middle is so near, else off the road
@@ -25,20 +32,20 @@ Body = tuple[str, str, Sequence[float]]
 """A vehicle under control: name, SUMO's type; length, width, front x, y [m], angle [deg], speed [m/s]."""
 
 
-class Job(NamedTuple):
-    """What a run is started with; the files `NET` and `ROUTES` of its folder are SUMO's."""
+class TrafficJob(NamedTuple):
+    """Inputs of a run; its folder holds SUMO's files `NET` and `ROUTES`."""
 
     folder: str
     seed: int
-    followers: Mapping[str, tuple[str, str, list[str]]]  # name, type and edges of who enters when a vehicle has left
+    followers: Mapping[str, tuple[str, str, list[str]]]  # by a vehicle that leaves: name, type, edges of the next
     again: int | None = None  # vehicles without one set out again, numbered from this; None where they do not
-    edge: str = ""  # a route of those under control, whom SUMO does not see without one
+    edge: str = ""  # a route for the vehicles under control; without one, SUMO does not see them
     scenarios: Sequence[Mapping[str, object]] = ()  # as JSON
     steps: int = 0  # that are made at the start
 
 
-class Request(NamedTuple):
-    """What a step obeys."""
+class StepRequest(NamedTuple):
+    """External inputs of a step."""
 
     bodies: Sequence[Body] = ()  # under control
     dangers: Sequence[Danger] = ()  # to brake for
@@ -50,7 +57,7 @@ class Request(NamedTuple):
 class Simulation:
     """A SUMO run, step by step."""
 
-    def __init__(self, sumo: Any, job: Job) -> None:
+    def __init__(self, sumo: Any, job: TrafficJob) -> None:
         """Start libsumo, the module `sumo`, in the job's folder, which is the working directory."""
         options = {
             "net-file": NET,
@@ -80,7 +87,7 @@ class Simulation:
         for _ in range(job.steps):
             self.advance()
 
-    def step(self, request: Request) -> None:
+    def step(self, request: StepRequest) -> None:
         """Make a step that obeys the request."""
         for light, state in request.lights.items():
             self.sumo.trafficlight.setRedYellowGreenState(light, state)
@@ -95,7 +102,7 @@ class Simulation:
         self.advance()
 
     def states(self) -> States:
-        """Return the states of SUMO's own vehicles and pedestrians, as scenarios have them seen."""
+        """Return the states of SUMO's vehicles and pedestrians, with the shifts and turns of scenarios."""
         seen = self.director.stage.seen if self.director else None
         out: States = {}
         for name in self.sumo.vehicle.getIDList():
@@ -107,7 +114,7 @@ class Simulation:
         return out
 
     def advance(self) -> None:
-        """Make a step with nobody under control; vehicles that have arrived are followed, or set out again."""
+        """Advance by a step; vehicles that have arrived are replaced by the next ones, or set out again."""
         sumo = self.sumo
         sumo.simulationStep()
         for name in sumo.simulation.getArrivedIDList():
@@ -124,12 +131,12 @@ class Simulation:
         self._walkers.follow({name: _state_of(sumo.person, name) for name in sumo.person.getIDList()})
         if self.director:
             self.director.direct()
-        for name in sumo.simulation.getDepartedIDList():  # those whom a script has entered, too
+        for name in sumo.simulation.getDepartedIDList():  # including those that a script has inserted
             if name not in self._own:
                 self._tours[name] = _type_of(sumo.vehicle, name), list(sumo.vehicle.getRoute(name))
 
     def _remove(self, name: str) -> None:
-        """Let one of SUMO's own leave, if it is still there."""
+        """Remove a vehicle or pedestrian of SUMO, if it is still present."""
         self._halted.pop(name, None)
         if self._tours.pop(name, None) is not None:
             self.sumo.vehicle.remove(name)
@@ -149,7 +156,7 @@ class Simulation:
         self.sumo.vehicle.add(follower, follower, kind, departPos="base", departSpeed="max", departLane="best")
 
     def _mirror(self, bodies: Sequence[Body]) -> None:
-        """Place the vehicles under control; those that are not among `bodies` any more leave."""
+        """Mirror the vehicles under control in SUMO: place `bodies`, and remove those that are no longer among them."""
         vehicle = self.sumo.vehicle
         names = {OWN + row[0] for row in bodies}
         for name in sorted(self._own - names):
@@ -175,3 +182,40 @@ def _state_of(domain: Any, name: str) -> State:
 def _type_of(domain: Any, name: str) -> str:
     """Return the type of a vehicle or pedestrian; "type@vehicle" is SUMO's copy of a type for one vehicle."""
     return domain.getTypeID(name).partition("@")[0]
+
+
+HURRY_MPS = 2.5  # jogging speed; the pedestrians of the demand walk at no more than 1.7 m/s
+
+
+class Walkers:
+    """The pedestrians of a run, with limited speed: they follow SUMO's pedestrians step by step."""
+
+    def __init__(self, step_s: float) -> None:
+        """Start without pedestrians; `step_s` is the duration of a step [s]."""
+        self.states: dict[str, State] = {}  # of those present now, in SUMO's order
+        self._step_s = step_s
+        self._behind: dict[str, deque[tuple[float, float]]] = {}  # path between a pedestrian and SUMO's
+
+    def follow(self, targets: Mapping[str, State]) -> None:
+        """Advance by one step, in which SUMO's pedestrians reach `targets`; those not among them leave."""
+        self.states = {name: self._follow(name, target) for name, target in targets.items()}
+        self._behind = {name: path for name, path in self._behind.items() if path and name in targets}
+
+    def _follow(self, name: str, target: State) -> State:
+        """Return `target`, or where it is out of reach the state on the path to it, with its own angle and speed."""
+        if name not in self.states:
+            return target
+        path = self._behind.setdefault(name, deque())
+        path.append(target[:2])
+        start_x, start_y = x, y = self.states[name][:2]
+        left = HURRY_MPS * self._step_s
+        while path:
+            to_x, to_y = path[0]
+            distance = math.hypot(to_x - x, to_y - y)
+            if distance > left:
+                x, y = x + (to_x - x) * left / distance, y + (to_y - y) * left / distance
+                moved_x, moved_y = x - start_x, y - start_y
+                return x, y, math.degrees(math.atan2(moved_x, moved_y)), math.hypot(moved_x, moved_y) / self._step_s
+            left -= distance
+            x, y = path.popleft()
+        return target

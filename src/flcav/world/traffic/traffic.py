@@ -1,10 +1,16 @@
-"""Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`."""
+"""Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`.
+
+Actors on a relief: their heights, pitch and roll, and how fast they climb.
+
+SUMO moves them in plan. Their horizontal velocity stays as it is; the vertical one follows from the ground they pass.
+"""
 
 import contextlib
 import json
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import shapely
@@ -12,23 +18,23 @@ from numpy.typing import NDArray
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError
 from flcav.geometry import heading_vectors, wrap_angle
 from flcav.statistics.streams import derive_seed, stream
+from flcav.world.map.relief import find_tilts
 from flcav.world.map.roads import read_net
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import KERB_M, Town
+from flcav.world.scenarios.manoeuvres import shape_of
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S
 from flcav.world.shapes import SHAPES
 from flcav.world.trace import Event, Trace
 from flcav.world.traffic.bridges import find_footing
 from flcav.world.traffic.client import Sumo, write_job
-from flcav.world.traffic.climb import stand_on_relief
 from flcav.world.traffic.demand import Demand, Parked, list_vehicle_types, park, write_demand
-from flcav.world.traffic.recording import Recorded
-
-Array = NDArray[np.float64]
+from flcav.world.traffic.process import RecordedTraffic
 
 FILL_S = 30.0  # all actors have departed by then
 SMOOTHING_STEPS = 4  # half width of the moving average of poses, since SUMO turns and changes lanes abruptly
@@ -79,39 +85,35 @@ def simulate_drives(
     trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
-        told = "the CAV is not" if cavs == 1 else f"not all of {cavs} CAVs are"
+        missing = "the CAV is not" if cavs == 1 else f"not all of {cavs} CAVs are"
         fewer = ", or take fewer" if cavs > 1 else ""
-        raise InputError(f"{told} under way at {times_s[0]} s: begin later{fewer}")
+        raise InputError(f"{missing} under way at {times_s[0]} s: begin later{fewer}")
     return trace, _build_trace(town, (driven * np.float64(STEP_S)).round(1), _of_cavs(raw), drive_rows, [])
 
 
-def _of_cavs(raw: Recorded) -> Recorded:
+def _of_cavs(raw: RecordedTraffic) -> RecordedTraffic:
     """Return the states of CAVs alone."""
     own = np.char.startswith(raw.id, "cav")
     return raw._replace(id=raw.id[own], type=raw.type[own], state=raw.state[:, own])
 
 
-def _windows(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+def _windows(steps: Ints) -> Ints:
     """Return the steps (T, W) over which the state at each of `steps` (T,) is averaged; none before 1."""
     return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
-def _run(net: Path, demand: Demand, seed: int, steps: NDArray[np.int64], scenarios: Sequence[Scenario]) -> Recorded:
+def _run(net: Path, demand: Demand, seed: int, steps: Ints, scenarios: Sequence[Scenario]) -> RecordedTraffic:
     """Return the states at these steps of a run with nobody under control; raises `RuntimeError` where SUMO fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
         job = write_job(Path(name), net, demand, seed)._replace(scenarios=[each.model_dump() for each in scenarios])
         with contextlib.closing(Sumo(job, f"SUMO failed on {net}")) as sumo:
             sumo.record(steps.tolist(), out := Path(name) / "out.npz")
         with np.load(out) as arrays:
-            return Recorded(**arrays)
+            return RecordedTraffic(**arrays)
 
 
 def _build_trace(
-    town: Town,
-    time_s: Array,
-    raw: Recorded,
-    windows: tuple[NDArray[np.int64], ...],
-    parked: list[Parked],
+    town: Town, time_s: Array, raw: RecordedTraffic, windows: tuple[Ints, ...], parked: list[Parked]
 ) -> Trace:
     """Return the trace of SUMO's states, averaged over `windows` (rows of the steps before, at and after the times)."""
     before, now, after = windows
@@ -164,12 +166,12 @@ def _build_trace(
     )
 
 
-def _smooth(raw: Recorded, windows: NDArray[np.int64]) -> Array:
+def _smooth(raw: RecordedTraffic, windows: Ints) -> Array:
     """Return front x, y, yaw, speed (T, A, 4), averaged over each window (T, W); NaN where absent at its middle."""
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
     total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
-    for column, opposite in zip(windows.T, windows.T[::-1]):  # both or neither: else who just came would be ahead
+    for column, opposite in zip(windows.T, windows.T[::-1]):  # both or neither: no shift of new actors
         there = ~np.isnan(dense[column, :, :1] + dense[opposite, :, :1])
         total += np.where(there, dense[column], 0.0)
         count += there
@@ -179,7 +181,7 @@ def _smooth(raw: Recorded, windows: NDArray[np.int64]) -> Array:
     return out
 
 
-def _dense(raw: Recorded, rows: NDArray[np.int64]) -> Array:
+def _dense(raw: RecordedTraffic, rows: Ints) -> Array:
     """Return front x, y, unwrapped yaw, speed (R, A, 4) at `rows` (R,) of the steps read; NaN where absent."""
     out = raw.state[rows]
     yaw = np.pi / 2 - np.radians(out[..., 2])
@@ -225,14 +227,13 @@ def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
     return next(motions), next(motions)
 
 
-def _drop_obstructing(raw: Recorded, parked: list[Parked]) -> list[Parked]:
+def _drop_obstructing(raw: RecordedTraffic, parked: list[Parked]) -> list[Parked]:
     """Return the parked vehicles that do not overlap the paths of actors created for scenarios."""
     scripted = np.flatnonzero(np.char.startswith(raw.id, "scripted"))
     ways = []
     for actor in scripted:
         at = raw.state[~np.isnan(raw.state[:, actor, 0]), actor]
-        category, _, shape = str(raw.type[actor]).partition(".")
-        length, width = next(row[1:3] for row in SHAPES[category] if row.name == shape)
+        length, width = shape_of(str(raw.type[actor]))[1:3]
         yaw = np.pi / 2 - np.radians(at[:, 2])
         middle = at[:, :2] - length / 2 * heading_vectors(yaw)
         ways += [make_footprint(x, y, turn, length, width).buffer(0.3) for (x, y), turn in zip(middle, yaw)]
@@ -256,3 +257,49 @@ def number_of(name: str) -> tuple[str, int]:
     """Return the key that sorts names by their number: "veh2" before "veh10"."""
     kind = name.rstrip("0123456789")
     return kind, int(name[len(kind) :])
+
+
+DIFFERENCE_S = 0.3  # of the central differences along an actor's way: longer than it takes over a triangle's edge
+
+
+class OnRelief(NamedTuple):
+    """The motion of A actors at T instants on a relief; NaN where absent."""
+
+    height: Array  # (T, A) of the ground under them [m]
+    tilt: Array  # (T, A, 2) pitch and roll [rad]
+    velocity: Array  # (T, A, 3) [m/s]
+    acceleration: Array  # (T, A, 3) [m/s^2]
+
+
+def stand_on_relief(
+    heights: Callable[[Array, Array], Array],
+    centre: Array,
+    yaw: Array,
+    velocity: Array,
+    acceleration: Array,
+    size: Array,
+    upright: Mask,
+) -> OnRelief:
+    """Return the motion of actors on a relief, given that in plan.
+
+    `heights` are those of what each actor stands on, at x, y (T, A) [m]. `centre` (T, A, 2) [m], `yaw` (T, A) [rad],
+    `velocity` and `acceleration` (T, A, 3); `size` (A, 3) [m]. Actors that are `upright` (A,) do not tilt.
+    """
+
+    def height_at(time_s: float) -> Array:
+        moved = centre + time_s * velocity[..., :2] + time_s**2 / 2 * acceleration[..., :2]
+        x, y = moved[..., 0], moved[..., 1]
+        return np.where(upright, heights(x, y), find_tilts(heights, x, y, yaw, size)[0])
+
+    _, pitch, roll = find_tilts(heights, centre[..., 0], centre[..., 1], yaw, size)
+    tilt = np.where(upright[:, None], 0.0, np.stack((pitch, roll), axis=2))
+    tilt[np.isnan(yaw)] = np.nan
+    before, now, after = (height_at(time_s) for time_s in (-DIFFERENCE_S, 0.0, DIFFERENCE_S))
+    climb = (after - before) / (2 * DIFFERENCE_S)
+    change = (after - 2 * now + before) / DIFFERENCE_S**2
+    return OnRelief(
+        now,
+        tilt,
+        np.concatenate((velocity[..., :2], climb[..., None]), axis=2),
+        np.concatenate((acceleration[..., :2], change[..., None]), axis=2),
+    )

@@ -22,8 +22,8 @@ from flcav.sources.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
 from flcav.sources.carla.server.sensing.cameras import sense_rgb
 from flcav.sources.carla.server.wire import VehicleControl
 from flcav.world import static
-from flcav.world.dynamics.blueprints import blueprint
 from flcav.world.dynamics.obstacles import list_obstacles
+from flcav.world.dynamics.vehicle import make_blueprint
 from flcav.world.opendrive.importing import ImportedTown
 
 DT_S = 0.05
@@ -57,7 +57,7 @@ def drive(calls, car, **pedals):
 
 def test_wheels_are_where_the_car_is_driven_by(calls):
     car = spawn(calls, "vehicle.tesla.model3", place(calls))
-    made = blueprint(car.category, 0, car.size)
+    made = make_blueprint(car.category, 0, car.size)
     places = [wheel[-1] for wheel in invoke(calls, "get_physics_control", (car.id,))[-2]]  # [cm]
     wheels = 0.01 * np.array(places).reshape(2, 2, 3)  # front and rear, left and right
     assert np.linalg.norm(wheels[0] - wheels[1], axis=1) == pytest.approx(made.wheelbase_m)

@@ -6,7 +6,7 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from flcav.world.dynamics.contacts import RESTITUTION, Footprints, find_overlaps, resolve
+from flcav.world.dynamics.contacts import RESTITUTION, Footprints, find_overlaps, resolve_contacts
 from flcav.world.map.surfaces import make_footprint
 
 
@@ -44,7 +44,7 @@ def test_a_head_on_collision_is_that_of_the_textbook():
     rows = np.array([[0.0, 0, 0, 4, 2], [3.9, 0, np.pi, 4, 2]])
     velocity = np.array([[10.0, 0], [-6.0, 0]])
     mass = np.array([1500.0, 3000.0])
-    place, after, spin, contacts = resolve(boxes(rows), rows[:, :3], velocity, np.zeros(2), mass, mass)
+    place, after, spin, contacts = resolve_contacts(boxes(rows), rows[:, :3], velocity, np.zeros(2), mass, mass)
     common = mass @ velocity[:, 0] / mass.sum()
     np.testing.assert_allclose(after[:, 0], common - RESTITUTION * (velocity[:, 0] - common))
     np.testing.assert_allclose(after[:, 1], 0, atol=1e-9)
@@ -64,7 +64,7 @@ def test_collisions_keep_momentum_and_lose_energy(seed: int):
     velocity, spin = random.uniform(-10, 10, (2, 2)), random.uniform(-1, 1, 2)
     mass = random.uniform(1000, 4000, 2)
     inertia = 2 * mass
-    place, after, turned, contacts = resolve(boxes(rows), rows[:, :3], velocity, spin, mass, inertia)
+    place, after, turned, contacts = resolve_contacts(boxes(rows), rows[:, :3], velocity, spin, mass, inertia)
     if (np.abs(place - rows[:, :3]) == 0).all():  # undone
         return
     np.testing.assert_allclose(mass @ after, mass @ velocity, atol=1e-6)
@@ -105,7 +105,7 @@ def test_nothing_interpenetrates(seed: int):
         moved = everything.copy()
         moved[:, :2] += velocity * 0.05
         moved[:, 2] += spin * 0.05
-        everything[:, :3], velocity, spin, _ = resolve(boxes(moved), before, velocity, spin, mass, inertia)
+        everything[:, :3], velocity, spin, _ = resolve_contacts(boxes(moved), before, velocity, spin, mass, inertia)
         shapes = np.array([make_footprint(*row) for row in everything])
         first, second = shapely.STRtree(shapes).query(shapes, "intersects")
         apart = (first >= second) | (first >= count)

@@ -4,25 +4,25 @@ import numpy as np
 import pytest
 
 from flcav.geometry import heading_vectors
-from flcav.world.dynamics.blueprints import blueprint
 from flcav.world.dynamics.vehicle import (
     AIR_KGPM3,
     GRAVITY_MPS2,
     GRIP_MPS2,
     ROLLING_MPS2,
-    Motion,
     Pedals,
+    PlanarMotion,
     Vehicles,
-    drive,
+    drive_vehicles,
+    make_blueprint,
     stack_blueprints,
 )
 
-SEDAN = blueprint("car", 3)
+SEDAN = make_blueprint("car", 3)
 CARS = stack_blueprints([SEDAN])
 
 
-def moving(speed: float, yaw: float = 0.0) -> Motion:
-    return Motion(np.zeros((1, 2)), np.array([yaw]), speed * heading_vectors([yaw]), np.zeros(1), np.zeros(1))
+def moving(speed: float, yaw: float = 0.0) -> PlanarMotion:
+    return PlanarMotion(np.zeros((1, 2)), np.array([yaw]), speed * heading_vectors([yaw]), np.zeros(1), np.zeros(1))
 
 
 def pedals(throttle=0.0, steer=0.0, brake=0.0, hand_brake=False, reverse=False) -> Pedals:
@@ -31,10 +31,12 @@ def pedals(throttle=0.0, steer=0.0, brake=0.0, hand_brake=False, reverse=False) 
     )
 
 
-def run(motion: Motion, steps: int, pressed: Pedals, pitch=0.0, dt_s=0.05, cars: Vehicles = CARS) -> list[Motion]:
+def run(
+    motion: PlanarMotion, steps: int, pressed: Pedals, pitch=0.0, dt_s=0.05, cars: Vehicles = CARS
+) -> list[PlanarMotion]:
     out = [motion]
     for _ in range(steps):
-        out.append(drive(out[-1], cars, pressed, np.array([pitch]), dt_s))
+        out.append(drive_vehicles(out[-1], cars, pressed, np.array([pitch]), dt_s))
     return out
 
 
@@ -108,12 +110,14 @@ def test_shorter_steps_give_the_same_way():
 
 
 def test_vehicles_in_one_call_do_not_affect_each_other():
-    two = [SEDAN, blueprint("bus", 0)]
-    both = Motion(*(np.repeat(array, 2, axis=0) for array in moving(7.0)))
+    two = [SEDAN, make_blueprint("bus", 0)]
+    both = PlanarMotion(*(np.repeat(array, 2, axis=0) for array in moving(7.0)))
     one = pedals(throttle=0.7, steer=0.2)
     pressed = one._replace(**{name: np.repeat(array, 2) for name, array in one._asdict().items()})
-    together = drive(both, stack_blueprints(two), pressed, np.zeros(2), 0.05)
+    together = drive_vehicles(both, stack_blueprints(two), pressed, np.zeros(2), 0.05)
     for row, each in enumerate(two):
-        alone = drive(moving(7.0), stack_blueprints([each]), pedals(throttle=0.7, steer=0.2), np.zeros(1), 0.05)
+        alone = drive_vehicles(
+            moving(7.0), stack_blueprints([each]), pedals(throttle=0.7, steer=0.2), np.zeros(1), 0.05
+        )
         for a, b in zip(together, alone):
             np.testing.assert_array_equal(a[row], b[0])

@@ -14,8 +14,7 @@ from flcav.world.map.roads import read_net
 from flcav.world.map.signals import Signals
 from flcav.world.map.town import Poles, Signs, Town, lift_town
 from flcav.world.materials import Material
-from flcav.world.opendrive.bridges import BRIDGE_M, Borders, find_bridges
-from flcav.world.opendrive.heights import sample_heights
+from flcav.world.opendrive.heights import BRIDGE_M, Borders, find_bridges, sample_heights
 from flcav.world.opendrive.importing import import_town
 from flcav.world.opendrive.streets import SIDEWALK_M
 from flcav.world.scene import Scene

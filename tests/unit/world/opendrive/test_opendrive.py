@@ -19,7 +19,7 @@ from flcav.world.map.town import Town, load_town
 from flcav.world.opendrive.document import read_map
 from flcav.world.opendrive.georeference import inverse_mercator, locate_origin
 from flcav.world.opendrive.importing import ImportedTown, import_town
-from flcav.world.opendrive.objects.crosswalks import find_crosswalks
+from flcav.world.opendrive.objects.crossings import find_crosswalks
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.traffic.traffic import simulate
 

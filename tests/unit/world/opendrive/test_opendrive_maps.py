@@ -14,16 +14,16 @@ from flcav.config import InputError
 from flcav.world.map.lanes import map_layers
 from flcav.world.map.parameters import GeoReference
 from flcav.world.map.roads import Edge, RoadNet, read_net
-from flcav.world.map.surfaces import subtract, unite
+from flcav.world.map.surfaces import cut_area, unite
 from flcav.world.map.town import Town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import ImportedTown, import_town
-from flcav.world.opendrive.mending.maps import mend_map
-from flcav.world.opendrive.mirror import mirror_map
+from flcav.world.opendrive.mending import mend_map
+from flcav.world.opendrive.netconvert import mirror_map
 from flcav.world.opendrive.objects.signs import find_signs
 from flcav.world.static import TownPart, build_static_world
 from flcav.world.traffic.demand import draw_tour, find_middles
-from flcav.world.traffic.reach import find_driven, find_walked
+from flcav.world.traffic.passages import find_driven, find_walked
 from flcav.world.traffic.traffic import simulate
 
 CROSS = Path(__file__).parents[3] / "data" / "cross.xodr"
@@ -143,7 +143,7 @@ def chain(*names: str) -> list[Edge]:
 
 
 def test_tours_go_only_where_there_is_a_way() -> None:
-    from flcav.world.map.roads import Connection
+    from flcav.world.map.roads import LaneConnection
 
     edges = chain("a", "b", "c", "d")
     ways = [("a", "b"), ("b", "a"), ("b", "c"), ("d", "d")]  # c is a dead end, d a circle of its own
@@ -152,7 +152,7 @@ def test_tours_go_only_where_there_is_a_way() -> None:
         {},
         frozenset(),
         {},
-        tuple(Connection(f"{start}_0", f"{end}_0", "", "s", "") for start, end in ways),
+        tuple(LaneConnection(f"{start}_0", f"{end}_0", "", "s", "") for start, end in ways),
     )
     reach = find_driven(net, edges)
     np.testing.assert_array_equal(reach, np.array([[1, 1, 1, 0], [1, 1, 1, 0], [0, 0, 0, 0], [0, 0, 0, 1]], bool))
@@ -408,7 +408,7 @@ def test_areas_that_defeat_exact_overlay_are_snapped(monkeypatch: pytest.MonkeyP
         return exact(one, other, grid_size=grid_size)
 
     monkeypatch.setattr(shapely, "difference", fails)
-    assert subtract(shapely.box(0, 0, 2, 2), shapely.box(1, 0, 3, 2)).area == pytest.approx(2.0)
+    assert cut_area(shapely.box(0, 0, 2, 2), shapely.box(1, 0, 3, 2)).area == pytest.approx(2.0)
     assert unite([shapely.box(0, 0, 1, 1), shapely.box(1, 0, 2, 1)]).area == pytest.approx(2.0)
 
 

@@ -22,7 +22,7 @@ from flcav.world.opendrive.objects.places import outline_object
 from flcav.world.opendrive.road_surface import Road
 from flcav.world.static import build_town_mesh, list_signs_and_signals
 from flcav.world.traffic.demand import park
-from flcav.world.traffic.reach import find_walked
+from flcav.world.traffic.passages import find_walked
 from flcav.world.traffic.traffic import simulate
 
 MAP = Path(__file__).parents[3] / "data" / "cross_with_objects.xodr"

@@ -14,11 +14,11 @@ from shapely.geometry import Point, Polygon
 from flcav.geometry import Boxes, angles_of, inverse, points_in_boxes, pose, rotations
 from flcav.world.map.relief import Deck, Relief, find_tilts
 from flcav.world.materials import Material
-from flcav.world.meshes.drape import FLAT_M, _cut, drape_area, drape_polygon, drape_wall
+from flcav.world.meshes.mesh import FLAT_M, _cut, drape_area, drape_polygon, drape_wall
 from flcav.world.opendrive.heights import sample_heights
 from flcav.world.opendrive.reference_line import ReferenceLine
 from flcav.world.opendrive.road_surface import Road
-from flcav.world.traffic.climb import stand_on_relief
+from flcav.world.traffic.traffic import stand_on_relief
 
 POINTS = np.random.default_rng(0).uniform((-50, -40, 0), (50, 40, 6), (200, 3))
 

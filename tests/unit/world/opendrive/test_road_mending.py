@@ -14,9 +14,8 @@ from flcav.config import InputError
 from flcav.world.map.roads import RoadNet, read_net
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.importing import ImportedTown, import_town
-from flcav.world.opendrive.mending.roads import MOST_TOLD, mend_roads
-from flcav.world.opendrive.plan_view import shorten
-from flcav.world.opendrive.reference_line import ReferenceLine, list_pieces
+from flcav.world.opendrive.mending import MOST_TOLD, mend_roads
+from flcav.world.opendrive.reference_line import ReferenceLine, list_pieces, shorten_geometry
 from flcav.world.opendrive.road_surface import Road
 
 pytest.importorskip("sumo", reason="eclipse-sumo (the extra 'towns') is not installed")
@@ -158,7 +157,7 @@ def test_a_spiral_cut_short_goes_the_same_way(pieces: int) -> None:
     row = ElementTree.fromstring(geometry(0, 0, 80, shape='<spiral curvStart="-0.01" curvEnd="0.04"/>'))
     lengths = (60.0, 33.0)[:pieces]
     for each in lengths:
-        shorten(row, each)
+        shorten_geometry(row, each)
     length = lengths[-1]
     s = np.linspace(0.0, length, 50)
     np.testing.assert_allclose(
@@ -206,7 +205,7 @@ def test_cubics_by_arc_length_and_by_share_are_the_same_curve(tmp_path: Path) ->
         assert shape.get("pRange") == by  # so that netconvert draws the same
         row = root.find(".//geometry")
         assert row is not None
-        shorten(row, 0.7 * length)
+        shorten_geometry(row, 0.7 * length)
         np.testing.assert_allclose(
             list_pieces([row])[0].at(np.array([0.3, 0.7]) * length)[:, :2], curve[[30_000, 70_000]], atol=1e-6
         )

@@ -40,7 +40,7 @@ from flcav.geometry import angles_of, inverse, pose, rotations, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
-from flcav.storage.exchange import read_csv
+from flcav.storage.records import read_csv
 
 Array = NDArray[np.float64]
 Poses = Mapping[int, Array]  # tick -> (4, 4)

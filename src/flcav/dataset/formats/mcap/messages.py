@@ -38,7 +38,7 @@ from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
 from flcav.dataset.formats.mounts import quaternion
 from flcav.dataset.payloads import encode_png
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.sensors.radar import compute_echo_directions
 
 LIDAR_FIELDS = ("x", "y", "z", "intensity")
 TIME_FIELD = "time"  # of a point [s] after the cloud's time stamp, as in ROS drivers of spinning LiDARs

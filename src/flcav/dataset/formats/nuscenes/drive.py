@@ -30,7 +30,7 @@ from flcav.dataset.formats.nuscenes.tables import (
 from flcav.dataset.payloads import encode_png
 from flcav.geometry import transform_points, yaw_of
 from flcav.sensors.frame import Frame
-from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.sensors.radar import compute_echo_directions
 
 Array = NDArray[np.float64]
 

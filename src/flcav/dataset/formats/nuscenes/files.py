@@ -9,7 +9,7 @@ from PIL import Image, ImageDraw
 from flcav.config import InputError, read_file
 from flcav.dataset.formats.layout import BRIGHTEST
 from flcav.dataset.formats.reading import check_cloud
-from flcav.sensors.radar.radar import compute_echo_directions
+from flcav.sensors.radar import compute_echo_directions
 from flcav.world.map.town import Town
 
 OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # nuScenes': x right, y ahead

@@ -14,10 +14,9 @@ from scipy.spatial import KDTree
 
 from flcav.geometry import Boxes, count_points_in_boxes, inverse, points_in_boxes, transform_points
 from flcav.sensors.frame import SEMANTICS, Annotations, SignViews, Views
-from flcav.sensors.labels.outlines import clip_boxes, outline_boxes
-from flcav.sensors.labels.views import find_actor_regions
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
+from flcav.sensors.views import clip_boxes, find_actor_regions, outline_boxes
 from flcav.sources.carla.recording.sensors import SemanticSweep
 from flcav.sources.carla.recording.traffic import State
 

@@ -11,9 +11,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from flcav.config import InputError, shorten
-from flcav.interface.extras import format_install_command
-from flcav.interface.wording import suggest
-from flcav.machine.locks import take_turns
+from flcav.interface.wording import format_install_command, suggest
+from flcav.machine.locks import wait_for_turn
 from flcav.sources.recipe import STEP_S, CarlaRecipe
 
 if TYPE_CHECKING:
@@ -65,7 +64,7 @@ def open_session(recipe: CarlaRecipe, map_name: str, scene: str, seed: int) -> I
     import carla
 
     address = f"{recipe.host}:{recipe.port}"
-    with take_turns(f"carla-{re.sub('[^A-Za-z0-9]', '-', address)}"), _name_failures(address, scene):
+    with wait_for_turn(f"carla-{re.sub('[^A-Za-z0-9]', '-', address)}"), _name_failures(address, scene):
         client = carla.Client(recipe.host, recipe.port)
         client.set_timeout(recipe.timeout_s)
         _check_version(client, address)

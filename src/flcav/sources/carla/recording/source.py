@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, Json
 from flcav.geometry import Boxes, points_in_boxes, pose, transform_points
-from flcav.sensors.calibration import build_calibration, perturb_calibration
 from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.navigation import draw_fix_errors, draw_imu_errors
-from flcav.sensors.rig import CAMERA_RANGE_M, Rig
+from flcav.sensors.rig import CAMERA_RANGE_M, Rig, build_calibration, perturb_calibration
 from flcav.sources.carla.frames import MapFrame
 from flcav.sources.carla.recording.labels import Sight, Sweep, annotate
 from flcav.sources.carla.recording.sensors import (

@@ -9,7 +9,7 @@ from flcav.sources.carla.server.actors import Actor
 from flcav.sources.carla.server.catalogue import FLOAT, TRIGGER
 from flcav.sources.carla.server.wire import AckermannControl, VehicleControl
 from flcav.world.commands import Grip
-from flcav.world.dynamics.bodies import Body
+from flcav.world.dynamics.bodies import ControlledBody
 
 PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
 SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
@@ -32,7 +32,7 @@ def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
     return min(told["friction"], 1.0) if inside.all() else None
 
 
-def list_grips(actors: Collection[Actor], bodies: Iterable[Body]) -> list[Grip]:
+def list_grips(actors: Collection[Actor], bodies: Iterable[ControlledBody]) -> list[Grip]:
     """Return how the tyres of vehicles hold, by the last box of friction that each is in, where that has changed."""
     known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
     boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from flcav.sources.carla.server.actors import Actor
-from flcav.world.dynamics.blueprints import blueprint
+from flcav.world.dynamics.vehicle import make_blueprint
 from flcav.world.live import LiveWorld
 
 WHEEL_M = 0.35  # radius
@@ -16,7 +16,7 @@ STEERING = [[0.0, 1.0], [20.0, 0.9], [120.0, 0.7]]  # share of the angle over th
 
 def describe_physics(vehicle: Actor, world: LiveWorld) -> list[Any]:
     """Return a vehicle's physics: those of its size, and CARLA's defaults for what plays no part here."""
-    made = blueprint(vehicle.category, 0, vehicle.size)
+    made = make_blueprint(vehicle.category, 0, vehicle.size)
     steer = float(np.degrees(made.steer_limit_rad))
     wheels = []
     for front in (True, False):

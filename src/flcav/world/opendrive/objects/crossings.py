@@ -1,19 +1,91 @@
-"""Crossings of a town's net where the map has its crosswalks, in netconvert's plain files."""
+"""Crosswalks of an OpenDRIVE map, and the crossings that they become in a town's net, in netconvert's plain files.
+
+Crosswalks of an OpenDRIVE map: objects with an outline, and markings that are signals (OpenDRIVE 1.8, 13 and 14).
+"""
 
 import copy
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 from shapely.ops import substring
 
+from flcav.arrays import Array
 from flcav.world.map.roads import CARRIAGEWAY, Edge, Lane, RoadNet, read_net
-from flcav.world.opendrive.objects.crosswalks import Crosswalk
+from flcav.world.opendrive.objects.places import TakenOver, enclose_outline, locate_thing, outline_object, read_number
+from flcav.world.opendrive.road_surface import Road
 
-Array = NDArray[np.float64]
+PAINTED_CROSSWALK = "1000003"  # type of a signal that is a painted crosswalk: its width is that across the road,
+WIDE_M = (1.0, 15.0)  # its value that of the walkers' way; widths that are believed
+LONG_M = (2.0, 60.0)  # lengths of a crosswalk that are believed
+
+
+@dataclass(frozen=True)
+class Crosswalk:
+    """A crosswalk of the map, as the rectangle around it."""
+
+    centre: Array  # (2,) town [m]
+    axes: Array  # (2, 2) unit vectors along its sides, one a row
+    sides: Array  # (2,) lengths of these sides [m]
+
+    def along(self, walked: Array) -> tuple[Array, float, float]:
+        """Return the unit vector of the walkers' way, its length and its width [m].
+
+        It is that axis which is nearest to the direction `walked` (2,), and points along it.
+        """
+        share = self.axes @ walked
+        first = int(np.argmax(np.abs(share)))
+        return self.axes[first] * np.sign(share[first]), float(self.sides[first]), float(self.sides[1 - first])
+
+
+def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[Crosswalk]:
+    """Return the crosswalks of a map in town coordinates: map + `offset_m` [m]."""
+    found, left = [], Counter[str]()
+    for row in root.iterfind("road"):
+        named = [thing for thing in row.iterfind("objects/object") if thing.get("type") == "crosswalk"]
+        painted = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_CROSSWALK]
+        if not named and not painted:
+            continue
+        road = Road(row)
+        for outline in [outline_object(road, thing) for thing in named] + [_outline(road, one) for one in painted]:
+            if outline is None:
+                left["no place or outline"] += 1
+                continue
+            crosswalk = _enclose(outline + offset_m)
+            if crosswalk is None:
+                left["no size of a crosswalk"] += 1
+            else:
+                found.append(crosswalk)
+    return TakenOver(tuple(found), left)
+
+
+def _outline(road: Road, marking: ElementTree.Element) -> Array | None:
+    """Return the corners (4, 2) of a crosswalk that is a signal; None where it lacks its place or extents."""
+    place = locate_thing(road, marking)
+    across, along = read_number(marking, "width"), read_number(marking, "value")
+    if place is None or not (LONG_M[0] <= across <= LONG_M[1] and WIDE_M[0] <= along <= WIDE_M[1]):
+        return None
+    forward = np.array([np.cos(place[2]), np.sin(place[2])])
+    left = np.array([-forward[1], forward[0]])
+    return place[:2] + np.array([a * along / 2 * forward + b * across / 2 * left for a, b in CORNERS])
+
+
+CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
+
+
+def _enclose(outline: Array) -> Crosswalk | None:
+    """Return the smallest rectangle around an outline (K, 2); None where its sides are not those of a crosswalk."""
+    found = enclose_outline(outline)
+    if found is None:
+        return None
+    sides = found.sides
+    if not (WIDE_M[0] <= sides.min() <= WIDE_M[1] and LONG_M[0] <= sides.max() <= LONG_M[1]):
+        return None
+    return Crosswalk(found.centre, found.edges / sides[:, None], sides)
+
 
 NEAR_M = 8.0  # from a crosswalk to the crossing at a junction that it is
 ALIGNED = np.cos(np.radians(30.0))  # least cosine of the angle between them
@@ -54,7 +126,7 @@ def take_crosswalks(prefix: Path, net: Path, crosswalks: tuple[Crosswalk, ...]) 
 
 
 def _guesses(connections: ElementTree.Element, net: Path) -> list[_Guess]:
-    """Return the crossings of the plain connections with their middle lines, which the net alone has."""
+    """Return the crossings of the plain connections with their middle lines, which are read from the net."""
     lines: dict[tuple[str, frozenset[str]], Array] = {}
     for row in ElementTree.parse(net).getroot().iterfind("edge"):
         lane = row.find("lane")

@@ -2,15 +2,19 @@
 
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
+from collections import Counter
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
+from flcav.arrays import Array
 from flcav.world.opendrive.road_surface import Road
+
+Part = TypeVar("Part")
 
 LARGEST_M = 200.0  # farthest corner of an object from its place, or from the middle of its road
 
@@ -30,12 +34,12 @@ def repeat_object(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
             yield one
 
 
-def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64] | None:
+def outline_object(road: Road, thing: ElementTree.Element) -> Array | None:
     """Return the outline (K, 2) of an object in the map [m]: its corners, or its length and width; None without.
 
     Corners are in the object's own frame (u, v), which its heading turns against the road, or on the road (s, t).
     """
-    place = locate(road, thing)
+    place = locate_thing(road, thing)
     if place is None:
         return None
     corners = [*thing.iter("cornerLocal")]
@@ -55,15 +59,54 @@ def outline_object(road: Road, thing: ElementTree.Element) -> NDArray[np.float64
 
 
 @dataclass(frozen=True)
+class TakenOver(Generic[Part]):
+    """What a town takes over of one kind of a map's things, and how many things were left out, by the reason."""
+
+    found: tuple[Part, ...]
+    left: Counter[str]
+    taken: int | None = None  # how many things of the map these are; None: as many
+
+    def notes(self, what: str) -> list[str]:
+        """Return the sentence of `note_taken` about these things."""
+        return note_taken(what, len(self.found) if self.taken is None else self.taken, self.left)
+
+
+def note_taken(what: str, taken: int, left: Counter[str]) -> list[str]:
+    """Return a sentence on how many of a map's things were taken over, and why others were not; none without any."""
+    if not taken and not left:
+        return []
+    reasons = "".join(f"; left out: {count} ({reason})" for reason, count in sorted(left.items()))
+    return [f"{what} of the map taken over: {taken}{reasons}."]
+
+
+def list_objects(
+    root: ElementTree.Element, wanted: Callable[[ElementTree.Element], bool]
+) -> Iterator[tuple[Road, ElementTree.Element]]:
+    """Yield the objects of a map for which `wanted` holds, each with its road."""
+    for row in root.iterfind("road"):
+        things = [thing for thing in row.iterfind("objects/object") if wanted(thing)]
+        if things:
+            road = Road(row)
+            yield from ((road, thing) for thing in things)
+
+
+@dataclass(frozen=True)
 class Rectangle:
     """A rectangle in the plane, by its centre (2,), two edges (2, 2), one a row, and their lengths (2,) [m]."""
 
-    centre: NDArray[np.float64]
-    edges: NDArray[np.float64]
-    sides: NDArray[np.float64]
+    centre: Array
+    edges: Array
+    sides: Array
+
+    @property
+    def extents(self) -> tuple[float, float, float]:
+        """Return the longer and the shorter side [m], and the heading of the longer one [rad]."""
+        long = int(np.argmax(self.sides))
+        yaw = math.atan2(self.edges[long, 1], self.edges[long, 0])
+        return float(self.sides[long]), float(self.sides[1 - long]), yaw
 
 
-def enclose_outline(outline: NDArray[np.float64]) -> Rectangle | None:
+def enclose_outline(outline: Array) -> Rectangle | None:
     """Return the smallest rectangle around an outline (K, 2); None where it has no area."""
     rectangle = shapely.oriented_envelope(shapely.MultiPoint(outline))
     if not isinstance(rectangle, Polygon):
@@ -73,7 +116,7 @@ def enclose_outline(outline: NDArray[np.float64]) -> Rectangle | None:
     return Rectangle(corners[:4].mean(axis=0), edges, np.hypot(*edges.T))
 
 
-def locate(
+def locate_thing(
     road: Road, thing: ElementTree.Element, offset_m: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[float, float, float] | None:
     """Return x, y [m] and the road's heading [rad] where a thing stands; None where it says no place on the road."""

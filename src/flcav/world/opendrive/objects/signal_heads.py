@@ -4,23 +4,21 @@ import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
+from flcav.arrays import Array
 from flcav.config import shorten
 from flcav.geometry import heading_vectors, left_vectors
 from flcav.world.map.parameters import SignalParameters
-from flcav.world.map.roads import Connection, RoadNet
+from flcav.world.map.roads import LaneConnection, RoadNet
 from flcav.world.map.signals import ARM_HEAD_M, KERB_HEAD_M
-from flcav.world.opendrive.objects.places import locate, read_number
+from flcav.world.opendrive.objects.places import TakenOver, locate_thing, read_number
 from flcav.world.opendrive.road_surface import Road
 
-Array = NDArray[np.float64]
 Placed = tuple[ElementTree.Element, ElementTree.Element]  # a road, and a signal or a reference to one on it
 
 LIGHT, WALKERS = "1000001", "1000002"  # types of traffic lights: for vehicles, for pedestrians
@@ -36,15 +34,7 @@ KERB_M = 0.3  # from a mast to the road
 FARTHEST_M, STEP_M = 20.0, 0.25  # reach of an arm at most, and steps in which a place for its mast is sought
 
 
-@dataclass(frozen=True)
-class SignalHeads:
-    """The signal heads that a map describes, and how many were left out, by the reason."""
-
-    found: tuple[SignalParameters, ...]
-    left: Counter[str]
-
-
-def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> SignalHeads:
+def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> TakenOver[SignalParameters]:
     """Return the heads of the traffic lights of a map that stand at a light of `net`, town = map + `offset_m` [m].
 
     The way that a head is for follows from the roads that it, or a reference to it, is on. Its axis is that of the map,
@@ -60,7 +50,7 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
             if signal.get("dynamic") != "yes":
                 continue
             name, kind = signal.get("id", ""), signal.get("type", "")
-            place = locate(Road(row), signal, offset_m)
+            place = locate_thing(Road(row), signal, offset_m)
             if kind not in (LIGHT, WALKERS) or place is None:
                 head = "no place" if kind in (LIGHT, WALKERS) else f"of the type {shorten(kind)}"
             elif kind == WALKERS:
@@ -72,7 +62,7 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
                 left[head] += 1
             else:
                 found.append(head)
-    return SignalHeads(tuple(found), left)
+    return TakenOver(tuple(found), left)
 
 
 def _list_references(root: ElementTree.Element) -> dict[str, list[tuple[str, ElementTree.Element]]]:
@@ -96,7 +86,7 @@ class _Ways:
         self._road = shapely.union_all([LineString(lane.shape).buffer(lane.width / 2) for lane in lanes])
         shapely.prepare(self._road)
 
-    def find(self, references: list[Placed], own: Placed) -> Connection | None:
+    def find(self, references: list[Placed], own: Placed) -> LaneConnection | None:
         """Return the way that a signal is for: by its references in junctions, else by others, else by its own road.
 
         Of several from the street of the nearest one, the straight one is taken first.
@@ -116,7 +106,7 @@ class _Ways:
                 return min(own_street, key=lambda way: way.turn != "s")
         return None
 
-    def _nearest(self, start: Array, end: Array, *, inside: bool) -> tuple[float, Connection] | None:
+    def _nearest(self, start: Array, end: Array, *, inside: bool) -> tuple[float, LaneConnection] | None:
         """Return the way next to a road travelled from `start` to `end`, and how far it is [m].
 
         Outside junctions only the end counts; of the ways of one lane the straight one is taken.
@@ -134,7 +124,7 @@ class _Ways:
         nearest = min(rated, key=lambda item: item[:3], default=None)
         return None if nearest is None else (nearest[0], nearest[3])
 
-    def heading(self, way: Connection) -> Array:
+    def heading(self, way: LaneConnection) -> Array:
         """Return the unit vector in which traffic comes to the light of a way."""
         step = np.diff(self._lanes[way.start].shape[-2:], axis=0)[0]
         return step / max(float(np.hypot(*step)), 1e-9)
@@ -172,7 +162,11 @@ def _travelled(row: ElementTree.Element, signal: ElementTree.Element) -> Iterato
 
 
 def _place(
-    signal: ElementTree.Element, place: tuple[float, float, float], way: Connection | None, ways: _Ways, controller: str
+    signal: ElementTree.Element,
+    place: tuple[float, float, float],
+    way: LaneConnection | None,
+    ways: _Ways,
+    controller: str,
 ) -> SignalParameters | str:
     """Return the head of a signal at x, y and the road's heading, or the reason why there is none."""
     if way is None:

@@ -9,8 +9,9 @@ from typing import Literal
 from flcav.config import shorten
 from flcav.world.map.parameters import PostParameters, SignParameters
 from flcav.world.map.street_furniture import SIGN_HEIGHT_M, SPEED_SIGNS
-from flcav.world.opendrive.objects import crosswalks, stop_lines
-from flcav.world.opendrive.objects.places import locate, read_number, repeat_object
+from flcav.world.opendrive.objects.crossings import PAINTED_CROSSWALK
+from flcav.world.opendrive.objects.places import TakenOver, list_objects, locate_thing, read_number, repeat_object
+from flcav.world.opendrive.objects.stop_lines import PAINTED_STOP_LINE
 from flcav.world.opendrive.road_surface import Road
 
 SIGNS: dict[str, Literal["stop", "yield"]] = {"206": "stop", "205": "yield"}  # numbers of the German catalogue
@@ -19,24 +20,14 @@ KMH = {"km/h": 1.0, "mph": 1.609344, "m/s": 3.6}
 LIMITS_KMH = (5.0, 200.0)  # least and largest limit that is believed
 PLATE_M = (1.2, 4.5)  # heights at which a plate is believed to hang
 POST_M = (0.3, 15.0)  # heights of poles that are taken over
-PAINTED = (crosswalks.MARKING, stop_lines.MARKING)  # types of signals that are paint
+PAINTED = (PAINTED_CROSSWALK, PAINTED_STOP_LINE)  # types of signals that are paint
 
 
 @dataclass(frozen=True)
-class MappedSigns:
-    """The signs that a map describes, and how many were left out, by the reason."""
+class MappedSigns(TakenOver[SignParameters]):
+    """The signs of a map."""
 
-    found: tuple[SignParameters, ...]
-    left: Counter[str]
-    limits: bool  # whether the map has speed-limit signs, taken over or left out
-
-
-@dataclass(frozen=True)
-class Posts:
-    """The poles that a map describes, each repetition one, and how many were left out, by the reason."""
-
-    found: tuple[PostParameters, ...]
-    left: Counter[str]
+    limits: bool = False  # whether the map has speed-limit signs, taken over or left out
 
 
 def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> MappedSigns:
@@ -55,7 +46,7 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Mapp
             limits |= name == LIMIT_SIGN
             limit = read_limit(signal)
             kind = SIGNS.get(name) or _limit_kind(limit)
-            place = locate(road, signal, offset_m)
+            place = locate_thing(road, signal, offset_m)
             if kind is None:
                 left[f"of the type {shorten(name)}" if name != LIMIT_SIGN else _tell_limit(limit)] += 1
                 continue
@@ -74,27 +65,23 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Mapp
                     height_m=round(up, 2) if PLATE_M[0] <= up <= PLATE_M[1] else SIGN_HEIGHT_M,
                 )
             )
-    return MappedSigns(tuple(found), left, limits)
+    return MappedSigns(tuple(found), left, limits=limits)
 
 
-def find_posts(root: ElementTree.Element, offset_m: tuple[float, float]) -> Posts:
+def find_map_poles(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[PostParameters]:
     """Return the poles of a map with a height, in town coordinates: map + `offset_m` [m]."""
     found, left = [], Counter[str]()
-    for row in root.iterfind("road"):
-        road = Road(row)
-        for thing in row.iterfind("objects/object"):
-            height = read_number(thing, "height")
-            if thing.get("type") != "pole":
-                continue
-            for one in repeat_object(thing):
-                place = locate(road, one, offset_m)
-                if not POST_M[0] <= height <= POST_M[1]:
-                    left["no height of a pole"] += 1
-                elif place is None:
-                    left["no place on the road"] += 1
-                else:
-                    found.append(PostParameters(x=round(place[0], 3), y=round(place[1], 3), height_m=round(height, 2)))
-    return Posts(tuple(found), left)
+    for road, thing in list_objects(root, lambda thing: thing.get("type") == "pole"):
+        height = read_number(thing, "height")
+        for one in repeat_object(thing):
+            place = locate_thing(road, one, offset_m)
+            if not POST_M[0] <= height <= POST_M[1]:
+                left["no height of a pole"] += 1
+            elif place is None:
+                left["no place on the road"] += 1
+            else:
+                found.append(PostParameters(x=round(place[0], 3), y=round(place[1], 3), height_m=round(height, 2)))
+    return TakenOver(tuple(found), left)
 
 
 def read_limit(signal: ElementTree.Element) -> float | None:

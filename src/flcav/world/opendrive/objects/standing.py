@@ -1,32 +1,34 @@
-"""Buildings, trees, hedges, walls and railings of an OpenDRIVE map (OpenDRIVE 1.8, 13)."""
+"""Buildings, trees, hedges, walls, railings and parking spaces of an OpenDRIVE map (OpenDRIVE 1.8, 13)."""
 
 import math
 import xml.etree.ElementTree as ElementTree
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
+from shapely.geometry import LineString, Polygon
+from shapely.geometry.base import BaseGeometry
 
-from flcav.world.map.parameters import CLUTTER, ObjectParameters
-from flcav.world.map.roads import RoadNet
+from flcav.arrays import Array
+from flcav.world.map.parameters import CLUTTER, ObjectParameters, ParkingParameters
+from flcav.world.map.roads import LaneKind, RoadNet
+from flcav.world.map.street_furniture import outline_space
 from flcav.world.map.surfaces import make_footprint
-from flcav.world.opendrive.objects.parking_spaces import cover_lanes
 from flcav.world.opendrive.objects.places import (
     LARGEST_M,
     Rectangle,
+    TakenOver,
     enclose_outline,
-    locate,
+    list_objects,
+    locate_thing,
     outline_object,
     read_number,
     repeat_object,
 )
 from flcav.world.opendrive.road_surface import Road
 
-Array = NDArray[np.float64]
 Kind = Literal["building", "tree", "hedge", "wall", "fence", "railing", "cabinet"]
 
 KINDS: dict[str, Kind] = {  # by the type of an object; an obstacle is a box like a cabinet
@@ -45,34 +47,22 @@ LONGEST_M = 20_000.0  # over which an object goes on
 TOUCHED = 0.1  # share of a footprint that may lie on a lane
 
 
-@dataclass(frozen=True)
-class StandingObjects:
-    """The objects that stand beside the roads of a map, how many it has, and how many were left out, by the reason."""
-
-    found: tuple[ObjectParameters, ...]  # what goes on along a road in pieces
-    taken: int
-    left: Counter[str]
-
-
-def find_objects(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> StandingObjects:
+def find_standing_objects(
+    root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet
+) -> TakenOver[ObjectParameters]:
     """Return the objects of a map of `KINDS` that stand on no lane or sidewalk; town = map + `offset_m` [m]."""
     ways = cover_lanes(net, ("driving", "bicycle", "sidewalk", "walkingarea", "crossing"))
     shapely.prepare(ways)
     found: list[ObjectParameters] = []
     taken, left = 0, Counter[str]()
-    for row in root.iterfind("road"):
-        things = [thing for thing in row.iterfind("objects/object") if thing.get("type") in KINDS]
-        if not things:
-            continue
-        road = Road(row)
-        for thing in things:
-            for pieces in _list_copies(road, thing, np.array(offset_m)):
-                free = [piece for piece in pieces if not _stands_on(piece, ways)]
-                found += free
-                taken += bool(free)
-                if not free:
-                    left["on a lane or sidewalk" if pieces else "no place or size"] += 1
-    return StandingObjects(tuple(found), taken, left)
+    for road, thing in list_objects(root, lambda thing: thing.get("type") in KINDS):
+        for pieces in _list_copies(road, thing, np.array(offset_m)):
+            free = [piece for piece in pieces if not _stands_on(piece, ways)]
+            found += free
+            taken += bool(free)
+            if not free:
+                left["on a lane or sidewalk" if pieces else "no place or size"] += 1
+    return TakenOver(tuple(found), left, taken)
 
 
 def _stands_on(piece: ObjectParameters, ways: shapely.Geometry) -> bool:
@@ -124,7 +114,7 @@ def _go_along(
 
 def _stand(road: Road, thing: ElementTree.Element, kind: Kind, offset_m: Array) -> Iterator[ObjectParameters]:
     """Yield an object that stands at one place."""
-    place = locate(road, thing)
+    place = locate_thing(road, thing)
     if place is None:
         return
     heights = [read_number(corner, "height") for tag in ("cornerLocal", "cornerRoad") for corner in thing.iter(tag)]
@@ -137,15 +127,14 @@ def _stand(road: Road, thing: ElementTree.Element, kind: Kind, offset_m: Array) 
     if radius > 0:
         yield from _describe(kind, place[:2] + offset_m, place[2], (2 * radius, 2 * radius), top)
     elif found is not None:
-        long = int(np.argmax(found.sides))
-        yaw = math.atan2(found.edges[long, 1], found.edges[long, 0])
-        yield from _describe(kind, found.centre, yaw, (float(found.sides[long]), float(found.sides[1 - long])), top)
+        length, width, yaw = found.extents
+        yield from _describe(kind, found.centre, yaw, (length, width), top)
 
 
 def _describe(
     kind: Kind, centre: Array, yaw: float, sides: tuple[float, float], height: float
 ) -> Iterator[ObjectParameters]:
-    """Yield an object of these extents [m] and heading [rad]; none where they are not believed."""
+    """Yield an object of these extents [m] and heading [rad]; none where they are implausible."""
     if SIDE_M[0] <= min(sides) and max(sides) <= SIDE_M[1] and HEIGHT_M[0] <= height <= HEIGHT_M[1]:
         yield ObjectParameters(
             kind=kind,
@@ -156,3 +145,61 @@ def _describe(
             width_m=round(sides[1], 2),
             height_m=round(height, 2),
         )
+
+
+LENGTH_M, WIDTH_M = (3.0, 20.0), (1.7, 6.0)  # extents that are believed
+
+
+def find_parking(
+    root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet
+) -> TakenOver[ParkingParameters]:
+    """Return the parking spaces of a map beside the lanes of `net`, in town coordinates: map + `offset_m` [m]."""
+    found: list[ParkingParameters] = []
+    left = Counter[str]()
+    driven, walked = cover_lanes(net, ("driving", "bicycle")), cover_lanes(net, ("sidewalk", "walkingarea", "crossing"))
+    taken: list[Polygon] = []
+    for road, each in list_objects(root, lambda thing: thing.get("type") == "parkingSpace"):
+        for thing in repeat_object(each):
+            outline = outline_object(road, thing)
+            space = None if outline is None else _enclose(outline + offset_m)
+            if space is None:
+                left["no place or size of a parking space"] += 1
+                continue
+            shape = outline_space(space)
+            if shape.intersection(driven).area > TOUCHED * shape.area:
+                left["on a lane for vehicles"] += 1
+            elif shape.intersection(walked).area > TOUCHED * shape.area:
+                left["on a sidewalk"] += 1
+            elif any(shape.intersection(other).area > TOUCHED * shape.area for other in taken):
+                left["on another one"] += 1
+            else:
+                found.append(space)
+                taken.append(shape)
+    return TakenOver(tuple(found), left)
+
+
+def cover_lanes(net: RoadNet, kinds: tuple[LaneKind, ...]) -> BaseGeometry:
+    """Return the area of all lanes of these kinds [m]."""
+    lanes = [lane for edge in net.edges.values() for lane in edge.lanes if lane.kind in kinds and len(lane.shape) > 1]
+    areas = [
+        shapely.make_valid(Polygon(lane.shape))
+        if lane.kind == "walkingarea" and len(lane.shape) > 2
+        else LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
+        for lane in lanes
+    ]
+    return shapely.union_all(areas)
+
+
+def _enclose(outline: np.ndarray) -> ParkingParameters | None:
+    """Return the smallest rectangle around an outline (K, 2) as a space; None where it is none for a vehicle."""
+    found = enclose_outline(outline)
+    if found is None:
+        return None
+    length, width, yaw = found.extents
+    if not (LENGTH_M[0] <= length <= LENGTH_M[1] and WIDTH_M[0] <= width <= WIDTH_M[1]):
+        return None
+    x, y = found.centre.tolist()
+    turned = round(math.degrees(yaw) % 360.0, 2)
+    return ParkingParameters(
+        x=round(x, 3), y=round(y, 3), yaw_deg=turned, length_m=round(length, 2), width_m=round(width, 2)
+    )

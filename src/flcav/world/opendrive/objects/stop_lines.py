@@ -9,17 +9,15 @@ from pathlib import Path
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 
+from flcav.arrays import Array
 from flcav.world.map.parameters import StopLineParameters
 from flcav.world.map.roads import Lane, RoadNet
-from flcav.world.opendrive.objects.places import locate, outline_object
+from flcav.world.opendrive.objects.places import TakenOver, locate_thing, outline_object
 from flcav.world.opendrive.road_surface import Road
 
-Array = NDArray[np.float64]
-
-MARKING = "294"  # type of a signal that is a painted stop line: its number in the German catalogue
+PAINTED_STOP_LINE = "294"  # type of a signal that is a painted stop line: its number in the German catalogue
 SUBTYPE = "signalLines"  # of an object `roadMark` that is one
 WIDE_M = (1.5, 30.0)  # lengths of a line that are believed
 STOPPED = ("driving", "bicycle")  # lanes with stop lines
@@ -29,15 +27,6 @@ GAP_M = 1.0  # from a vehicle that stops to a line, SUMO's usual distance
 BEFORE_CROSSING_M = 0.6  # from the middle of a line to the crossing behind it
 ASKEW = math.cos(math.radians(60.0))  # of the least angle between a line and its lane
 AHEAD = math.cos(math.radians(30.0))  # of the largest angle between a lane and the direction a signal is for
-
-
-@dataclass(frozen=True)
-class StopLines:
-    """The stop lines that a map describes, one for each lane, how many lines these were, and how many were left out."""
-
-    found: tuple[StopLineParameters, ...]
-    taken: int
-    left: Counter[str]  # by the reason
 
 
 @dataclass(frozen=True)
@@ -58,7 +47,9 @@ class _Crossed:
     aside_m: float  # from where the line is described
 
 
-def find_stop_lines(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> StopLines:
+def find_stop_lines(
+    root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet
+) -> TakenOver[StopLineParameters]:
     """Return the stop lines of a map at the ends of the lanes of `net`, town = map + `offset_m` [m]."""
     found: dict[str, float] = {}
     taken, left = 0, Counter[str]()
@@ -79,13 +70,13 @@ def find_stop_lines(root: ElementTree.Element, offset_m: tuple[float, float], ne
                 taken += 1
                 found |= {each.lane: each.before_end_m for each in lanes if each.lane not in found}
     rows = (StopLineParameters(lane=lane, before_end_m=round(found[lane], 2)) for lane in found)
-    return StopLines(tuple(rows), taken, left)
+    return TakenOver(tuple(rows), left, taken)
 
 
 def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | None]:
-    """Yield the stop lines along one road of the map; None for one that does not say enough."""
+    """Yield the stop lines along one road of the map; None for one without place or length."""
     things = [thing for thing in row.iterfind("objects/object") if _is_stop_line(thing)]
-    signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == MARKING]
+    signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_STOP_LINE]
     if not things and not signals:
         return
     road = Road(row)
@@ -99,7 +90,7 @@ def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | N
         believed = WIDE_M[0] <= apart[i, j] <= WIDE_M[1]
         yield _Line(outline[[i, j]] + offset_m, None) if believed else None
     for signal in signals:
-        place = locate(road, signal)
+        place = locate_thing(road, signal)
         if place is None:
             yield None
             continue

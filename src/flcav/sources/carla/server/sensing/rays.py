@@ -1,7 +1,7 @@
 """CARLA's LiDARs and its radar: points in the sensor's left-handed frame.
 
 A LiDAR fires points_per_second over its channels, from the highest, evenly over the angle that it turns by in the time
-since its last sweep. Its intensity is exp(-a distance), and it loses returns as in `flcav.sensors.lidar.beams`. The
+since its last sweep. Its intensity is exp(-a distance), and it loses returns as in `flcav.sensors.lidar.lidar`. The
 radar's rays are random within its field of view; each gives the range rate of what it meets.
 """
 
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import unit_vectors
-from flcav.sensors.lidar.beams import CarlaReturns, carla_returns
+from flcav.sensors.lidar.lidar import CarlaReturns, carla_returns
 from flcav.sources.carla.frames import mirror
 from flcav.sources.carla.server.sensing.sight import Sensor, Sight
 from flcav.sources.carla.server.wire import SEMANTIC_POINT, pack_sweep
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 
 MOST_RAYS = 4_000_000  # of one sweep
 

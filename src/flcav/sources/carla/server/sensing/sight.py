@@ -9,14 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import inverse
-from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
+from flcav.sensors.camera import Camera, Exposure, label, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.sources.carla.frames import MapFrame
 from flcav.sources.carla.server.catalogue import Quality
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
-from flcav.world.rays.hits import Hits
+from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.weather import Weather

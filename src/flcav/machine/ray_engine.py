@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import Any, Concatenate, Generic, ParamSpec, TypeVar, TypeVarTuple
 
 from flcav.config import InputError
-from flcav.interface.extras import format_install_command
+from flcav.interface.wording import format_install_command
 from flcav.machine.processes import KILLED
 from flcav.machine.threads import VARIABLES
 
@@ -22,12 +22,12 @@ Given = ParamSpec("Given")
 Arguments = TypeVarTuple("Arguments")
 
 STORE_BYTES = 128_000_000  # object store of a Ray started here: only jobs and pieces of files pass through it
-CALLS = 3  # that an actor answers at the same time: it works, tells how far it is, and leaves
+CALLS = 3  # concurrent calls of an actor: its work, its progress, and its end
 LEAVING_S = 5.0  # for actors to leave before they are killed
 
 
 @dataclass(frozen=True)
-class Actor(Generic[Kind]):
+class RayActor(Generic[Kind]):
     """A handle to an actor: an object of the class `Kind` in a process of its own, on some machine."""
 
     _ray: ModuleType
@@ -50,20 +50,20 @@ class Actor(Generic[Kind]):
 class ActorPool(Generic[Kind]):
     """A pool of actors, each driven by a thread of this process."""
 
-    def __init__(self, actors: Iterable[Actor[Kind]], threads: ThreadPoolExecutor) -> None:
+    def __init__(self, actors: Iterable[RayActor[Kind]], threads: ThreadPoolExecutor) -> None:
         self._threads = threads
-        self._idle: SimpleQueue[Actor[Kind]] = SimpleQueue()
+        self._idle: SimpleQueue[RayActor[Kind]] = SimpleQueue()
         for actor in actors:
             self._idle.put(actor)
 
-    def lend(self, use: Callable[[Actor[Kind]], Result]) -> Future[Result]:
+    def lend(self, use: Callable[[RayActor[Kind]], Result]) -> Future[Result]:
         """Call `use` in a thread, with an actor that is idle then.
 
         The future raises what the actor's methods raise, and `OSError` where the actor was killed.
         """
         return self._threads.submit(self._lend, use)
 
-    def _lend(self, use: Callable[[Actor[Kind]], Result]) -> Result:
+    def _lend(self, use: Callable[[RayActor[Kind]], Result]) -> Result:
         from ray.exceptions import RayActorError, RayTaskError  # pyright: ignore[reportMissingImports]
 
         actor = self._idle.get()
@@ -88,7 +88,7 @@ def actor_pool(jobs: int, kind: Callable[[*Arguments], Kind], *arguments: *Argum
         shared = [ray.put(each) for each in arguments]
         handles = [remote.remote(*shared) for _ in range(jobs)]
         try:
-            yield ActorPool([Actor(ray, handle) for handle in handles], threads)
+            yield ActorPool([RayActor(ray, handle) for handle in handles], threads)
         finally:
             threads.shutdown(wait=False, cancel_futures=True)
             if leaving := [handle.leave.remote() for handle in handles if hasattr(kind, "leave")]:
@@ -114,12 +114,7 @@ def ray_session(jobs: int, asked: str = "--engine ray") -> Iterator[ModuleType]:
     if "RAY_ADDRESS" not in os.environ:
         local = {"num_cpus": jobs, "object_store_memory": STORE_BYTES, "include_dashboard": False}
         variables["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))  # workers find modules as this process does
-    ray.init(
-        **local,
-        runtime_env={"env_vars": variables},
-        log_to_driver=False,
-        logging_level=logging.ERROR,
-    )
+    ray.init(**local, runtime_env={"env_vars": variables}, log_to_driver=False, logging_level=logging.ERROR)
     try:
         yield ray
     finally:

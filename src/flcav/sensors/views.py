@@ -1,18 +1,110 @@
-"""Amodal 2-D boxes: bounding rectangles of actors' projected convex hulls, exact for lenses without distortion."""
+"""Image annotations of actors: visible pixels, visible and amodal boxes, truncation, occlusion.
+
+Amodal 2-D boxes: bounding rectangles of actors' projected convex hulls, exact for lenses without distortion.
+"""
 
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
+from flcav.arrays import Array, Ints, Ints32, Mask
 from flcav.geometry import inverse, transform_points
-from flcav.sensors.lens import Lens, project, unproject
+from flcav.machine.compiled import compiled
+from flcav.sensors.frame import Views
+from flcav.sensors.lens import Lens, compute_pixel_rays, project_optical, unproject
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 
-Array = NDArray[np.float64]
+OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outermost pixels
+SAMPLES = 4096  # pixels sampled of an amodal box for its occlusion, about; of larger ones every n-th row and column
+
+
+class Regions(NamedTuple):
+    """Pixel counts and bounding boxes of K instances in an image."""
+
+    pixels: Ints  # (K,) number of pixels
+    box: Array  # (K, 4) x1 y1 x2 y2 [px], to the pixels' outer edges; NaN where there are none
+
+
+def find_actor_regions(instance: Ints32, count: int) -> Regions:
+    """Return the regions of actors 0 to `count` - 1, whose values in the `instance` image (H, W) are 1 to `count`."""
+    return _regions(instance, count, 1)
+
+
+def find_thing_regions(instance: Ints32, count: int) -> Regions:
+    """Return the regions of things 0 to `count` - 1, whose values in the `instance` image (H, W) are -1 to -`count`."""
+    return _regions(instance, count, -1)
+
+
+def _regions(instance: Ints32, count: int, sign: int) -> Regions:
+    pixels = np.zeros(count + 1, np.int64)
+    box = np.empty((count + 1, 4))
+    box[:, :2], box[:, 2:] = np.inf, -np.inf
+    _collect(instance, sign, pixels, box)
+    box[pixels == 0] = np.nan
+    return Regions(pixels[1:], box[1:] + OUTER_EDGES)
+
+
+@compiled
+def _collect(instance, sign, pixels, box):
+    for v in range(instance.shape[0]):
+        for u in range(instance.shape[1]):
+            number = instance[v, u] * sign
+            if number > 0:
+                pixels[number] += 1
+                box[number, 0] = min(box[number, 0], u)
+                box[number, 1] = min(box[number, 1], v)
+                box[number, 2] = max(box[number, 2], u)
+                box[number, 3] = max(box[number, 3], v)
+
+
+def view_actors(
+    scene: Scene, world_from_camera: Array, lens: Lens, instance: Ints32, regions: Regions, actors: Ints
+) -> Views:
+    """Return the image annotations of `actors` (M,): 2-D boxes, pixels, truncation and occlusion.
+
+    `instance` (H, W) is a + 1 at the scene's actor a, `regions` are those of all the scene's actors. The scene is at
+    the instant of the image. Occlusion compares an image's pixels with rays cast at the actor alone.
+    """
+    box = compute_amodal_boxes(scene, world_from_camera, lens, actors)
+    occlusion = np.ones(len(actors))
+    inside = clip_boxes(box, lens)
+    for row in np.flatnonzero(regions.pixels[actors]):  # the occlusion of the others is 1
+        actor = int(actors[row])
+        sampled = _sampled(inside[row])
+        visible = np.count_nonzero(instance[np.ix_(*sampled)] == actor + 1)
+        unoccluded = _unoccluded(scene, world_from_camera, lens, actor, sampled)
+        if visible and unoccluded:
+            occlusion[row] = 1 - min(visible / unoccluded, 1.0)
+    return Views(
+        amodal_box=box,
+        visible_box=regions.box[actors],
+        pixels=regions.pixels[actors],
+        truncation=compute_truncation(box, lens),
+        occlusion=occlusion,
+    )
+
+
+def _sampled(box: Array) -> tuple[Ints, Ints]:
+    """Return the rows and the columns of the pixels sampled for the occlusion of an actor with the `box` (4,)."""
+    x1, y1, x2, y2 = box
+    step = max(1, int(np.sqrt((x2 - x1) * (y2 - y1) / SAMPLES)))
+    first_column, first_row = int(np.ceil(x1)), int(np.ceil(y1))
+    return np.arange(first_row, int(np.floor(y2)) + 1, step), np.arange(first_column, int(np.floor(x2)) + 1, step)
+
+
+def _unoccluded(scene: Scene, world_from_camera: Array, lens: Lens, actor: int, sampled: tuple[Ints, Ints]) -> int:
+    """Return the number of sampled pixels that show the actor in an empty world."""
+    rows, columns = sampled
+    rays = compute_pixel_rays(lens).reshape(lens.height, lens.width, 3)[np.ix_(rows, columns)].reshape(-1, 3)
+    if not len(rays):
+        return 0
+    body_from_camera = inverse(scene.world_from_actor(actor)) @ world_from_camera
+    hits = scene.cast_each(np.array([actor]), body_from_camera[None], np.array([len(rays)]), rays)
+    return int(np.count_nonzero(hits.face >= 0))
+
 
 NEAR_M = 0.1  # depth of the near plane, at which actors are clipped
 BOX_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
@@ -23,7 +115,7 @@ class Hull(NamedTuple):
     """The vertices and edges of a mesh's convex hull."""
 
     vertices: Array  # (V, 3) body frame [m]
-    edges: NDArray[np.int64]  # (E, 2) indices of vertices
+    edges: Ints  # (E, 2) indices of vertices
 
 
 @lru_cache(maxsize=256)
@@ -38,7 +130,7 @@ def hull(category: str, shape: int, size: tuple[float, ...] | None = None) -> Hu
 
 
 def compute_amodal_boxes(
-    scene: Scene, world_from_camera: Array, lens: Lens, actors: NDArray[np.int64], near_m: float = NEAR_M
+    scene: Scene, world_from_camera: Array, lens: Lens, actors: Ints, near_m: float = NEAR_M
 ) -> Array:
     """Return the amodal 2-D boxes (M, 4) x1 y1 x2 y2 [px] of `actors` (M,), around all that is beyond the near plane.
 
@@ -80,7 +172,7 @@ def _area(boxes: Array) -> Array:
     return (boxes[:, 2] - boxes[:, 0]) * (boxes[:, 3] - boxes[:, 1])
 
 
-def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: Ints) -> Mask:
     """Return (M,) whether each actor's bounding sphere touches the camera's viewing frustum (frustum culling)."""
     trace, index = scene.trace, scene.index
     size = trace.size[actors]
@@ -100,7 +192,7 @@ def _border(lens: Lens) -> Array:
     return np.concatenate((*across, *(np.column_stack((np.full(9, edge), v)) for edge in (0, lens.width - 1))))
 
 
-def clip_in_front(points: Array, edges: NDArray[np.int64], near_m: float) -> Array:
+def clip_in_front(points: Array, edges: Ints, near_m: float) -> Array:
     """Return the vertices (V, 3) of a hull clipped to z >= `near_m`: those beyond, and edges' cuts with the plane."""
     ahead = points[:, 2] >= near_m
     one, other = (points[end] for end in edges[ahead[edges[:, 0]] != ahead[edges[:, 1]]].T)
@@ -115,7 +207,7 @@ def _project(lens: Lens, points: Array) -> Array:
         radius = np.linalg.norm(plane, axis=1, keepdims=True)
         plane = plane * np.minimum(1, BEYOND_IMAGE * _image_radius(lens) / np.maximum(radius, 1e-9))
         points = np.concatenate((plane, np.ones((len(plane), 1))), axis=1)
-    return project(lens, points)
+    return project_optical(lens, points)
 
 
 def _image_radius(lens: Lens) -> float:
@@ -133,10 +225,10 @@ def outline_boxes(corners: Array, lens: Lens, world_from_camera: Array) -> tuple
     corners = transform_points(inverse(world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)
     ahead = (corners[:, :, 2] >= NEAR_M).sum(axis=1)
     whole = ahead == 8
-    pixels = project(lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
+    pixels = project_optical(lens, corners[whole].reshape(-1, 3)).reshape(-1, 8, 2)
     amodal[whole] = np.concatenate((pixels.min(axis=1), pixels.max(axis=1)), axis=1)
     for row in np.flatnonzero((ahead > 0) & ~whole):  # the others are behind the camera
-        pixels = project(lens, clip_in_front(corners[row], BOX_EDGES, NEAR_M))
+        pixels = project_optical(lens, clip_in_front(corners[row], BOX_EDGES, NEAR_M))
         amodal[row] = *pixels.min(axis=0), *pixels.max(axis=0)
     truncation = compute_truncation(amodal, lens)
     amodal[truncation == 1] = np.nan

@@ -18,20 +18,18 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.ndimage import gaussian_filter
 
+from flcav.arrays import Array, Array32, Bytes
 from flcav.machine.compiled import compiled
 from flcav.sensors.lens import Lens, compute_pixel_rays
-from flcav.sensors.rendering.ambient_occlusion import compute_ambient_occlusion
 from flcav.sensors.rendering.appearance import Appearance, build_appearance
 from flcav.sensors.rendering.facade import shade_facade
 from flcav.sensors.rendering.gbuffer import GBuffer, fill_gbuffer
-from flcav.sensors.rendering.light import compute_light, compute_sun_visibility, soften
+from flcav.sensors.rendering.light import compute_ambient_occlusion, compute_light, compute_sun_visibility, soften
 from flcav.sensors.rendering.noise import sample_noise
 from flcav.world.materials import Material
 from flcav.world.scene import Scene
 from flcav.world.static import TownPart
 from flcav.world.weather import Weather
-
-Array = NDArray[np.float64]
 
 FAR_M = 1000.0
 KELVIN_STEP = 0.01  # quantisation of a thermal image
@@ -139,7 +137,7 @@ def air_temperature(weather: Weather) -> float:
     return float(286.0 + warm - 2.5 * weather.cloud_cover * (warm > 0) - min(weather.rain_mm_h / 10.0, 1.0) * 2.0)
 
 
-def sky_temperature(weather: Weather, rise: NDArray[np.float32] | float) -> Array:
+def sky_temperature(weather: Weather, rise: Array32 | float) -> Array:
     """Return the apparent temperature of the sky [K] at the elevation whose sine is `rise`; clouds are warmer."""
     clear = 42.0 * np.clip(rise, 0, 1) ** 0.5 + 6.0
     return air_temperature(weather) - clear * (1 - 0.85 * weather.cloud_cover)
@@ -151,14 +149,14 @@ def _sunshine(weather: Weather) -> float:
     return float(np.clip(height * 3, 0, 1) * (1 - 0.85 * np.clip((weather.cloud_cover - 0.3) / 0.6, 0, 1)))
 
 
-def _living(seen: GBuffer, material: NDArray[np.uint8], air: float) -> Array:
+def _living(seen: GBuffer, material: Bytes, air: float) -> Array:
     """Return (N,) how much warmer than the air skin and clothes are [K]; 0 for other surfaces."""
     body = _BODY[material] + 273.15
     clothed = np.where(material == Material.SKIN, 1.0, 0.7)
     return np.where(np.isnan(body) | (seen.instance < 1), 0.0, clothed * (body - air))
 
 
-def _driving(scene: Scene, seen: GBuffer, material: NDArray[np.uint8], lamps_on: bool) -> Array:
+def _driving(scene: Scene, seen: GBuffer, material: Bytes, lamps_on: bool) -> Array:
     """Return (N,) how much warmer the parts of vehicles in traffic are than when parked [K]; 0 for other surfaces."""
     trace = scene.trace
     warm = np.zeros(len(seen))
@@ -177,9 +175,7 @@ def _driving(scene: Scene, seen: GBuffer, material: NDArray[np.uint8], lamps_on:
     return warm
 
 
-def _texture_of(
-    seen: GBuffer, appearance: Appearance, infrared: Infrared
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _texture_of(seen: GBuffer, appearance: Appearance, infrared: Infrared) -> tuple[Array32, Array32]:
     """Return each pixel's share (N,) of window panes and its noise of temperature (N,), -0.5 to 0.5."""
     pane, patch = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
     _texture(seen, appearance, np.float32(1 / infrared.intrinsics()[0, 0]), pane, patch)

@@ -1,4 +1,8 @@
-"""Radar cross-sections at 77 GHz, and a Swerling 1 detector over resolution cells.
+"""Simulation of a 77 GHz radar: ray casting, cross-sections, resolution cells, detection and false alarms.
+
+Only direct echoes of the first surface are modelled: no multipath over the road, nothing behind glass.
+
+Radar cross-sections at 77 GHz, and a Swerling 1 detector over resolution cells.
 
 Mean cross-sections of actors are those commonly measured at 76 to 81 GHz (pedestrian -8 dBsm: Yamada et al., 2005; cars
 10 dBsm with flashes off flat front, rear and sides: Schipper et al., 2011). An actor's cross-section is spread evenly
@@ -15,14 +19,17 @@ with the square root of the power.
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from flcav.arrays import Array, Array32, Bytes, Ints, Ints32, Words
 from flcav.config import Config
+from flcav.geometry import unit_vectors
 from flcav.world.materials import Material
+from flcav.world.rays.packets import Hits
+from flcav.world.scene import Scene
 from flcav.world.trace import CATEGORIES
+from flcav.world.weather import Weather
 
-Array = NDArray[np.float64]
 FLASH = 24.0  # exponent of the cosine of a flash's angle: about 27 degrees wide at half its decibels
 LYING = (Material.GROUND, Material.ROAD, Material.SIDEWALK)  # horizontal surfaces: constant-gamma clutter
 TOWN_DB: dict[Material, float] = {
@@ -69,7 +76,7 @@ _CATEGORIES = (*CATEGORIES, "prop")
 _ACTOR = np.array([*(ACTOR_RCS[category] for category in CATEGORIES), PROP_RCS])
 
 
-def compute_actor_rcs(category: NDArray[np.str_], aspect: Array) -> Array:
+def compute_actor_rcs(category: Words, aspect: Array) -> Array:
     """Return (K,) mean radar cross-sections [m^2] of whole, unoccluded actors.
 
     `category` (K,) are their classes, `aspect` (K,) the direction to the radar [rad], counter-clockwise from ahead.
@@ -85,7 +92,7 @@ def silhouette(size: Array, aspect: Array) -> Array:
     return (length * np.abs(np.sin(aspect)) + width * np.abs(np.cos(aspect))) * height
 
 
-def compute_town_rcs(material: NDArray[np.uint8], cosine: Array) -> Array:
+def compute_town_rcs(material: Bytes, cosine: Array) -> Array:
     """Return (K,) cross-sections per projected area of the town's surfaces, by material and `cosine` of incidence."""
     glint = 1 + (10 ** (GLINT_DB / 10) - 1) * cosine**GLINT
     return _TOWN[material] * np.where(_LIES[material], 1.0, glint)
@@ -124,10 +131,10 @@ class Cells(NamedTuple):
 
     values: Array  # (C, 4) as in `Radar.extent`: means weighted by cross-section
     sigma: Array  # (C,) sum of the cross-sections [m^2]
-    actor: NDArray[np.int64]  # (C,) that of the largest cross-section; -1 for the town
+    actor: Ints  # (C,) that of the largest cross-section; -1 for the town
 
 
-def resolve(values: Array, sigma: Array, actor: NDArray[np.int32], radar: Radar) -> Cells:
+def resolve_cells(values: Array, sigma: Array, actor: Ints32, radar: Radar) -> Cells:
     """Return the resolution cells that hold N echoes, which are summed up by cell.
 
     `values` (N, 4) are range [m], azimuth [rad], elevation [rad] and Doppler [m/s] of the echoes, `sigma` (N,) their
@@ -160,7 +167,7 @@ def snr_per_m2(radar: Radar, values: Array, rain_mm_h: float) -> Array:
     return at_reference / REFERENCE_M2 * (radar.detects_car_m / distance) ** 4 * 10 ** ((gain_db - loss_db) / 10)
 
 
-def detect(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> tuple[Array, NDArray[np.int64]]:
+def detect_cells(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> tuple[Array, Ints]:
     """Return the detections (M, 5) among `cells` and their actors (M,).
 
     A detection is range [m], azimuth [rad], elevation [rad], Doppler [m/s], all with errors, and cross-section [dBsm].
@@ -179,10 +186,110 @@ def detect(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generato
 
 
 def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Array:
-    """Return M false alarms (M, 5), columns as in `detect`: cells whose noise alone exceeds the threshold (Poisson)."""
+    """Return M false alarms (M, 5), as `detect_cells`: a Poisson number of cells, at random places."""
     low, high = radar.extent().T
     cells = np.prod(np.ceil((high - low) / radar.resolution()))
     count = rng.poisson(cells * radar.false_alarm_rate)
     values = rng.uniform(low, high, (count, 4))
     power = -np.log(radar.false_alarm_rate) + rng.standard_exponential(count)
     return np.column_stack((values, 10 * np.log10(power / snr_per_m2(radar, values, rain_mm_h))))
+
+
+RAYS_PER_CELL = 3  # along azimuth, and as many along elevation
+LIMBS_M_S = {"pedestrian": 0.5, "bicycle": 0.5}  # standard deviation of limbs' speeds (micro-Doppler)
+
+
+def sweep_radar(
+    scene: Scene,
+    world_from_radar: Array,
+    velocity: Array,
+    radar: Radar,
+    rng: np.random.Generator,
+    *,
+    hidden: int | None = None,
+    weather: Weather | None = None,
+) -> tuple[Array32, Ints32]:
+    """Return the detections of one radar sweep, nearest first, and the actor of each.
+
+    Detections (N, 5) are range [m], azimuth [rad, to the left], elevation [rad, upwards], Doppler [m/s, positive where
+    the distance grows] and radar cross-section [dBsm]. Actors (N,) are the trace's, by the largest share of the echo;
+    -1 for the town and for false alarms. `velocity` (3,) is the radar's [m/s, world frame], `hidden` the carrier.
+    """
+    directions, solid_angle = draw_rays(radar, rng)
+    hits = scene.cast(world_from_radar, directions, far_m=radar.range_m, hidden=hidden)
+    met = np.flatnonzero(hits.instance >= 0)
+    hits = Hits(hits.distance[met], hits.instance[met], hits.face[met])
+    ahead = directions[met].astype(np.float64)
+    sigma = cross_sections(scene, world_from_radar, ahead, hits, solid_angle[met])
+    speed = _range_rates(scene, world_from_radar, ahead, hits, velocity, rng)
+    away = hits.distance.astype(np.float64)
+    values = np.column_stack((away, np.arctan2(ahead[:, 1], ahead[:, 0]), np.arcsin(ahead[:, 2]), speed))
+    cells = resolve_cells(values, sigma, hits.instance - 1, radar)
+    rain = weather.rain_mm_h if weather else 0.0
+    measured, actor = detect_cells(cells, radar, rain, rng)
+    alarms = false_alarms(radar, rain, rng)
+    everything = np.concatenate((measured, alarms)).astype(np.float32)
+    owner = np.concatenate((actor, np.full(len(alarms), -1))).astype(np.int32)
+    order = np.argsort(everything[:, 0], kind="stable")
+    return everything[order], owner[order]
+
+
+def compute_echo_directions(echoes: Array32) -> Array:
+    """Return (N, 3) unit vectors from the radar to the detections (N, 5) of a sweep, radar frame."""
+    azimuth, elevation = echoes[:, 1:3].T.astype(np.float64)
+    return unit_vectors(azimuth, elevation)
+
+
+def draw_rays(radar: Radar, rng: np.random.Generator) -> tuple[Array32, Array]:
+    """Return N unit rays (N, 3), one at random in each cell of a grid over the field of view, and cells' (N,) [sr]."""
+    _, (left, right), (low, high), _ = radar.extent()
+    _, azimuth_cell, elevation_cell, _ = radar.resolution()
+    columns = int(np.ceil((right - left) / azimuth_cell * RAYS_PER_CELL))
+    rows = int(np.ceil((high - low) / elevation_cell * RAYS_PER_CELL))
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    azimuth = left + (column + rng.random(len(column))) * (right - left) / columns
+    elevation = low + (row + rng.random(len(row))) * (high - low) / rows
+    solid_angle = np.cos(elevation) * ((right - left) / columns) * ((high - low) / rows)
+    return unit_vectors(azimuth, elevation).astype(np.float32), solid_angle
+
+
+def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, solid_angle: Array) -> Array:
+    """Return (N,) radar cross-sections [m^2] of the surface patches that N rays hit.
+
+    `ahead` (N, 3) are the rays in the radar's frame, `solid_angle` (N,) [sr] what each stands for: its patch has the
+    projected area solid angle * distance^2.
+    """
+    surfaces = scene.surfaces
+    row = surfaces.first[hits.instance] + hits.face
+    turn = world_from_radar[:3, :3].T @ scene.world_from_instance()
+    normal = np.einsum("nij,nj->ni", turn[hits.instance], surfaces.normal[row].astype(np.float64))
+    cosine = np.abs((normal * ahead).sum(axis=1))
+    per_area = compute_town_rcs(surfaces.material[row], cosine)
+
+    moving = hits.instance > 0
+    seen, which = np.unique(hits.instance[moving] - 1, return_inverse=True)
+    x, y, _, yaw = scene.poses()[seen].T
+    aspect = np.arctan2(world_from_radar[1, 3] - y, world_from_radar[0, 3] - x) - yaw
+    category, size = scene.trace.category[seen], scene.trace.size[seen]
+    per_area[moving] = (compute_actor_rcs(category, aspect) / silhouette(size, aspect))[which]
+    return per_area * solid_angle * hits.distance.astype(np.float64) ** 2
+
+
+def _range_rates(
+    scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, velocity: Array, rng: np.random.Generator
+) -> Array:
+    """Return (N,) range rates [m/s] of the surface points that N rays hit, positive where the distance grows."""
+    trace, index = scene.trace, scene.index
+    limbs = np.array([LIMBS_M_S.get(str(category), 0.0) for category in trace.category])
+    line = ahead @ world_from_radar[:3, :3].T
+    moving = np.flatnonzero(hits.instance > 0)
+    actor = hits.instance[moving] - 1
+    at = world_from_radar[:3, 3] + hits.distance[moving, None] * line[moving]
+    arm = at - scene.poses()[actor, :3]
+    spin = trace.yaw_rate[index, actor]
+    swing = np.column_stack((-spin * arm[:, 1], spin * arm[:, 0], np.zeros(len(spin))))
+    relative = np.tile(-velocity, (len(ahead), 1))
+    relative[moving] += trace.velocity[index, actor] + swing
+    rate = (relative * line).sum(axis=1)
+    rate[moving] += limbs[actor] * rng.standard_normal(len(moving))
+    return rate

@@ -1,1 +1,0 @@
-"""Camera simulation: pinhole lens with distortion, colour images, tone mapping, thermal images."""

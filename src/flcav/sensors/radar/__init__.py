@@ -1,1 +1,0 @@
-"""Radar simulation: cross-sections, resolution cells, detection."""
