@@ -25,7 +25,6 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.device import select_device
 from flcav.perception.signs.task import SIGNS
@@ -35,7 +34,7 @@ from flcav.perception.training import Checkpointing, Validation, train
 from flcav.perception.training.run import Request, train_network
 from flcav.perception.weather.evaluate import evaluate_whole_space
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import load_network, save_network, to_arrays
+from flcav.perception.weights import CARD_KEY, load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.charts.task_columns import show_layers
 from flcav.report.pictures.inference import draw

@@ -3,10 +3,9 @@ from pathlib import Path
 
 import torch
 
-from flcav.perception.card import Card, DataEntry
 from flcav.perception.objects.model import pillars_config, second
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.weights import load_network, read_card, save_network
+from flcav.perception.weights import Card, DataEntry, load_network, read_card, save_network
 from flcav.releases.repositories.directive import Directive
 from flcav.releases.repositories.repository import publish, stage_release
 from flcav.releases.vehicles.checking import Sources, open_sources

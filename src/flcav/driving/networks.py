@@ -23,9 +23,9 @@ from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.predict import detect
 from flcav.perception.tasks import task_named
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.roads import RoadMap, road_map
+from flcav.perception.trajectory.rasters import RoadMap, road_map
+from flcav.perception.weather.evaluate import predict_probabilities
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import reduce_picture
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe

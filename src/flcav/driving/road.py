@@ -19,7 +19,7 @@ from flcav.network.messages import from_names, pack
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import link_vehicles, unit_positions
 from flcav.perception.objects.predict import detect
-from flcav.perception.tracking.tracker import Tracked, Tracker
+from flcav.perception.tracking import Tracked, Tracker
 from flcav.sensors.lidar.background import Background, learn_background
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar_pole

@@ -12,12 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from flcav.arrays import Array, Ints
 from flcav.geometry import Boxes, wrap_angle
-
-Array = NDArray[np.float64]
 
 YAW = 6  # column of a box and of its variance
 GATE = 18.4  # largest squared Mahalanobis distance in x, y of a box from its object: 99.99 % of chi-squared, 2 dof
@@ -42,8 +40,8 @@ class RoadAverage:
 
     boxes: Boxes  # (K,) world frame, at the time asked for, with scores and variances
     velocity: Array  # (K, 2) along x and y of the world [m/s]
-    agents: NDArray[np.int64]  # (K,) number of agents that saw the object
-    member: tuple[NDArray[np.int64], ...]  # for each `BoxReport` the object of each of its boxes
+    agents: Ints  # (K,) number of agents that saw the object
+    member: tuple[Ints, ...]  # for each `BoxReport` the object of each of its boxes
 
 
 def average_boxes(told: Sequence[BoxReport], at_s: float) -> RoadAverage:
@@ -99,7 +97,7 @@ class _Lines:
     def __init__(self, most: int) -> None:
         self._sums = np.zeros((5, most, 2))  # w, w t, w t^2, w x, w x t
 
-    def add(self, row: NDArray[np.int64], xy: Array, variance: Array, t: Array | float) -> None:
+    def add(self, row: Ints, xy: Array, variance: Array, t: Array | float) -> None:
         """Add boxes (N,) of the objects `row`, with x, y and their variance (N, 2), seen at `t` [s]."""
         weight, t = 1 / variance, np.broadcast_to(np.reshape(t, (-1, 1)), xy.shape)
         for number, value in enumerate((weight, weight * t, weight * t * t, weight * xy, weight * xy * t)):
@@ -113,12 +111,12 @@ class _Lines:
         return (wtt * wx - wt * wxt) / det, (w * wxt - wt * wx) / det, np.stack((wtt, -wt, w)) / det
 
 
-def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[NDArray[np.int64], ...]:
+def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[Ints, ...]:
     """Return for each `BoxReport` the number of the object that each of its boxes belongs to, from 0."""
     most = sum(len(one.boxes) for one in told)
     lines, labels, count = _Lines(most), np.zeros(most, dtype=np.int64), 0
     known: dict[str, int] = {}
-    member: dict[int, NDArray[np.int64]] = {}
+    member: dict[int, Ints] = {}
     for number in sorted(range(len(told)), key=lambda i: told[i].time_s):
         boxes, t = told[number].boxes, told[number].time_s - at_s
         xy, variance = boxes.center[:, :2], variance_of(boxes)[:, :2]
@@ -142,7 +140,7 @@ def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[NDArray[np.int64
     return tuple(member[number] for number in range(len(told)))
 
 
-def _intersect(row: NDArray[np.int64], mean: Array, variance: Array, count: int) -> tuple[Array, Array]:
+def _intersect(row: Ints, mean: Array, variance: Array, count: int) -> tuple[Array, Array]:
     """Return mean (count, 7) and information (count, 7) of the covariance intersection of boxes with the same `row`.
 
     mean, variance: (N, 7). With weights u_i = (1 / tr_i) / sum (1 / tr_j): information sum u_i / P_i, and mean
@@ -155,7 +153,7 @@ def _intersect(row: NDArray[np.int64], mean: Array, variance: Array, count: int)
     return _sums(row, each * mean, count) / information, information
 
 
-def _mean_heading(row: NDArray[np.int64], yaw: Array, variance: Array, count: int) -> Array:
+def _mean_heading(row: Ints, yaw: Array, variance: Array, count: int) -> Array:
     """Return the heading (count,) [rad] of each object: the mean axis of its boxes, and the way most of them face."""
     weight = 1 / variance
     sin, cos = (np.bincount(row, weight * wave(2 * yaw), count) for wave in (np.sin, np.cos))
@@ -164,7 +162,7 @@ def _mean_heading(row: NDArray[np.int64], yaw: Array, variance: Array, count: in
     return wrap_angle(np.where(ahead >= 0, axis, axis + np.pi))
 
 
-def _sums(row: NDArray[np.int64], values: Array, count: int) -> Array:
+def _sums(row: Ints, values: Array, count: int) -> Array:
     """Return (count, 7) the sums of `values` (N, 7) over the rows of the same number."""
     out = np.zeros((count, values.shape[1]))
     np.add.at(out, row, values)

@@ -9,12 +9,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.fusion.average import average_boxes, variance_of
 from flcav.fusion.sightings import Sighting, tell
-
-Array = NDArray[np.float64]
 
 CLOCK_S = 0.3  # standard deviation of an offset, before anything is seen
 OFFSETS_S: Array = np.linspace(-0.9, 0.9, 91)  # within three of these

@@ -13,13 +13,13 @@ from functools import lru_cache
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from shapely.geometry import Polygon
 from shapely.geometry.base import BaseGeometry
 
+from flcav.arrays import Array, Array32
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse, transform_points
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
@@ -76,9 +76,7 @@ def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int]
     return find
 
 
-def flatten_ground(
-    points: NDArray[np.float32], world_from_lidar: NDArray[np.float64], relief: Relief
-) -> NDArray[np.float32]:
+def flatten_ground(points: Array32, world_from_lidar: Array, relief: Relief) -> Array32:
     """Return points (N, >= 3) [m], LiDAR frame, as they would lie if all ground were as high as that below the sensor.
 
     Each keeps its place on the map and its height above the ground there.
@@ -88,9 +86,7 @@ def flatten_ground(
     return np.column_stack((level, points[:, 3:])).astype(np.float32)
 
 
-def rise_from(
-    world_from_lidar: NDArray[np.float64], places: NDArray[np.float64], relief: Relief
-) -> NDArray[np.float64]:
+def rise_from(world_from_lidar: Array, places: Array, relief: Relief) -> Array:
     """Return (N, 3) how far the ground rises from the sensor's foot to below `places` (N, 3), world frame [m]."""
     rise = relief.heights(*places[:, :2].T) - relief.heights(*world_from_lidar[:2, 3])
     return np.column_stack((np.zeros((len(places), 2)), rise))

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import Config
 from flcav.fusion.average import RoadAverage, average_boxes, variance_of
 from flcav.fusion.labels import cell_centers
@@ -30,12 +31,10 @@ from flcav.fusion.road import RoadView
 from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
 from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points
 from flcav.network.messages import from_names, pack, to_names, unpack
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
-
-Array = NDArray[np.float64]
 
 TOLD = 0.1  # lowest score of a detection that a vehicle tells of
 FREE = 0.5  # what vehicles alone tell of is dropped where road sensors saw more than this share of its footprint free
@@ -61,7 +60,7 @@ class Guidance:
     """Message of the edge server on one frame of a vehicle: the road average, in the vehicle's frame."""
 
     boxes: Boxes  # (K,) label = detection class, or the actor category of a lookalike; with scores and variances
-    confirmed: NDArray[np.bool_]  # (K,) whether a road sensor has the box, or two sure vehicles; others are ignored
+    confirmed: Mask  # (K,) whether a road sensor has the box, or two sure vehicles; others are ignored
     world_from_agent: Array  # (4, 4) the vehicle's pose as the edge server has it
 
     def message(self) -> bytes:
@@ -134,9 +133,7 @@ def average_spin(
     return [place_in(_shift(boxes[kept], by), confirmed, each) for each, by in zip(asking, moved, strict=True)]
 
 
-def _count_votes(
-    told: Sequence[Sighting], average: RoadAverage, threshold: float
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _count_votes(told: Sequence[Sighting], average: RoadAverage, threshold: float) -> tuple[Mask, Ints]:
     """Return (K,) whether a road sensor has each object, (K,) how many vehicles are sure of it, over a window."""
     count = len(average.boxes)
     road, sure = np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
@@ -166,9 +163,7 @@ def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
     return replace(seen, boxes=replace(seen.boxes, label=label)[label != ""])
 
 
-def select_labels(
-    boxes: Boxes, road: NDArray[np.bool_], views: Sequence[RoadView], threshold: float
-) -> NDArray[np.bool_]:
+def select_labels(boxes: Boxes, road: Mask, views: Sequence[RoadView], threshold: float) -> Mask:
     """Return (N,) which boxes of an average are told to vehicles; `road` (N,): whether a road sensor has the box."""
     assert boxes.score is not None
     seen = boxes[road]
@@ -186,7 +181,7 @@ def share_of_free_ground(boxes: Boxes, views: Sequence[RoadView]) -> Array:
     return free.mean(axis=1)
 
 
-def place_in(boxes: Boxes, confirmed: NDArray[np.bool_], seen: Sighting) -> Guidance:
+def place_in(boxes: Boxes, confirmed: Mask, seen: Sighting) -> Guidance:
     """Return the boxes, world frame, as guidance of a vehicle: in its frame, with the variance of its pose added."""
     placed = add_pose_variance(boxes, seen).transform(inverse(seen.world_from_agent))
     return Guidance(placed, confirmed, seen.world_from_agent)

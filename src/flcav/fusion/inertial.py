@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError
 from flcav.geometry import rotations_about_z
 from flcav.machine.compiled import compiled
@@ -33,8 +33,6 @@ from flcav.sensors.navigation import GRAVITY
 from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.geodesy import convert_to_map
 from flcav.world.map.parameters import GeoReference
-
-Array = NDArray[np.float64]
 
 STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
 ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's velocity across and upwards, its own axes
@@ -132,7 +130,7 @@ def _measure_way(times_s: Array, both: tuple[Array, ...]) -> float:
 
 def _list_epochs(
     log: NavigationLog, places: Array, ground: Callable[[Array, Array], Array], at_s: Array
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[Ints, Array]:
     """Return the IMU samples (E,) nearest to fixes and to `at_s`, and the fixes (E, 5), NaN where there are none.
 
     A fix is x, y, z, how long after the sample it is, and the height of the ground there. places: (M, 3) of all fixes.
@@ -146,7 +144,7 @@ def _list_epochs(
     return epochs, fixes
 
 
-def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
+def _nearest(times_s: Array, at_s: Array) -> Ints:
     """Return the index of the sample nearest to each of `at_s`."""
     after = np.clip(np.searchsorted(times_s, at_s), 1, len(times_s) - 1)
     return after - (at_s - times_s[after - 1] < times_s[after] - at_s)
@@ -185,7 +183,7 @@ def _begin(log: NavigationLog, places: Array, lever: Array) -> tuple[Array, Arra
     return places[first] - (0, 0, lever[2]), velocity, np.diag(np.concatenate(deviations) ** 2)
 
 
-def _find_rest(log: NavigationLog, inertia: Array, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _find_rest(log: NavigationLog, inertia: Array, epochs: Ints) -> Mask:
     """Return (E,) whether the IMU varies no more around an epoch than by its white noise."""
     aside = max(round(QUIET_S * log.unit.rate_hz), 2)
     around = np.clip(epochs[:, None] + np.arange(-aside, aside + 1), 0, len(inertia) - 1)

@@ -15,9 +15,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, find_free_cells
 from flcav.geometry import Boxes, concatenate, inverse, points_in_boxes, transform_points
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
@@ -93,7 +94,7 @@ def label_by_tracks(
     return move_sample(Sample(points, boxes[targets], ignored), network_from_lidar(frame, config, lidar))
 
 
-def _distinct(boxes: Boxes) -> NDArray[np.int64]:
+def _distinct(boxes: Boxes) -> Ints:
     """Return the indices of boxes that are no duplicates of an earlier one: two poles may label the same car."""
     kept: list[int] = []
     for i, center in enumerate(boxes.center):
@@ -102,14 +103,14 @@ def _distinct(boxes: Boxes) -> NDArray[np.int64]:
     return np.array(kept, dtype=np.int64)
 
 
-def cell_centers(config: SecondConfig) -> NDArray[np.float64]:
+def cell_centers(config: SecondConfig) -> Array:
     """Return the centres (K, 2) of the cells of `CELL_M` over the detector's range, x first, LiDAR frame [m]."""
     x0, y0, _, x1, y1, _ = config.range_m
     x, y = np.arange(x0 + CELL_M / 2, x1, CELL_M), np.arange(y0 + CELL_M / 2, y1, CELL_M)
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: Mask) -> Mask:
     """Return (N,): whether the road labelled an object at a detection's place, or observed the place.
 
     `told` are the roadside boxes, `cells` (K, 2) cell centres, both in the LiDAR frame; `looked` (K,) says which cells
@@ -123,7 +124,7 @@ def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArra
     return seen | (offset < told.size[None, :, 0] / 2).any(axis=1)
 
 
-def _free_ground(points: NDArray[np.float32], above: NDArray, cells: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _free_ground(points: Array32, above: NDArray, cells: Array) -> Mask:
     """Return (K,): whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
     `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `above` (N,) are the points' heights over the
@@ -135,7 +136,7 @@ def _free_ground(points: NDArray[np.float32], above: NDArray, cells: NDArray[np.
     inside = ((index >= 0) & (index < shape)).all(axis=1)
     index, z = index[inside], above[inside]
 
-    def hit(returns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def hit(returns: Mask) -> Mask:
         grid = np.zeros(shape, dtype=bool)
         grid[index[returns, 0], index[returns, 1]] = True
         return grid

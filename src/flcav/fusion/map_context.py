@@ -9,16 +9,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.spatial import KDTree
 from shapely import STRtree
 from shapely.geometry import Polygon
 
+from flcav.arrays import Array
 from flcav.fusion.average import YAW, variance_of
 from flcav.geometry import Boxes, wrap_angle
 from flcav.world.map.layers import MapLane, MapLayers
-
-Array = NDArray[np.float64]
 
 STEP_M = 1.0  # between two points of a lane's centre line
 LANE_RAD = np.radians(4.0)  # standard deviation of a car's heading about its lane's

@@ -6,14 +6,12 @@ Poses are either the true ones with drawn errors, or estimated from what the veh
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from flcav.arrays import Array
 from flcav.config import Config
 from flcav.fusion.sightings import Navigation
 from flcav.geometry import pose
-
-Array = NDArray[np.float64]
 
 
 class NavigationErrors(Config):

@@ -12,13 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.config import InputError, Json
 from flcav.fusion.registration import import_small_gicp
 from flcav.geometry import inverse
 from flcav.sensors.frame import Frame
 from flcav.sources.source import Source
-
-Array = NDArray[np.float64]
 
 CELL_M, VOXEL_M = 0.25, 1.0  # clouds are thinned to a point in each cell; edge of the map's voxels
 NEAREST_M = 2.5  # returns within this are of the vehicle itself

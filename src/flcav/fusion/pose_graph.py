@@ -11,16 +11,14 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.config import InputError
 from flcav.fusion.average import YAW, RoadAverage, average_boxes, variance_of
 from flcav.fusion.clocks import set_clocks
 from flcav.fusion.sightings import Navigation, Sighting, tell
 from flcav.geometry import pose, transform_points, wrap_angle, yaw_of
 from flcav.interface.extras import format_install_command
-
-Array = NDArray[np.float64]
 
 POST_M = 0.15  # standard deviation of a post's foot
 POST_GATE_M = 1.5  # farthest a post may lie from its place on the map, beside the error of the pose

@@ -5,12 +5,10 @@ a sign.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.ndimage import label
 
+from flcav.arrays import Array, Array32
 from flcav.world.map.town import Town
-
-Array = NDArray[np.float64]
 
 CELL_M = 0.2  # edge of a cell of the bird's-eye grid
 BAND_M = (0.5, 2.2)  # heights above the road in which posts are looked for: above kerbs, below the plates of signs
@@ -20,7 +18,7 @@ REACH_M = 40.0  # farther posts have too few returns
 LEAST_RETURNS = 4
 
 
-def find_posts(points: NDArray[np.float32], height_m: float) -> Array:
+def find_posts(points: Array32, height_m: float) -> Array:
     """Return the feet (L, 2) x, y [m] of the posts in a sweep (N, >= 3), in the frame of the points.
 
     height_m: of the frame's origin above the road. Columns touch where their cells do, also at corners.

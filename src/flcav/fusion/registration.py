@@ -10,10 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.config import InputError
 from flcav.interface.extras import format_install_command
-
-Array = NDArray[np.float64]
 
 PAIR_M = (3.0, 0.8)  # farthest pair of points, in each pass
 CELL_M = 0.3  # clouds are thinned to a point in each cell of this edge

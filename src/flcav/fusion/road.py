@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_dilation
 
+from flcav.arrays import Array, Mask
 from flcav.geometry import Boxes, transform_points
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.sensors.frame import Frame
@@ -27,11 +28,11 @@ class RoadView:
     """Roadside perception of one LiDAR spin, world frame: labelled boxes, free cells and occupied cells."""
 
     boxes: Boxes  # labelled objects; label = actor category
-    origin: NDArray[np.float64]  # (2,) world x, y of the corner of cell (0, 0) [m]
-    ground: NDArray[np.bool_]  # (X, Y) cells of CELL_M that were seen to be free ground
-    occupied: NDArray[np.bool_]  # (X, Y) cells with returns above the ground
+    origin: Array  # (2,) world x, y of the corner of cell (0, 0) [m]
+    ground: Mask  # (X, Y) cells of CELL_M that were seen to be free ground
+    occupied: Mask  # (X, Y) cells with returns above the ground
 
-    def at(self, cells: NDArray[np.bool_], xy: NDArray) -> NDArray[np.bool_]:
+    def at(self, cells: Mask, xy: NDArray) -> Mask:
         """Return (K,): the value of the grid `cells` (`ground` or `occupied`) at each world position `xy` (K, 2) [m].
 
         It is False outside the grid.
@@ -92,6 +93,6 @@ def build_road_view(
     return RoadView(boxes, origin, find_free_cells(ground, occupied), occupied)
 
 
-def find_free_cells(ground: NDArray[np.bool_], standing: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def find_free_cells(ground: Mask, standing: Mask) -> Mask:
     """Return the cells (X, Y) within two cells of one in `ground` and not within two cells of one in `standing`."""
     return np.asarray(binary_dilation(ground, REACH)) & ~np.asarray(binary_dilation(standing, REACH), dtype=bool)

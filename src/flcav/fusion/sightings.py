@@ -3,12 +3,10 @@
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.fusion.average import YAW, BoxReport, variance_of
 from flcav.geometry import Boxes
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -12,12 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
 from flcav.geometry import Boxes, concatenate, heading_vectors
-
-Array = NDArray[np.float64]
 
 LEAST_SCORE = 0.1  # of a track
 VEHICLE_M = 2.0  # length from which an object is fitted: those on foot and on two wheels bend

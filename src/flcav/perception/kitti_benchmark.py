@@ -8,8 +8,8 @@ from typing import Annotated, Literal
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
@@ -21,7 +21,7 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.images import kitti_view
-from flcav.perception.metrics.average_precision import interval_words
+from flcav.perception.metrics.detection import interval_words
 from flcav.perception.metrics.kitti import (
     COUNTS,
     LEVELS,
@@ -32,18 +32,16 @@ from flcav.perception.metrics.kitti import (
     label_states,
 )
 from flcav.perception.metrics.operating_point import FoundAtDistance, describe_counts
-from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.evaluate import Score, count_objects, score_detections
-from flcav.perception.objects.model import Second
+from flcav.perception.objects.model import Second, SecondConfig
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_moved
 from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import FrameTruth, level_mount
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 from flcav.perception.task import Evaluated, KnownLidar
 from flcav.sensors.labels.outlines import BOX_EDGES, NEAR_M, clip_in_front
 from flcav.storage.records import LEFT_OUT, Class
 
-Array = NDArray[np.float64]
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
 
 LIMITS = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}  # IoU above which a detection is of an object
@@ -249,7 +247,7 @@ def _of_class(found: _Found, name: str, level: str, kind: BenchmarkKind) -> Clas
     )
 
 
-def _label(found: _Found, name: str, level: str) -> NDArray[np.int64]:
+def _label(found: _Found, name: str, level: str) -> Ints:
     known = found.frame.objects
     heights = _height(known.rectangle)
     return label_states(name, known.boxes.label, heights, known.occlusion, known.truncation, LEVELS[level])

@@ -18,7 +18,6 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, print_progress
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card, join_lidars, read_lidar
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti
@@ -29,9 +28,9 @@ from flcav.perception.objects.truth import narrow_range
 from flcav.perception.outcomes import NetworkComparison, as_measurable, compare_outcomes
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
+from flcav.perception.tracking import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, Request, train_network
-from flcav.perception.weights import find_shipped, load_network, read_card
+from flcav.perception.weights import Card, find_shipped, join_lidars, load_network, read_card, read_lidar
 
 Named = str | Task
 Data = Dataset | Path | str

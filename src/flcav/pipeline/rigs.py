@@ -7,9 +7,9 @@ from flcav.config import Json
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
+from flcav.perception.weights import join_lidars, read_lidar
 from flcav.pipeline.engine import Notify
 from flcav.pipeline.frames import make_recording_recipe
 from flcav.pipeline.recipe import SPLITS_OF

@@ -9,9 +9,9 @@ from flcav.experiments.studies import objects as objects_tables
 from flcav.experiments.studies.objects import STUDY
 from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.geometry import Boxes
-from flcav.perception.card import Card
 from flcav.perception.images import CameraView
 from flcav.perception.objects.evaluate import ObjectsEvaluation
+from flcav.perception.weights import Card
 from flcav.pipeline.provenance import provenance
 from flcav.report.pictures.clouds import real_frame
 from flcav.statistics.seeds import mean_over_seeds

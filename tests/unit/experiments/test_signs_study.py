@@ -6,8 +6,8 @@ from flcav.config import parse_config
 from flcav.dataset.rectangles import SIGNS
 from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.experiments.studies.signs import STUDY, tables
-from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
+from flcav.perception.weights import Card
 from flcav.pipeline.provenance import provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

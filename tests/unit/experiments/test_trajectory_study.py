@@ -8,9 +8,9 @@ import pytest
 from flcav.experiments.studies import study_named
 from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResult
 from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
-from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
+from flcav.perception.weights import Card
 from flcav.pipeline.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 

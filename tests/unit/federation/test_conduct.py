@@ -32,7 +32,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.scaffold import Scaffold
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.perception.distillation import SentOutputs
+from flcav.perception.client import SentOutputs
 from flcav.statistics.streams import derive_seed
 
 START = {"w": np.zeros(50, np.float32)}

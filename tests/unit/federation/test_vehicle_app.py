@@ -40,7 +40,7 @@ from flcav.federation.secure.parties import SecureClient
 from flcav.federation.strategies import strategy_named
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate
-from flcav.perception.distillation import SentOutputs
+from flcav.perception.client import SentOutputs
 
 TRAINED: list[int] = []
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from flcav.fusion.average import BoxReport
 from flcav.fusion.tracks import Sweep, fit_vehicle, track_objects
 from flcav.geometry import Boxes, heading_vectors
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 
 LIDAR_M = 1.8
 

@@ -15,7 +15,6 @@ from flcav.dataset.store import Dataset
 from flcav.fusion.detector import ROAD
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.networks import find_trained_lidar
 from flcav.perception.objects import predict as prediction
 from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
@@ -25,7 +24,7 @@ from flcav.perception.task import KnownLidar
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import find_shipped, read_card, save_network
+from flcav.perception.weights import find_shipped, join_lidars, read_card, read_lidar, save_network
 from flcav.sensors.frame import Calibration, Frame
 from flcav.sensors.rig import RIGS
 from flcav.sources.randomisation import DRAWN_BEAMS

@@ -16,15 +16,14 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.perception.client import TaskClient
-from flcav.perception.distillation import PROBABILITIES, OutputClient, SharedSamples
-from flcav.perception.signs.config import SignsConfig
+from flcav.perception.client import PROBABILITIES, OutputClient, SharedSamples, TaskClient
+from flcav.perception.signs.loss import assign_anchors
+from flcav.perception.signs.model import SignsConfig
 from flcav.perception.signs.predict import predict
 from flcav.perception.signs.samples import Sample as SignSample
-from flcav.perception.signs.targets import assign_anchors
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network
-from flcav.perception.weather.config import LeNetConfig
+from flcav.perception.weather.model import LeNetConfig
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays

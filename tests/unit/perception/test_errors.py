@@ -23,11 +23,10 @@ from flcav.perception.errors import (
     unpack_errors,
 )
 from flcav.perception.signs import errors as sign_errors
-from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
-from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
 from flcav.perception.signs.predict import SignDetections
 from flcav.perception.signs.samples import sample_from_frame
-from flcav.perception.trajectory import errors as path_errors
+from flcav.perception.trajectory import evaluate as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import samples_of

@@ -10,14 +10,17 @@ import pytest
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.perception.signs import infer
-from flcav.perception.signs.augment import draw
-from flcav.perception.signs.background import compare_with_background, learn_picture_background, picture_reader
-from flcav.perception.signs.config import CONFIGURATIONS
-from flcav.perception.signs.infer import detect_signs
-from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import SignDetections
-from flcav.perception.signs.samples import RecordedPictures, sample_from_frame
+from flcav.perception.signs import predict
+from flcav.perception.signs.model import CONFIGURATIONS, SignDetector
+from flcav.perception.signs.predict import SignDetections, detect_signs
+from flcav.perception.signs.samples import (
+    RecordedPictures,
+    compare_with_background,
+    draw,
+    learn_picture_background,
+    picture_reader,
+    sample_from_frame,
+)
 from flcav.perception.signs.task import SIGNS
 from flcav.sensors.frame import Annotations, Frame, Views
 from perception.frames import frame
@@ -127,7 +130,7 @@ def test_findings_in_a_dataset_are_of_pictures_beside_their_background(monkeypat
     (tmp_path / MANIFEST).touch()
     monkeypatch.setattr(Dataset, "open", lambda path: STREET)
     shown = []
-    monkeypatch.setattr(infer, "detect", lambda network, picture, threshold: shown.append(picture) or NOTHING)
+    monkeypatch.setattr(predict, "detect", lambda network, picture, threshold: shown.append(picture) or NOTHING)
     findings = list(detect_signs(SignDetector(ROAD), tmp_path, 0.5, [1, 3]))
     for number, finding, seen in zip((1, 3), findings, shown, strict=True):
         assert (finding.seen == Street().plane(number, "left", "rgb")).all()

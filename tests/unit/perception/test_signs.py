@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from flcav.perception.ops.rectangles import complete_iou
-from flcav.perception.signs.augment import GREY, crop_sample, draw, draw_window, join_mosaic
-from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
+from flcav.perception.ops.boxes import complete_iou
 from flcav.perception.signs.evaluate import ClassPrecision, SignTruth, mean_average_precision
-from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
-from flcav.perception.signs.model import SignDetector, decode, decode_boxes
+from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign_anchors, detection_loss
+from flcav.perception.signs.model import CONFIGURATIONS, STRIDES, SignDetector, SignsConfig, decode, decode_boxes
 from flcav.perception.signs.predict import SignDetections, detect
-from flcav.perception.signs.samples import Sample
-from flcav.perception.signs.targets import MOST_TIMES, assign_anchors
+from flcav.perception.signs.samples import GREY, Sample, crop_sample, draw, draw_window, join_mosaic
 from flcav.perception.signs.task import SIGNS, SignsTask
 from flcav.perception.task import build_network
 from flcav.perception.training import train

@@ -9,11 +9,17 @@ import torch
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
 from flcav.perception.objects.augment import augment, transform_sample
-from flcav.perception.objects.config import Augmentation
-from flcav.perception.objects.loss import second_loss
-from flcav.perception.objects.model import head_shape
+from flcav.perception.objects.loss import (
+    anchor_boxes,
+    assign_anchors,
+    decode,
+    direction_of,
+    encode,
+    mark_free_cells,
+    second_loss,
+)
+from flcav.perception.objects.model import Augmentation, head_shape
 from flcav.perception.objects.samples import crop_to_range
-from flcav.perception.objects.targets import anchor_boxes, assign_anchors, decode, direction_of, encode, mark_free_cells
 
 CONFIG = second_tiny().config
 NO_POINTS = np.zeros((0, 4), dtype=np.float32)

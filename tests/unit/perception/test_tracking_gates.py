@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.perception.tracking.tracker import LEAST_VARIANCE, TrackState, assign_detections, innovation
+from flcav.perception.tracking import LEAST_VARIANCE, TrackState, assign_detections, innovation
 
 WIDE = 1e6  # variance [m^2] with which every place is likely
 

@@ -15,25 +15,23 @@ from flcav.dataset.layout import FrameKey
 from flcav.geometry import inverse, pose
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.cross_view import (
+from flcav.perception.trajectory.evaluate import compute_errors, evaluate_paths, is_turning
+from flcav.perception.trajectory.model import (
     FAR_M,
     LEARNED,
     SCALE_M,
     CrossAttention,
     CrossViewEncoder,
+    ForecastTensors,
     Inputs,
     cast_rays,
     intersect_ground,
     pixel_grid,
     place_grid,
 )
-from flcav.perception.trajectory.evaluate import compute_errors, evaluate_paths, is_turning
-from flcav.perception.trajectory.loss import forecast_loss, map_loss
-from flcav.perception.trajectory.model import ForecastTensors
-from flcav.perception.trajectory.rasters import LAYERS, STATIC, cell_of, centres
-from flcav.perception.trajectory.roads import BEFORE_M, road_map
+from flcav.perception.trajectory.rasters import BEFORE_M, LAYERS, STATIC, cell_of, centres, road_map
 from flcav.perception.trajectory.samples import extract_columns, rescaled
-from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.trajectory.task import TRAJECTORY, forecast_loss, map_loss
 from flcav.perception.trajectory.tracks import (
     check_instants,
     constant_velocity,

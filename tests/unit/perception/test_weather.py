@@ -7,12 +7,9 @@ from pydantic import TypeAdapter
 
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.training import train
-from flcav.perception.weather.augment import augment
-from flcav.perception.weather.config import LeNetConfig
-from flcav.perception.weather.evaluate import evaluate_classes
-from flcav.perception.weather.model import SEEN_MAPS, LeNet, PartlyConnected, Subsampling
-from flcav.perception.weather.predict import predict_probabilities
-from flcav.perception.weather.samples import Sample, reduce_picture
+from flcav.perception.weather.evaluate import evaluate_classes, predict_probabilities
+from flcav.perception.weather.model import SEEN_MAPS, LeNet, LeNetConfig, PartlyConnected, Subsampling
+from flcav.perception.weather.samples import Sample, augment, reduce_picture
 from flcav.perception.weather.task import WEATHER
 from flcav.world.weather import WEATHER_CLASSES
 

@@ -7,8 +7,8 @@ from shapely.geometry import Polygon
 
 from flcav.config import InputError
 from flcav.geometry import inverse
-from flcav.perception.card import read_lidar
 from flcav.perception.task import KnownLidar
+from flcav.perception.weights import read_lidar
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from flcav.config import Json
 from flcav.geometry.boxes import Boxes, concatenate
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
 from flcav.perception.objects.evaluate import score_detections
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames

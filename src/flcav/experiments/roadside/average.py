@@ -23,7 +23,7 @@ from flcav.fusion.sightings import Sighting, tell
 from flcav.geometry import Boxes, inverse, wrap_angle, yaw_of
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.metrics import average_precision, match
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.metrics.detection import assign_targets
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_errors

@@ -25,11 +25,11 @@ from flcav.fusion.association import (
 from flcav.fusion.detector import PICTURE_THRESHOLD, load_picture_network
 from flcav.fusion.registration import Offset, measure_offset
 from flcav.geometry import Boxes, inverse
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.truth import CARS
-from flcav.perception.ops.rectangles import iou
-from flcav.perception.signs.background import picture_reader
+from flcav.perception.ops.boxes import rectangle_iou
 from flcav.perception.signs.predict import detect
+from flcav.perception.signs.samples import picture_reader
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
@@ -173,5 +173,5 @@ def _actors_of_boxes(boxes: NDArray[np.float64], views: Views) -> NDArray[np.int
     shown = np.flatnonzero(views.pixels > 0)
     if not len(boxes) or not len(shown):
         return np.full(len(boxes), -1)
-    overlap = iou(torch.from_numpy(boxes), torch.from_numpy(views.visible_box[shown] + HALF_PX)).numpy()
+    overlap = rectangle_iou(torch.from_numpy(boxes), torch.from_numpy(views.visible_box[shown] + HALF_PX)).numpy()
     return np.where(overlap.max(axis=1) >= OVERLAP, shown[overlap.argmax(axis=1)], -1)

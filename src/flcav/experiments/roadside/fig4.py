@@ -24,8 +24,8 @@ from flcav.fusion.registration import Offset, measure_offset, register
 from flcav.fusion.road import MIN_RETURNS
 from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.foreground import frame_reader, pole_backgrounds
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.agents import frame_reader, pole_backgrounds
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.truth import CARS
 from flcav.pipeline.provenance import Provenance, provenance

@@ -19,9 +19,8 @@ from flcav.fusion.detector import load_road_network
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, inverse
-from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import CONFIGURATIONS
+from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.objects.model import CONFIGURATIONS, SecondConfig
 from flcav.perception.objects.truth import choose_lidar, in_range, network_from_lidar
 from flcav.pipeline.frames import Frames, group_frames
 from flcav.pipeline.labels.pseudo_labels import Spin, road_views, select_frames_near

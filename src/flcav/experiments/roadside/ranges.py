@@ -20,8 +20,8 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.fig4 import LIDAR, OVERLAP, find_range, list_cars
 from flcav.fusion.detector import THRESHOLD, load_road_network
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.foreground import frame_reader
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.agents import frame_reader
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style

@@ -13,7 +13,7 @@ from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.networks import resolve_network
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar, ground_truth

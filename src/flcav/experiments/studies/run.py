@@ -13,11 +13,10 @@ from typing import Any, Generic, TypeVar, cast, get_type_hints
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
 from flcav.experiments.splits import open_split, record_split
-from flcav.perception.card import Card
 from flcav.perception.study import RecipeFields, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
-from flcav.perception.weights import load_network
+from flcav.perception.weights import Card, load_network
 from flcav.pipeline.engine import Notify, Step, Work, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.statistics.power import MOST_SEEDS, plan_seeds

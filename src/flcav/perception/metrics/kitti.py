@@ -13,12 +13,9 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask, Words
 from flcav.machine.compiled import compiled
-
-Array = NDArray[np.float64]
-States = NDArray[np.int64]
 
 COUNTS, IGNORED, OTHER = 0, 1, -1  # state of an object or a detection for a class at a level
 RECALLS = 41  # positions of recall, of which the first, 0, is left out of the mean
@@ -45,22 +42,22 @@ class ClassFrame:
     """The detections and objects of one frame for a class, a level and a kind of overlap."""
 
     score: Array  # (D,)
-    detection: States  # (D,) COUNTS, IGNORED or OTHER
-    label: States  # (G,) of objects, the same
+    detection: Ints  # (D,) COUNTS, IGNORED or OTHER
+    label: Ints  # (G,) of objects, the same
     overlap: Array  # (D, G) IoU
-    excused: NDArray[np.bool_]  # (D,) lies in a DontCare region
+    excused: Mask  # (D,) lies in a DontCare region
 
 
 def label_states(
-    name: str, labels: NDArray[np.str_], height_px: Array, occlusion: States, truncation: Array, level: Difficulty
-) -> States:
+    name: str, labels: Words, height_px: Array, occlusion: Ints, truncation: Array, level: Difficulty
+) -> Ints:
     """Return (G,) whether each of a frame's objects counts for the class `name` at a level."""
     hard = (occlusion > level.occlusion) | (truncation > level.truncation) | (height_px <= level.height_px)
     own, similar = labels == name, labels == SIMILAR.get(name, "")
     return np.where(own & ~hard, COUNTS, np.where(own | similar, IGNORED, OTHER)).astype(np.int64)
 
 
-def detection_states(name: str, labels: NDArray[np.str_], height_px: Array, level: Difficulty) -> States:
+def detection_states(name: str, labels: Words, height_px: Array, level: Difficulty) -> Ints:
     """Return (D,) whether each of a frame's detections counts for the class `name` at a level."""
     return np.where(height_px < level.height_px, IGNORED, np.where(labels == name, COUNTS, OTHER)).astype(np.int64)
 
@@ -109,17 +106,17 @@ def find_thresholds(scores: Array, targets: int) -> list[float]:
     return found[:RECALLS]
 
 
-def _arguments(frame: ClassFrame) -> tuple[Array, States, States, Array, NDArray[np.bool_]]:
+def _arguments(frame: ClassFrame) -> tuple[Array, Ints, Ints, Array, Mask]:
     return frame.score, frame.detection, frame.label, frame.overlap, frame.excused
 
 
 @compiled
 def _match(
     score: Array,
-    detection: States,
-    label: States,
+    detection: Ints,
+    label: Ints,
     overlap: Array,
-    excused: NDArray[np.bool_],
+    excused: Mask,
     limit: float,
     threshold: float,
     counted: bool,

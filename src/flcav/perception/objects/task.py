@@ -1,6 +1,6 @@
 """3D object detection as a perception task: samples, loss, evaluation, inference and error registry of SECOND."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,25 +8,42 @@ from torch import Tensor
 
 from flcav.config import Json
 from flcav.dataset.store import Dataset
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
+from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, Registry
+from flcav.perception.metrics.detection import assign_targets, on_neutral
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
-from flcav.perception.objects.calibrate import calibrate, measure_reliability
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.errors import find_errors
-from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, count_cars, count_objects, score_detections
-from flcav.perception.objects.infer import detect_objects
-from flcav.perception.objects.loss import batch_loss
-from flcav.perception.objects.messages import pack_sweep, unpack_sweep
-from flcav.perception.objects.model import CONFIGURATIONS, Second, second
-from flcav.perception.objects.outcomes import ObjectsOutcomes
-from flcav.perception.objects.predict import detect_frames, detect_in
-from flcav.perception.objects.samples import RecordedSweeps, Sample, compare_rig, select_fitting_frames
-from flcav.perception.objects.truth import target_criteria
+from flcav.perception.objects.evaluate import (
+    ObjectsEvaluation,
+    ObjectsOutcomes,
+    break_down,
+    count_cars,
+    count_objects,
+    score_detections,
+)
+from flcav.perception.objects.loss import assign_anchors, second_loss
+from flcav.perception.objects.model import CONFIGURATIONS, Second, SecondConfig, second
+from flcav.perception.objects.predict import (
+    calibrate,
+    detect_frames,
+    detect_in,
+    detect_objects,
+    measure_reliability,
+    predict,
+)
+from flcav.perception.objects.samples import (
+    RecordedSweeps,
+    Sample,
+    compare_rig,
+    pack_sweep,
+    select_fitting_frames,
+    unpack_sweep,
+)
+from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range, target_criteria
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, KnownLidar, Practice
+from flcav.sensors.frame import Frame
 
 
 class ObjectsTask(ObjectsOutcomes):
@@ -92,7 +109,8 @@ class ObjectsTask(ObjectsOutcomes):
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of SECOND on a batch, differentiable in the network's parameters."""
-        return batch_loss(network, samples)
+        targets = [assign_anchors(sample, network.config) for sample in samples]
+        return second_loss(predict(network, [sample.points for sample in samples]), targets, network.config)
 
     def evaluate(
         self,
@@ -146,7 +164,7 @@ class ObjectsTask(ObjectsOutcomes):
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.infer`."""
+        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.predict`."""
         yield from detect_objects(network, path, threshold, frames)
 
     def register_errors(
@@ -174,3 +192,67 @@ class ObjectsTask(ObjectsOutcomes):
 
 
 OBJECTS = ObjectsTask()
+
+
+OVERLAP = 0.5  # 3D IoU from which an object is detected
+
+
+def find_errors(
+    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
+) -> Iterator[list[PerceptionError]]:
+    """Yield the misses and false positives of each frame, of detections of score `threshold` or more.
+
+    They are at world coordinates; those that repeat over frames are among them, see `flcav.perception.errors`.
+    detections: one `Boxes` per frame, LiDAR frame. Raises ValueError where these and `frames` differ in length.
+    """
+    for frame, found in zip(frames, detections, strict=True):
+        found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
+        matched = np.zeros(len(found), dtype=bool)
+        missed = _misses(frame, found, matched, config)
+        yield [*missed, *_false_positives(frame, found[~matched], config)]
+
+
+def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
+    """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    label, asked = truth.boxes.label, truth.target | truth.faint
+    missed = asked.copy()
+    for name in config.classes:
+        own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
+        target = assign_targets(found[own], truth.boxes[objects], OVERLAP)
+        matched[own[target >= 0]] = True
+        missed[objects[target[target >= 0]]] = False
+    matched |= on_neutral(found, truth.boxes)
+    return [
+        PerceptionError(
+            *(float(value) for value in annotations.boxes.center[i]),
+            weight=1.0,
+            kind=MISS,
+            label=str(label[i]),
+            returns=int(truth.returns[i]),
+            occlusion=float(annotations.occlusion[i]),
+            scene=frame.scene,
+            track=str(annotations.track[i]),
+        )
+        for i in np.flatnonzero(missed)
+    ]
+
+
+def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[PerceptionError]:
+    name = choose_lidar(frame)
+    found = found[in_range(found, config)]
+    returns = points_in_boxes(frame.lidar[name], found).sum(1)
+    world = transform_points(frame.world_from_sensor(name), found.center)
+    return [
+        PerceptionError(
+            *(float(value) for value in world[i]),
+            weight=1.0,
+            kind=FALSE_POSITIVE,
+            label=str(found.label[i]),
+            returns=int(returns[i]),
+            occlusion=float("nan"),
+            scene=frame.scene,
+            track="",
+        )
+        for i in np.flatnonzero(returns >= 1)
+    ]

@@ -5,25 +5,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from torch import Tensor
 
+from flcav.arrays import Array32
 from flcav.config import InputError, Json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.signs.augment import draw
-from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
 from flcav.perception.signs.errors import register_errors
-from flcav.perception.signs.evaluate import SignsEvaluation, mean_average_precision
-from flcav.perception.signs.infer import detect_signs
-from flcav.perception.signs.loss import batch_loss, imitation_loss
-from flcav.perception.signs.messages import pack_frame, unpack_frame
-from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.outcomes import SignsOutcomes, by_picture
-from flcav.perception.signs.predict import class_probabilities
-from flcav.perception.signs.samples import RecordedPictures, Sample
+from flcav.perception.signs.evaluate import SignsEvaluation, SignsOutcomes, by_picture, mean_average_precision
+from flcav.perception.signs.loss import batch_loss, class_probabilities, imitation_loss
+from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
+from flcav.perception.signs.predict import detect_signs
+from flcav.perception.signs.samples import RecordedPictures, Sample, draw, pack_frame, unpack_frame
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 
@@ -57,20 +52,18 @@ class SignsTask(SignsOutcomes):
         return RecordedPictures(data, config, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
-        """Return an augmented sample, see `flcav.perception.signs.augment.draw`."""
+        """Return an augmented sample, see `flcav.perception.signs.samples.draw`."""
         return draw(samples, index, config, rng)
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of a batch of images of one size, whose sides are multiples of 32."""
         return batch_loss(network, samples)
 
-    def class_probabilities(self, network: SignDetector, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
+    def class_probabilities(self, network: SignDetector, samples: Sequence[Sample]) -> list[Array32]:
         """Return the class probabilities (boxes, classes) of the boxes of each image."""
         return class_probabilities(network, samples)
 
-    def imitation_loss(
-        self, network: SignDetector, samples: Sequence[Sample], targets: Sequence[NDArray[np.float32]]
-    ) -> Tensor:
+    def imitation_loss(self, network: SignDetector, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
         """Return the loss of a batch whose boxes have class probabilities instead of labels."""
         return imitation_loss(network, samples, targets)
 
@@ -106,7 +99,7 @@ class SignsTask(SignsOutcomes):
     def infer(
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the detections of each image at `path`, by falling score, see `flcav.perception.signs.infer`."""
+        """Yield the detections of each image at `path`, by falling score, see `flcav.perception.signs.predict`."""
         yield from detect_signs(network, path, threshold, frames)
 
     def register_errors(

@@ -13,15 +13,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
+from flcav.arrays import Array, Ints
 from flcav.config import DamagedFile, InputError
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import suggest
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
-from flcav.perception.training.adamw import AdamW
-from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
+from flcav.perception.training.checkpoint import AdamW, RunState, load_checkpoint, save_checkpoint
 from flcav.statistics.streams import stream
 
 CLIP_NORM = 10.0  # largest norm of the gradient
@@ -83,8 +82,8 @@ class Validation:
 class TrainingHistory:
     """Losses and validation scores of a training."""
 
-    losses: NDArray[np.float64]  # (steps,) loss of each batch; fewer steps than asked for after early stopping
-    scores: NDArray[np.float64]  # (validations,)
+    losses: Array  # (steps,) loss of each batch; fewer steps than asked for after early stopping
+    scores: Array  # (validations,)
 
 
 def train(
@@ -211,7 +210,7 @@ def step(
     return float(loss.detach())
 
 
-def batches(samples: int, batch: int, steps: int, seed: int) -> NDArray[np.int64]:
+def batches(samples: int, batch: int, steps: int, seed: int) -> Ints:
     """Return the sample indices of each batch, (steps, batch): shuffled epochs one after another, cut into batches.
 
     A batch has at most as many samples as there are.

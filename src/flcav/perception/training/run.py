@@ -6,23 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import ConcatDataset
 
+from flcav.arrays import Array
 from flcav.config import DamagedFile
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import DAMAGED, Report, ignore_progress
 from flcav.machine.locks import only_writer
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
 from flcav.perception.task import Calibrates, Evaluated, Task, build_network, find_configuration
 from flcav.perception.training.checkpoint import Settings, find_finished_card, part_of
 from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
-from flcav.perception.weights import save_network
+from flcav.perception.weights import Card, DataEntry, data_entry, save_network, write_card
 from flcav.storage.files import check_writable
 
 WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
@@ -213,7 +211,7 @@ def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> Dataset
     return DatasetPart(data, chosen, data_entry(data, chosen))
 
 
-def _rounded(scores: NDArray[np.float64]) -> list[float]:
+def _rounded(scores: Array) -> list[float]:
     return [round(float(score), 4) for score in scores]
 
 

@@ -4,7 +4,9 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
+from torch.nn import functional
 
 from flcav.config import Json
 from flcav.dataset.store import Dataset
@@ -13,15 +15,16 @@ from flcav.perception.errors import Registry
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
 from flcav.perception.trajectory.config import CONFIGURATIONS, TrajectoryConfig
-from flcav.perception.trajectory.errors import register_errors
-from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
-from flcav.perception.trajectory.infer import forecast_frames
-from flcav.perception.trajectory.loss import batch_loss
-from flcav.perception.trajectory.messages import pack_frames, unpack_frames
-from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.outcomes import TrajectoryOutcomes
-from flcav.perception.trajectory.predict import predict
-from flcav.perception.trajectory.samples import Sample, samples_of, select_fitting_frames
+from flcav.perception.trajectory.evaluate import (
+    TrajectoryEvaluation,
+    TrajectoryOutcomes,
+    evaluate_paths,
+    register_errors,
+)
+from flcav.perception.trajectory.model import LEARNED, ForecastTensors, TrajectoryNetwork
+from flcav.perception.trajectory.predict import forecast_frames, futures_of, inputs_of, predict, rasters_of
+from flcav.perception.trajectory.rasters import LAYERS
+from flcav.perception.trajectory.samples import Sample, pack_frames, samples_of, select_fitting_frames, unpack_frames
 
 
 class TrajectoryTask(TrajectoryOutcomes):
@@ -78,7 +81,7 @@ class TrajectoryTask(TrajectoryOutcomes):
         return evaluate_paths(paths, probabilities, seen.past, seen.future, seen.at_junction, seen.scene)
 
     def pack_samples(self, data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> Iterator[bytes]:
-        """Yield the message of each frame: its samples, see `flcav.perception.trajectory.messages`."""
+        """Yield the message of each frame: its samples, see `flcav.perception.trajectory.samples`."""
         return pack_frames(data, config, frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: TrajectoryConfig) -> list[Sample]:
@@ -99,8 +102,49 @@ class TrajectoryTask(TrajectoryOutcomes):
         threshold: float = 0.0,
         progress: Report = ignore_progress,
     ) -> Registry:
-        """Return the misses, see `flcav.perception.trajectory.errors.register_errors`; `threshold` has no effect."""
+        """Return the misses, see `flcav.perception.trajectory.evaluate.register_errors`; `threshold` has no effect."""
         return register_errors(network, data, samples_of(data, network.config, frames), progress)
 
 
 TRAJECTORY = TrajectoryTask()
+
+
+SHARED = 0.05  # share of the regression over all modes, against unused modes: Rupprecht et al., ICCV 2017, eq. 5
+MODE_WEIGHT = 1.0  # weight of the mode classification
+
+
+def batch_loss(network: TrajectoryNetwork, samples: Sequence[Sample]) -> Tensor:
+    """Return the loss of the forecast, with cameras plus the weighted loss of the map's segmentation."""
+    inputs = inputs_of(samples, network)
+    forecast = network(inputs)
+    loss = forecast_loss(forecast, futures_of(samples, inputs.past.device))
+    if forecast.map_logits is None or network.config.cameras is None:
+        return loss
+    taught = map_loss(forecast.map_logits, rasters_of(samples, inputs.past.device))
+    return loss + network.config.cameras.map_weight * taught
+
+
+def forecast_loss(forecast: ForecastTensors, future: Tensor) -> Tensor:
+    """Return the winner-takes-all regression and the mode classification against `future` (B, FUTURE, 2) [m].
+
+    The winner is the mode with the smallest average displacement error. Regression is Huber's loss with threshold 1 m,
+    which limits the influence of outliers; classification is the cross entropy of the modes' logits.
+    """
+    apart = functional.smooth_l1_loss(forecast.paths, future[:, None].expand_as(forecast.paths), reduction="none")
+    off = apart.sum(dim=3).mean(dim=2)  # (B, K)
+    with torch.no_grad():
+        winner = torch.linalg.vector_norm(forecast.paths - future[:, None], dim=3).mean(dim=2).argmin(dim=1)
+    won = off.gather(1, winner[:, None])[:, 0]
+    regression = ((1 - SHARED) * won + SHARED * off.mean(dim=1)).mean()
+    return regression + MODE_WEIGHT * functional.cross_entropy(forecast.logits, winner)
+
+
+def map_loss(map_logits: Tensor, raster: Tensor) -> Tensor:
+    """Return the weighted binary cross entropy of map logits (B, LEARNED, h, w) against the raster's layers.
+
+    `raster` (B, LAYERS, cells, cells) is averaged to the resolution of the logits.
+    """
+    wanted = raster[:, [LAYERS.index(name) for name in LEARNED]]
+    wanted = functional.adaptive_avg_pool2d(wanted, map_logits.shape[-1])
+    weight = map_logits.new_tensor(list(LEARNED.values()))[:, None, None]
+    return functional.binary_cross_entropy_with_logits(map_logits, wanted, pos_weight=weight)

@@ -4,25 +4,27 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 from torch import Tensor
+from torch.nn import functional
 
+from flcav.arrays import Array32
 from flcav.config import Json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.study import StudyRecipe
 from flcav.perception.task import Finding, Practice
-from flcav.perception.weather.augment import augment
-from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
-from flcav.perception.weather.evaluate import Classification, evaluate_samples
-from flcav.perception.weather.infer import classify_pictures
-from flcav.perception.weather.loss import batch_loss, imitation_loss
-from flcav.perception.weather.messages import pack_frame, unpack_frame
-from flcav.perception.weather.model import Classifier, LeNet
-from flcav.perception.weather.outcomes import WeatherOutcomes
-from flcav.perception.weather.predict import predict_probabilities
-from flcav.perception.weather.samples import Sample, label_pictures
+from flcav.perception.weather.evaluate import (
+    Classification,
+    WeatherOutcomes,
+    classify_pictures,
+    evaluate_samples,
+    predict_probabilities,
+    tensor_of,
+)
+from flcav.perception.weather.model import CONFIGURATIONS, Classifier, LeNet, LeNetConfig
+from flcav.perception.weather.samples import Sample, augment, label_pictures, pack_frame, unpack_frame
 from flcav.world.weather import WEATHER_CLASSES
 
 
@@ -54,20 +56,18 @@ class WeatherTask(WeatherOutcomes):
         return label_pictures(data, config.classes, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
-        """Return an augmented sample, see `flcav.perception.weather.augment`."""
+        """Return an augmented sample, see `flcav.perception.weather.samples`."""
         return augment(samples[index], rng)
 
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the mean cross entropy of a batch."""
         return batch_loss(network, samples)
 
-    def class_probabilities(self, network: Classifier, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
+    def class_probabilities(self, network: Classifier, samples: Sequence[Sample]) -> list[Array32]:
         """Return the class probabilities (1, classes) of each image."""
         return [*predict_probabilities(network, [sample.picture for sample in samples])[:, None]]
 
-    def imitation_loss(
-        self, network: Classifier, samples: Sequence[Sample], targets: Sequence[NDArray[np.float32]]
-    ) -> Tensor:
+    def imitation_loss(self, network: Classifier, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
         """Return the mean cross entropy of a batch with class probabilities for targets."""
         return imitation_loss(network, samples, targets)
 
@@ -99,3 +99,15 @@ class WeatherTask(WeatherOutcomes):
 
 
 WEATHER = WeatherTask()
+
+
+def batch_loss(network: Classifier, samples: Sequence[Sample]) -> Tensor:
+    """Return the mean cross entropy of `network` on a batch of samples, differentiable in the network's parameters."""
+    logits = network(tensor_of(network, [sample.picture for sample in samples]))
+    return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
+
+
+def imitation_loss(network: Classifier, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
+    """Return the mean cross entropy of `network` with class probabilities (1, classes) of each sample for targets."""
+    logits = network(tensor_of(network, [sample.picture for sample in samples]))
+    return functional.cross_entropy(logits, torch.from_numpy(np.concatenate(targets)).to(logits))

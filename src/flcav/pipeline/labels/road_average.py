@@ -31,8 +31,7 @@ from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import second
+from flcav.perception.objects.model import SecondConfig, second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar

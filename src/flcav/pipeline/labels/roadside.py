@@ -10,7 +10,7 @@ from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import build_road_view
 from flcav.geometry import Boxes
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.frames import Frames

@@ -11,8 +11,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger
 from flcav.network.messages import pack, send, unpack
-from flcav.perception.client import as_shared
-from flcav.perception.distillation import SharedSamples
+from flcav.perception.client import SharedSamples, as_shared
 from flcav.perception.errors import Registry, pack_errors, unpack_errors
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, to_arrays

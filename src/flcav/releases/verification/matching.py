@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.metrics import Matches
-from flcav.perception.metrics.matching import lies_on, on_neutral
+from flcav.perception.metrics.detection import lies_on, on_neutral
 from flcav.perception.objects.truth import FrameTruth, select_class
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 
 Mask = NDArray[np.bool_]
 

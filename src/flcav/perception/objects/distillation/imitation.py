@@ -11,11 +11,17 @@ from collections.abc import Sequence
 import torch.nn.functional as F
 from torch import Tensor
 
-from flcav.perception.objects.loss import BOX_WEIGHT, DIRECTION_WEIGHT, residual_errors, second_loss, smooth_l1
+from flcav.perception.objects.loss import (
+    BOX_WEIGHT,
+    DIRECTION_WEIGHT,
+    assign_anchors,
+    residual_errors,
+    second_loss,
+    smooth_l1,
+)
 from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.predict import voxels_of
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import assign_anchors
 from flcav.perception.objects.task import ObjectsTask
 
 SEEN = 0.1  # score from which on the teacher sees an object

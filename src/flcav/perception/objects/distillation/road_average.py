@@ -17,23 +17,23 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from flcav.arrays import Ints
 from flcav.geometry import Boxes, concatenate, spread_over_footprints
-from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.loss import (
     BOX_WEIGHT,
     DIRECTION_WEIGHT,
     VARIANCE_WEIGHT,
+    Targets,
+    assign_anchors,
     box_losses,
     classification_loss,
 )
-from flcav.perception.objects.model import HeadOutput, Second
+from flcav.perception.objects.model import HeadOutput, Second, SecondConfig
 from flcav.perception.objects.predict import voxels_of
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import Targets, assign_anchors
 from flcav.perception.objects.task import ObjectsTask
 
 MATCH_M = 2.0  # largest distance in bird's-eye view of a vehicle's box from the box of the road average
@@ -131,7 +131,7 @@ def pool_boxes(features: Tensor, boxes: Boxes, config: SecondConfig) -> Tensor:
     return sampled[0].mean(2).T
 
 
-def match_boxes(own: Boxes, road: Boxes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def match_boxes(own: Boxes, road: Boxes) -> tuple[Ints, Ints]:
     """Return rows of `own` and of `road` that are of one object: one to one, nearest in bird's-eye view together.
 
     They are of one class and at most `MATCH_M` apart.
