@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from flcav.geometry import Boxes
-from flcav.perception.objects.distillation.road_average import (
+from flcav.perception.objects.distillation import (
     DistillationTerms,
     contrastive_loss,
     distillation_loss,

@@ -1,6 +1,6 @@
 """Greedy matching of detections to ground truth by IoU, with neutral objects as in the KITTI benchmark."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -53,20 +53,32 @@ def match(
 
 
 def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> Ints:
-    """Return (D,) the index of the target matched to each detection, -1 for none.
+    """Return (D,) the index of the target matched to each detection, -1 for none: `match_greedily` by score.
 
-    Assignment is greedy by score, by IoU of `kind` from `overlap` on; each target is matched once at most. Raises
-    ValueError where there are detections without scores.
+    overlap: IoU of `kind` from which a detection is of a target. Raises ValueError where there are detections without
+    scores.
     """
-    found = np.full(len(detections), -1)
     if not len(detections) or not len(targets):
-        return found
+        return np.full(len(detections), -1)
     ious = iou(torch.from_numpy(detections.array()), torch.from_numpy(targets.array()), kind).numpy()
-    for index in np.argsort(-_scores(detections), kind="stable"):
-        best = int(ious[index].argmax())
-        if ious[index, best] >= overlap:
-            found[index] = best
-            ious[:, best] = -1
+    return match_greedily(ious, overlap, np.argsort(-_scores(detections), kind="stable"))
+
+
+def match_greedily(overlap: Array, least: float, order: Iterable[int] | None = None) -> Ints:
+    """Return (D,) the target matched to each of D detections, -1 for none.
+
+    One detection after the other takes the target left that it overlaps most, from an overlap of `least` (> 0) on.
+
+    Args:
+        overlap: (D, T) of each detection with each target.
+        least: smallest overlap of a match.
+        order: of the detections, by falling score; None: as they stand.
+    """
+    found, left = np.full(len(overlap), -1), overlap.copy()
+    for number in range(len(left)) if order is None else order:
+        if left.size and left[number, best := int(left[number].argmax())] >= least:
+            found[number] = best
+            left[:, best] = -1
     return found
 
 

@@ -41,9 +41,36 @@ from flcav.perception.objects.samples import (
     unpack_sweep,
 )
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range, target_criteria
-from flcav.perception.study import StudyRecipe
+from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, KnownLidar, Practice
 from flcav.sensors.frame import Frame
+
+TOWNS = ("suburb", "ring", "grid")  # of the study
+TRACKS = "tracks"  # test of tracking
+
+
+def streets_study() -> StudyRecipe:
+    """Return the study recipe of drawn streets: five of each town, and a third of the sweeps of `ObjectsTask.study`.
+
+    Cars in those sweeps have flat ends.
+    """
+    recipe, drawn = read_recipe("objects"), read_recipe("streets")
+    tested, drawn_test = {"split": "test", "scenes": 10, "spins_per_scene": 4}, {"split": "test", "scenes": 10}
+    return StudyRecipe(
+        network="small",
+        train=(
+            *({**recipe, "town": town, "scenes": 5} for town in TOWNS),
+            *({**drawn, "town": town, "seed": seed} for town in TOWNS for seed in (23, 25, 27, 29, 31)),
+        ),
+        validation={**drawn, "town": "suburb", "seed": 123, "split": "validation", "scenes": 2},
+        tests={
+            **{town: {**recipe, **tested, "town": town, "seed": 451} for town in TOWNS},
+            "streets": {**drawn, **drawn_test, "town": "suburb", "seed": 453},
+            "streets-arterial": {**drawn, **drawn_test, "town": "arterial", "seed": 455},
+        },
+        epochs=8,
+        patience=8,
+    )
 
 
 class ObjectsTask(ObjectsOutcomes):
@@ -61,10 +88,23 @@ class ObjectsTask(ObjectsOutcomes):
         self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # the latest ground-truth database and its samples
 
     def study(self) -> StudyRecipe:
-        """Return the study recipe of the task, see `flcav.perception.objects.study`."""
-        from flcav.perception.objects.study import STUDY
-
-        return STUDY
+        """Return the study recipe: training in three towns, tests on other scenes of each, in weather, of tracking."""
+        recipe = read_recipe("objects")
+        tested = {**recipe, "split": "test", "scenes": 10, "spins_per_scene": 4}
+        weather = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
+        sequences = {**tested, "spins_per_scene": 20, "every_s": 0.5, "cavs": 1}
+        return StudyRecipe(
+            network="small",
+            train=tuple({**recipe, "town": town} for town in TOWNS),
+            validation={**recipe, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
+            tests={
+                **{town: {**tested, "town": town, "seed": 441} for town in TOWNS},
+                "weathers": {**tested, "town": "suburb", "seed": 541, "weather": weather},
+                TRACKS: {**sequences, "town": "suburb", "seed": 641},
+            },
+            epochs=8,
+            patience=8,
+        )
 
     def build(self, config: SecondConfig) -> Second:
         """Return a new SECOND network; torch's global generator draws its weights."""

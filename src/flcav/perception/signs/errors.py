@@ -12,6 +12,7 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry
 from flcav.perception.images import check_picture
+from flcav.perception.metrics.detection import match_greedily
 from flcav.perception.ops.boxes import rectangle_iou
 from flcav.perception.signs.model import SignDetector, SignsConfig
 from flcav.perception.signs.predict import SignDetections, detect
@@ -71,16 +72,15 @@ def _mistakes(
     wanted = find_targets(shown.box, size, config) & np.array([name in config.classes for name in names], dtype=bool)
     overlap = rectangle_iou(torch.from_numpy(found.box), torch.from_numpy(shown.box)).numpy()
     same = np.array([[config.classes[label] == name for name in names] for label in found.label], dtype=bool)
-    overlap = np.where(same.reshape(overlap.shape), overlap, 0.0)
-    free = wanted.copy()
-    false = []
-    for number in range(len(found)):
-        gain = np.where(free, overlap[number], 0.0)
-        if len(gain) and gain.max() >= OVERLAP:
-            free[gain.argmax()] = False
-        elif size_px(found.box[[number]])[0] >= config.smallest_px and not _on(found.box[number], shown.box[~wanted]):
-            false.append(number)
-    return shown.row[free], np.array(false, dtype=np.int64)
+    matched = match_greedily(np.where(same.reshape(overlap.shape) & wanted, overlap, 0.0), OVERLAP)
+    false = [
+        number
+        for number in np.flatnonzero(matched < 0)
+        if size_px(found.box[[number]])[0] >= config.smallest_px and not _on(found.box[number], shown.box[~wanted])
+    ]
+    missed = wanted.copy()
+    missed[matched[matched >= 0]] = False
+    return shown.row[missed], np.array(false, dtype=np.int64)
 
 
 def _on(box: Array, others: Array) -> bool:

@@ -19,7 +19,7 @@ from flcav.perception.signs.loss import batch_loss, class_probabilities, imitati
 from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
 from flcav.perception.signs.predict import detect_signs
 from flcav.perception.signs.samples import RecordedPictures, Sample, draw, pack_frame, unpack_frame
-from flcav.perception.study import StudyRecipe
+from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, Practice
 
 
@@ -38,10 +38,24 @@ class SignsTask(SignsOutcomes):
     threshold = THRESHOLD
 
     def study(self) -> StudyRecipe:
-        """Return the study recipe, see `flcav.perception.signs.study`."""
-        from flcav.perception.signs.study import STUDY
+        """Return the study recipe: training in three towns, tests on held-out scenes and on a held-out town.
 
-        return STUDY
+        The held-out scenes have all eight classes; the held-out town has only speed limits of 30, yield signs and
+        lights.
+        """
+        arterial = read_recipe("signs")
+        ring = {**arterial, "town": "ring", "warmup_s": [87.0, 89.5]}
+        return StudyRecipe(
+            network="n",
+            train=(arterial, read_recipe("signs_suburb"), read_recipe("signs_grid")),
+            validation={**arterial, "seed": 114, "split": "validation", "scenes": 6},
+            tests={
+                "held-out scenes": {**arterial, "seed": 414, "split": "test", "scenes": 12},
+                "held-out town": {**ring, "seed": 514, "split": "test", "scenes": 10},
+            },
+            epochs=15,
+            patience=15,
+        )
 
     def build(self, config: SignsConfig) -> SignDetector:
         """Return a network with random initial weights."""

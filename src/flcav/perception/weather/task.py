@@ -13,7 +13,7 @@ from flcav.config import Json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
-from flcav.perception.study import StudyRecipe
+from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, Practice
 from flcav.perception.weather.evaluate import (
     Classification,
@@ -25,7 +25,9 @@ from flcav.perception.weather.evaluate import (
 )
 from flcav.perception.weather.model import CONFIGURATIONS, Classifier, LeNet, LeNetConfig
 from flcav.perception.weather.samples import Sample, augment, label_pictures, pack_frame, unpack_frame
-from flcav.world.weather import WEATHER_CLASSES
+from flcav.world.weather import ANY, WEATHER_CLASSES
+
+WHOLE_SPACE = "whole space"  # test of weathers drawn from the whole space of parameters
 
 
 class WeatherTask(WeatherOutcomes):
@@ -42,10 +44,25 @@ class WeatherTask(WeatherOutcomes):
     labels = (ANNOTATED,)
 
     def study(self) -> StudyRecipe:
-        """Return the study recipe, see `flcav.perception.weather.study`."""
-        from flcav.perception.weather.study import STUDY
+        """Return the study recipe: training in three towns, tests on held-out scenes, a held-out town, any weather.
 
-        return STUDY
+        Each scene goes once through all eight classes, so that they are balanced. The test `WHOLE_SPACE` also draws
+        weathers between the classes' regions.
+        """
+        recipe = read_recipe("weather")
+        any_weather = {"classes": [ANY] * 8, "turn_s": 4.0}
+        return StudyRecipe(
+            network="tiny",
+            train=(recipe, {**recipe, "town": "suburb", "seed": 113}, {**recipe, "town": "arterial", "seed": 613}),
+            validation={**recipe, "seed": 213, "split": "validation", "scenes": 20},
+            tests={
+                "held-out scenes": {**recipe, "seed": 1013, "split": "test", "scenes": 12},
+                "held-out town": {**recipe, "town": "grid", "seed": 1113, "split": "test", "scenes": 12},
+                WHOLE_SPACE: {**recipe, "seed": 1213, "split": "test", "scenes": 12, "weather": any_weather},
+            },
+            epochs=60,
+            patience=15,
+        )
 
     def build(self, config: LeNetConfig) -> Classifier:
         """Return a network with random initial weights."""

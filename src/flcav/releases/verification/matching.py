@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.metrics import Matches
-from flcav.perception.metrics.detection import lies_on, on_neutral
+from flcav.perception.metrics.detection import lies_on, match_greedily, on_neutral
 from flcav.perception.objects.truth import FrameTruth, select_class
 from flcav.perception.ops.boxes import iou
 
@@ -74,14 +74,7 @@ def assign_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[
 
     least: IoU from which a detection finds a target. inside (T,): targets that can be found. rows (R,), rising.
     """
-    found = np.full(len(rows), -1)
-    free = np.where(inside, each.iou, -1.0)
-    for place, row in enumerate(rows if inside.any() else ()):
-        best = int(free[row].argmax())
-        if free[row, best] >= least:
-            found[place] = best
-            free[:, best] = -1.0
-    return found
+    return match_greedily(np.where(inside, each.iou, -1.0)[rows], least)
 
 
 def _match_frame(
