@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.driving.seen import EGO
-from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.fusion.road import THRESHOLD, load_road_network
 from flcav.geometry import Boxes, concatenate
 from flcav.network.messages import from_names, pack
 from flcav.network.radio.budget import Radio

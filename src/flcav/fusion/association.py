@@ -177,7 +177,7 @@ def fit_extrinsics(
     """
     cars = [shot.cars[own.car] for shot, own in zip(shots, pairs, strict=True)]
     boxes = np.concatenate([shot.boxes[own.box] for shot, own in zip(shots, pairs, strict=True)])
-    points = np.concatenate([outline(each) for each in cars])
+    points = np.concatenate([outline_cars(each) for each in cars])
     sigma = np.array([side_px(box) for box in boxes])[:, None]
     centers = np.concatenate([each.center for each in cars])
     share = 1 / (cdist(centers, centers) < STILL_M).sum(axis=1, keepdims=True)
@@ -201,7 +201,7 @@ def fit_extrinsics(
     )
 
 
-def outline(cars: Boxes) -> Array:
+def outline_cars(cars: Boxes) -> Array:
     """Return the (N, K, 3) points of cars' outlines, in the frame of their boxes [m]."""
     own = OUTLINE * (0.5, 0.5, 1.0) - (0, 0, 0.5)
     tilt = np.zeros((len(cars), 2)) if cars.tilt is None else cars.tilt
@@ -232,7 +232,7 @@ def _sides(points: Array, view: AssociatedCamera) -> Array:
 
 def _project_with_slope(cars: Boxes, view: AssociatedCamera) -> tuple[Array, Array]:
     """Return the boxes (N, 4) of `_sides` of cars, and their (N, 4, 6) derivative by an error of the extrinsics."""
-    points, step = outline(cars), 1e-5
+    points, step = outline_cars(cars), 1e-5
     moved = [
         _sides(points, replace(view, camera_from_lidar=apply_error(view.camera_from_lidar, step * axis)))
         for axis in np.eye(6)

@@ -4,18 +4,21 @@ Boxes are associated with objects spin by spin: an object moves at constant velo
 of Mahalanobis distance, and the Hungarian method settles which. What one agent tells of an object in several spins may
 be wrong in the same way each time (its pose, its clock), so that it is joined by covariance intersection, which stays
 consistent whatever the correlation (Julier and Uhlmann, ACC 1997), with the weights of Niehsen, "Information fusion
-based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace. What different agents tell is
-joined as independent, by inverse variance.
+based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace. What different agents report
+is joined as independent, by inverse variance.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
+from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
 from flcav.arrays import Array, Ints
-from flcav.geometry import Boxes, wrap_angle
+from flcav.config import Config
+from flcav.geometry import Boxes, pose, wrap_angle
 
 YAW = 6  # column of a box and of its variance
 GATE = 18.4  # largest squared Mahalanobis distance in x, y of a box from its object: 99.99 % of chi-squared, 2 dof
@@ -45,9 +48,9 @@ class RoadAverage:
 
 
 def average_boxes(told: Sequence[BoxReport], at_s: float) -> RoadAverage:
-    """Return the objects at `at_s` [s] that agents tell of in a window of spins.
+    """Return the objects at `at_s` [s] that agents report in a window of spins.
 
-    An agent's score of an object is the mean over all its spins, zero where it does not tell of the object; the average
+    An agent's score of an object is the mean over all its spins, zero where it does not report the object; the average
     has the probability that not all agents err, 1 - product of (1 - score).
     """
     told = list(told)
@@ -171,3 +174,72 @@ def _sums(row: Ints, values: Array, count: int) -> Array:
 
 def _scores(boxes: Boxes) -> Array:
     return np.ones(len(boxes)) if boxes.score is None else boxes.score
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """Standard deviations of a vehicle's own pose and clock, as its navigation states them."""
+
+    position_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Observation of one agent in one spin: its pose by navigation, boxes and posts."""
+
+    agent: str
+    time_s: float  # by its clock
+    world_from_agent: Array  # (4, 4) by its navigation; of a road sensor as surveyed
+    boxes: Boxes  # agent's frame, its origin on the ground, with scores and variances
+    posts: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (L, 2) feet of posts, agent's frame [m]
+    navigation: Navigation | None = None  # None: surveyed, a road sensor
+
+
+def report_boxes(sighting: Sighting) -> BoxReport:
+    """Return what an agent tells of a spin: boxes in the world, with the uncertainty of its pose in their variances.
+
+    A heading error moves a box at distance r by r times the error, across the line of sight.
+    """
+    boxes = sighting.boxes.transform(sighting.world_from_agent)
+    return BoxReport(sighting.agent, sighting.time_s, add_pose_variance(boxes, sighting))
+
+
+def add_pose_variance(boxes: Boxes, sighting: Sighting) -> Boxes:
+    """Return boxes, world frame, with the variance of an agent's pose added to theirs; of road sensors as they are."""
+    if sighting.navigation is None:
+        return boxes
+    known, variance = sighting.navigation, variance_of(boxes)
+    arm = boxes.center[:, :2] - sighting.world_from_agent[:2, 3]
+    variance[:, :2] += known.position_m**2 + (arm[:, ::-1] * known.heading_rad) ** 2
+    variance[:, YAW] += known.heading_rad**2
+    return replace(boxes, variance=variance)
+
+
+class NavigationErrors(Config):
+    """Standard deviations of the errors of vehicles' poses and clocks; those of poses are drawn for each frame."""
+
+    position_m: float = Field(default=0.0, ge=0, le=10)  # of a vehicle's position, along x and along y
+    heading_deg: float = Field(default=0.0, ge=0, le=45)  # of its heading
+    clock_s: float = Field(default=0.0, ge=0, le=1)  # of its clock's offset, one in each scene
+
+    @property
+    def stated(self) -> Navigation:
+        """Return what a vehicle states of its accuracy."""
+        return state_accuracy(self.position_m, float(np.radians(self.heading_deg)))
+
+    def navigate(self, world_from_agent: Array, rng: np.random.Generator) -> Array:
+        """Return a vehicle's pose (4, 4) as its navigation has it, with errors drawn from `rng`."""
+        off_m, turned = self.position_m * rng.standard_normal(2), np.radians(self.heading_deg) * rng.standard_normal()
+        known = world_from_agent @ pose(0, 0, 0, float(turned))
+        known[:2, 3] = world_from_agent[:2, 3] + off_m
+        return known
+
+
+ESTIMATED: Literal["estimated"] = "estimated"
+PoseSource = NavigationErrors | Literal["estimated"]  # "estimated": see `flcav.fusion.inertial`; clocks are exact
+
+
+def state_accuracy(position_m: float, heading_rad: float) -> Navigation:
+    """Return standard deviations as a vehicle states them: at least a centimetre and .001 rad."""
+    return Navigation(max(position_m, 0.01), max(heading_rad, 0.001))

@@ -1,4 +1,4 @@
-"""Labels by federated distillation: what vehicles tell the edge server, and what they learn from the road average.
+"""Labels by federated distillation: what vehicles report to the edge server, and what they learn from the road average.
 
 Wang et al. (IEEE Network 37(3), 2023): road sensors and vehicles send boxes with their uncertainties to the edge
 server, which averages them over a window of spins (`flcav.fusion.average`); each vehicle learns from the average at
@@ -9,7 +9,7 @@ truth, and vehicles know poses and times by their own navigation alone.
   each with a score that reaches the threshold of pseudo-labels in the mean of its spins, 0 in those without the box.
   Vehicles run one network and see one street: that two of them are half sure of a wall is no evidence of a car.
 - What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself.
-- What vehicles alone tell of is dropped where road sensors saw free ground, or have a box of their own.
+- What vehicles alone report is dropped where road sensors saw free ground, or have a box of their own.
 - An anchor is a negative only where a road sensor saw free ground.
 """
 
@@ -18,26 +18,109 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial import KDTree
+from shapely import STRtree
+from shapely.geometry import Polygon
 
 from flcav.arrays import Array, Ints, Mask
 from flcav.config import Config
-from flcav.fusion.average import RoadAverage, average_boxes, variance_of
+from flcav.fusion.average import (
+    YAW,
+    Navigation,
+    RoadAverage,
+    Sighting,
+    add_pose_variance,
+    average_boxes,
+    report_boxes,
+    variance_of,
+)
 from flcav.fusion.labels import cell_centers
-from flcav.fusion.map_context import MapContext, snap_to_map
 from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
-from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
-from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points
+from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points, wrap_angle
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
+from flcav.world.map.layers import MapLane, MapLayers
+
+STEP_M = 1.0  # between two points of a lane's centre line
+LANE_RAD = np.radians(4.0)  # standard deviation of a car's heading about its lane's
+ALONG_RAD = np.radians(30.0)  # a car that is turned farther from every lane does not follow one: it turns, or is parked
+WALKING_MPS = 2.5  # fastest pedestrian
+CARS = ("car", "van", "Car")
+PEDESTRIAN, CYCLIST = ("pedestrian", "Pedestrian"), ("bicycle", "Cyclist")
+
+
+@dataclass(frozen=True)
+class MapContext:
+    """The parts of a town's map that labels are snapped to."""
+
+    points: KDTree  # (Q, 2) points of the centre lines of driving lanes
+    yaw: Array  # (Q,) direction of driving there [rad]
+    half_width_m: Array  # (Q,)
+    walked: STRtree  # sidewalks and crossings
+
+
+def build_context(layers: MapLayers) -> MapContext:
+    """Return the context of a lane-level map; raises ValueError where it has no driving lane."""
+    parts = [_sample(lane) for lane in layers.lanes if lane.kind == "driving" and len(lane.centre_line) > 1]
+    if not parts:
+        raise ValueError("the map has no driving lane")
+    rows = np.concatenate(parts)
+    areas = [Polygon(outline) for outline in (*layers.sidewalks, *(each.outline for each in layers.crossings))]
+    return MapContext(KDTree(rows[:, :2]), rows[:, 2], rows[:, 3], STRtree(areas))
+
+
+def snap_to_map(boxes: Boxes, velocity: Array, context: MapContext) -> Boxes:
+    """Return the boxes (N,), world frame, with headings of cars on lanes and classes of people snapped to the map.
+
+    velocity: (N, 2) [m/s]. Of several lanes at a place, as on a junction, the one nearest to the box's axis counts.
+    """
+    yaw, variance, label = boxes.yaw.copy(), variance_of(boxes), boxes.label.tolist()
+    for row in np.flatnonzero(np.isin(boxes.label, CARS)):
+        near = np.array(context.points.query_ball_point(boxes.center[row, :2], r=3.0), dtype=np.int64)
+        if not len(near):
+            continue
+        apart = np.linalg.norm(context.points.data[near] - boxes.center[row, :2], axis=1)
+        near = near[apart <= context.half_width_m[near]]
+        axis = np.abs((context.yaw[near] - yaw[row] + np.pi / 2) % np.pi - np.pi / 2)
+        if not len(near) or axis.min() > ALONG_RAD:
+            continue
+        lane = context.yaw[near[axis.argmin()]]
+        off = (yaw[row] - lane + np.pi / 2) % np.pi - np.pi / 2
+        share = LANE_RAD**2 / (LANE_RAD**2 + variance[row, YAW])
+        yaw[row] = wrap_angle(lane + share * off)
+        variance[row, YAW] *= share
+    people = np.flatnonzero(np.isin(boxes.label, (*PEDESTRIAN, *CYCLIST)))
+    walked = np.zeros(len(people), dtype=bool)
+    walked[context.walked.query(shapely.points(boxes.center[people, :2]), predicate="within")[0]] = True
+    slow = np.hypot(*velocity[people].T) <= WALKING_MPS
+    for row, on_foot, fast in zip(people, walked, ~slow, strict=True):
+        names = PEDESTRIAN if on_foot and not fast else CYCLIST
+        if on_foot != fast:  # the map and the speed agree
+            label[row] = names[0 if label[row] in (PEDESTRIAN[0], CYCLIST[0]) else 1]
+    return replace(boxes, yaw=yaw, label=np.array(label, dtype=np.str_), variance=variance)
+
+
+def _sample(lane: MapLane) -> Array:
+    """Return (Q, 4) points of a lane: x, y, direction, half the width."""
+    steps = np.diff(lane.centre_line, axis=0)
+    lengths = np.hypot(*steps.T)
+    counts = np.maximum(np.ceil(lengths / STEP_M).astype(int), 1)
+    number = np.repeat(np.arange(len(steps)), counts)
+    share = (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5) / counts[number]
+    xy = lane.centre_line[:-1][number] + share[:, None] * steps[number]
+    yaw = np.arctan2(steps[:, 1], steps[:, 0])[number]
+    return np.column_stack((xy, yaw, np.full(len(xy), lane.width_m / 2)))
+
 
 TOLD = 0.1  # lowest score of a detection that a vehicle tells of
-FREE = 0.5  # what vehicles alone tell of is dropped where road sensors saw more than this share of its footprint free
+FREE = 0.5  # what vehicles alone report is dropped where road sensors saw more than this share of its footprint free
 PARTS = (8, 4)  # of a footprint, along and across, by which that share is measured
 RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the object's: poses are off
 
@@ -123,7 +206,7 @@ def average_spin(
     at_s = float(np.median(surveyed_s or times_s or [0.0]))
     if posts is not None:
         told = correct_poses(told, posts, at_s)
-    average = average_boxes([tell(each) for each in told], at_s)
+    average = average_boxes([report_boxes(each) for each in told], at_s)
     boxes = average.boxes if context is None else snap_to_map(average.boxes, average.velocity, context)
     road, sure = _count_votes(told, average, threshold)
     kept = select_labels(boxes, road, views, threshold)

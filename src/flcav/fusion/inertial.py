@@ -53,7 +53,7 @@ IMPOSSIBLE = 10.0  # mean of fixes' normalised squared innovations, of 3 dimensi
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MotionEstimate:
     """Estimated poses of a vehicle at T times, and their covariance."""
 
     world_from_agent: Array  # (T, 4, 4)
@@ -86,7 +86,7 @@ class _States(NamedTuple):
 
 def estimate_drive(
     log: NavigationLog, mounts: Mounts, geo: GeoReference, ground: Callable[[Array, Array], Array], at_s: Array
-) -> Estimate:
+) -> MotionEstimate:
     """Return the poses of a vehicle at the times `at_s` (T,) within its log, by all of the log.
 
     geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. Of the
@@ -357,7 +357,7 @@ def _log(turn: Array) -> Array:
     return cross * (angle / sine if sine > 1e-9 else 1.0)
 
 
-def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> Estimate:
+def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> MotionEstimate:
     """Return the poses of the vehicle's origin, `lever` from the IMU, so long after each state (T,)."""
     count = len(after_s)
     poses, covariance = np.zeros((count, 4, 4)), np.zeros((count, 6, 6))
@@ -368,4 +368,4 @@ def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> Esti
         jacobian = np.zeros((6, STATES))
         jacobian[:3, :3], jacobian[:3, 6:9], jacobian[3:, 6:9] = np.eye(3), -turn @ _skew(lever), np.eye(3)
         covariance[i] = jacobian @ state.covariance[i] @ jacobian.T
-    return Estimate(poses, covariance)
+    return MotionEstimate(poses, covariance)

@@ -7,18 +7,18 @@ Magazine 2(4), 2010). The Huber kernel bounds the weight of wrong associations. 
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import label
 
-from flcav.arrays import Array
+from flcav.arrays import Array, Array32
 from flcav.config import InputError
-from flcav.fusion.average import YAW, RoadAverage, average_boxes, variance_of
-from flcav.fusion.clocks import set_clocks
-from flcav.fusion.sightings import Navigation, Sighting, tell
+from flcav.fusion.average import YAW, Navigation, RoadAverage, Sighting, average_boxes, report_boxes, variance_of
 from flcav.geometry import pose, transform_points, wrap_angle, yaw_of
 from flcav.interface.extras import format_install_command
+from flcav.world.map.town import Town
 
 POST_M = 0.15  # standard deviation of a post's foot
 POST_GATE_M = 1.5  # farthest a post may lie from its place on the map, beside the error of the pose
@@ -35,7 +35,7 @@ def correct_poses(sightings: Sequence[Sighting], posts: Array, at_s: float) -> l
     corrected = list(sightings)
     for _ in range(PASSES):
         corrected = set_clocks(corrected, at_s)
-        found = average_boxes([tell(each) for each in corrected], at_s)
+        found = average_boxes([report_boxes(each) for each in corrected], at_s)
         corrected = _optimise(sightings, corrected, found, posts)
     return corrected
 
@@ -129,7 +129,7 @@ class _Seen(NamedTuple):
 
 
 def _share_objects(sightings: Sequence[Sighting], found: RoadAverage) -> list[list[_Seen]]:
-    """Return the objects that several agents tell of at about one instant, each as these agents saw it.
+    """Return the objects that several agents report at about one instant, each as these agents saw it.
 
     The instants are those of the road sensors, or of all agents where there are none. A box is moved to the nearest
     instant by its object's velocity, and turned by 180 degrees where it faces against the object.
@@ -160,3 +160,131 @@ def _import_gtsam() -> Any:
     except ImportError:
         raise InputError(f"a pose graph needs GTSAM, which is in: {format_install_command('fusion')}") from None
     return gtsam
+
+
+CLOCK_S = 0.3  # standard deviation of an offset, before anything is seen
+OFFSETS_S: Array = np.linspace(-0.9, 0.9, 91)  # within three of these
+LEAST_SPEED_MPS = 2.0  # slower objects say little about clocks
+TRACE_M = 0.2  # standard deviation of a trace, and of a vehicle's origin from the middle of its body
+BEYOND_S = 0.6  # farthest a trace is continued before its first and after its last instant
+OUTLIERS = 0.05  # share of places that belong to no trace
+LEAST_EVIDENCE = 2.0  # log-likelihood that an offset has above none: two standard deviations
+
+
+@dataclass(frozen=True)
+class ObjectPath:
+    """The path of an object by road sensors alone."""
+
+    times_s: Array  # (T,) increasing, two or more
+    places: Array  # (T, 2) x, y, world frame [m]
+
+    def place_at(self, times_s: Array) -> Array:
+        """Return places (..., 2) at times (...): on straight lines between instants; infinite beyond `BEYOND_S`."""
+        known, at = self.times_s, np.asarray(times_s)
+        before = np.clip(np.searchsorted(known, at) - 1, 0, len(known) - 2)
+        share = (at - known[before]) / (known[before + 1] - known[before])
+        found = self.places[before] + (self.places[before + 1] - self.places[before]) * share[..., None]
+        found[(at < known[0] - BEYOND_S) | (at > known[-1] + BEYOND_S)] = np.inf
+        return found
+
+
+def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
+    """Return the sightings with the times of vehicles set to the clock of the road sensors, where these see them move.
+
+    at_s: time at which objects of different spins are associated [s]. Offsets that explain no more than none, by
+    `LEAST_EVIDENCE`, are left.
+    """
+    traces = trace_objects([each for each in sightings if each.navigation is None], at_s)
+    offset = {
+        agent: estimate_offset([each for each in sightings if each.agent == agent], traces)
+        for agent in {each.agent for each in sightings if each.navigation is not None}
+    }
+    return [replace(each, time_s=each.time_s - offset.get(each.agent, 0.0)) for each in sightings]
+
+
+def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[ObjectPath]:
+    """Return the paths of moving objects that road sensors report at two instants or more."""
+    found: dict[int, dict[float, list[tuple[Array, float]]]] = {}
+    told = [report_boxes(each) for each in surveyed]
+    for each, member in zip(told, average_boxes(told, at_s).member, strict=True):
+        certain = 1 / variance_of(each.boxes)[:, :2].mean(axis=1)
+        for number, place, weight in zip(member.tolist(), each.boxes.center[:, :2], certain.tolist(), strict=True):
+            found.setdefault(number, {}).setdefault(round(each.time_s, 3), []).append((place, weight))
+    traces = []
+    for seen in found.values():
+        times = np.array(sorted(seen))
+        places = np.array([_average(seen[time]) for time in times.tolist()])
+        if len(times) > 1 and np.linalg.norm(places[-1] - places[0]) >= LEAST_SPEED_MPS * (times[-1] - times[0]):
+            traces.append(ObjectPath(times, places))
+    return traces
+
+
+def _average(seen: Sequence[tuple[Array, float]]) -> Array:
+    """Return the mean (2,) of places by their weights."""
+    places, weights = (np.array(column) for column in zip(*seen, strict=True))
+    return weights @ places / weights.sum()
+
+
+def estimate_offset(own: Sequence[Sighting], traces: Sequence[ObjectPath]) -> float:
+    """Return by how much a vehicle's clock is fast [s]; 0 where `traces` do not determine it.
+
+    own: what the vehicle tells of, and where it was itself.
+    """
+    if not traces:
+        return 0.0
+    evidence = -0.5 * (OFFSETS_S / CLOCK_S) ** 2
+    for each in own:
+        assert each.navigation is not None
+        boxes = report_boxes(each).boxes
+        places = np.vstack((boxes.center[:, :2], each.world_from_agent[:2, 3]))
+        variance = np.append(variance_of(boxes)[:, :2].mean(axis=1), each.navigation.position_m**2) + TRACE_M**2
+        weight = np.append(np.ones(len(boxes)) if boxes.score is None else boxes.score, 1.0)
+        expected = np.stack([trace.place_at(each.time_s - OFFSETS_S) for trace in traces])
+        apart = np.linalg.norm(places[:, None, None] - expected[None], axis=3).min(axis=1)  # (places, offsets)
+        evidence += weight @ np.log(OUTLIERS + np.exp(-0.5 * apart**2 / variance[:, None]))
+    best = int(evidence.argmax())
+    return float(OFFSETS_S[best]) if evidence[best] - evidence[len(OFFSETS_S) // 2] > LEAST_EVIDENCE else 0.0
+
+
+CELL_M = 0.2  # edge of a cell of the bird's-eye grid
+BAND_M = (0.5, 2.2)  # heights above the road in which posts are looked for: above kerbs, below the plates of signs
+LEAST_M = 0.9  # least height of a column of returns
+WIDEST_M = 0.45  # largest extent of a post along x and along y
+REACH_M = 40.0  # farther posts have too few returns
+LEAST_RETURNS = 4
+
+
+def segment_posts(points: Array32, height_m: float) -> Array:
+    """Return the feet (L, 2) x, y [m] of the posts in a sweep (N, >= 3), in the frame of the points.
+
+    height_m: of the frame's origin above the road. Columns touch where their cells do, also at corners.
+    """
+    z = points[:, 2] + height_m
+    near = (z > BAND_M[0]) & (z < BAND_M[1]) & (np.abs(points[:, :2]) < REACH_M).all(axis=1)
+    xy, z = points[near, :2].astype(np.float64), z[near].astype(np.float64)
+    cells = round(2 * REACH_M / CELL_M)
+    at = np.minimum(((xy + REACH_M) / CELL_M).astype(np.int64), cells - 1)
+    grid = np.zeros((cells, cells), dtype=bool)
+    grid[at[:, 0], at[:, 1]] = True
+    columns = np.zeros(grid.shape, dtype=np.int64)
+    count = int(label(grid, np.ones((3, 3)), output=columns))  # pyright: ignore[reportArgumentType]
+    number = columns[at[:, 0], at[:, 1]] - 1
+    returns = np.bincount(number, minlength=count)
+
+    def extent(values: Array) -> tuple[Array, Array]:
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, number, values)
+        np.maximum.at(high, number, values)
+        return low, high
+
+    (low_x, high_x), (low_y, high_y), (low_z, high_z) = (extent(values) for values in (xy[:, 0], xy[:, 1], z))
+    thin = (high_x - low_x <= WIDEST_M) & (high_y - low_y <= WIDEST_M)
+    posts = (returns >= LEAST_RETURNS) & thin & (high_z - low_z >= LEAST_M)
+    return np.column_stack(((low_x + high_x) / 2, (low_y + high_y) / 2))[posts]
+
+
+def posts_of(town: Town) -> Array:
+    """Return the feet (P, 2) x, y [m] of the posts on a town's map: lamps, masts of sensors and signals, sign posts."""
+    parts = (town.lamps[:, :2], town.poles.position[:, :2], town.signs.position[:, :2], town.signals.foot)
+    feet = np.concatenate([part.reshape(-1, 2) for part in parts])
+    return np.unique(feet, axis=0)

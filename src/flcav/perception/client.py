@@ -69,7 +69,7 @@ class WholeFrames:
 
     def pack_samples(self, data: Dataset, config: Any, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its point clouds, images and boxes."""
-        return (pack_frame(data, i) for i in frames)
+        return (pack_whole_frame(data, i) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: Any) -> None:
         """Return None: what a task makes of a whole frame it reads from the recording."""
@@ -88,7 +88,7 @@ def check_network(task: Task, network: str | None) -> None:
         task.check_for_vehicles(config)
 
 
-def pack_frame(data: Dataset, i: int) -> bytes:
+def pack_whole_frame(data: Dataset, i: int) -> bytes:
     """Return a whole frame as a message: point clouds, image files as recorded, and annotated boxes in the world."""
     frame = data.frame(i)
     boxes = frame.annotations.boxes

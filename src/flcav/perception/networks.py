@@ -29,7 +29,7 @@ from flcav.perception.outcomes import NetworkComparison, as_measurable, compare_
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking import evaluate_tracks, group_sequences
-from flcav.perception.training.run import WEIGHTS, Request, train_network
+from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
 from flcav.perception.weights import Card, find_shipped, join_lidars, load_network, read_card, read_lidar
 
 Named = str | Task
@@ -115,7 +115,9 @@ def train(
     folders = data if isinstance(data, Sequence) and not isinstance(data, str) else [data]
     held = None if validation is None else open_data(validation)
     place = select_device(device)
-    request = Request([open_data(each) for each in folders], held, network, epochs, patience, seed, place, agents)
+    request = TrainingRequest(
+        [open_data(each) for each in folders], held, network, epochs, patience, seed, place, agents
+    )
     learned, weights = resolve_task(task), Path(out) / WEIGHTS
     card = train_network(learned, request, Path(out), progress)
     return TrainedNetwork(load_network(learned, weights).to(place), card, weights)

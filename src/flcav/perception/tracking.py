@@ -178,7 +178,7 @@ class Tracker:
         for label in sorted({track.label for track in self._tracks}):
             tracks = [track for track in self._tracks if track.label == label]
             own = np.flatnonzero(detections.label == label)
-            for t, d in assign_detections([track.state for track in tracks], rows[own], variance[own], after_s):
+            for t, d in associate_detections([track.state for track in tracks], rows[own], variance[own], after_s):
                 track, number = tracks[t], own[d]
                 state = update_state(track.state, rows[number], variance[number])
                 track.state, track.ahead_m = head_with_motion(state, track.ahead_m, time_s - track.seen_s)
@@ -208,7 +208,9 @@ class Tracker:
         return Tracked(boxes, np.array([track.number for track in told], dtype=np.int64), mean[:, 7:])
 
 
-def assign_detections(states: list[TrackState], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
+def associate_detections(
+    states: list[TrackState], boxes: Array, variance: Array, after_s: float
+) -> list[tuple[int, int]]:
     """Return the pairs (index of a state, index of a box) of least total cost: the Hungarian method within the gate.
 
     The cost is twice the negative log-likelihood of the detection's x, y under the prediction, up to a constant.

@@ -33,8 +33,7 @@ from flcav.experiments.placement.records import (
 from flcav.experiments.placement.run import choose_near, list_regions, plan_half_width, summarise_gains
 from flcav.experiments.placement.spread import spread_over_scenes
 from flcav.experiments.placement.tables import tables
-from flcav.fusion.detector import TRAINED_IN
-from flcav.fusion.road import RoadView
+from flcav.fusion.road import TRAINED_IN, RoadView
 from flcav.geometry import Boxes, pose
 from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError

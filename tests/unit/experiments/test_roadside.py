@@ -14,7 +14,7 @@ from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.fig4 import EDGES_M, find_range
 from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SHARED, LidarModel, SensorRanges
-from flcav.fusion.sightings import Navigation, Sighting
+from flcav.fusion.average import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
 from flcav.pipeline.provenance import provenance
 from flcav.sensors.rig import RIGS, Rig

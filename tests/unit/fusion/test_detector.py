@@ -7,7 +7,7 @@ import shapely
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.detector import detect_frames, score_town
-from flcav.fusion.detector import (
+from flcav.fusion.road import (
     OFF_ROAD_M,
     ROAD,
     TRAINED_IN,

@@ -12,7 +12,7 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.fusion.detector import ROAD
+from flcav.fusion.road import ROAD
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
 from flcav.perception.networks import find_trained_lidar

@@ -25,7 +25,7 @@ from flcav.perception.errors import (
 from flcav.perception.signs import errors as sign_errors
 from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
 from flcav.perception.signs.predict import SignDetections
-from flcav.perception.signs.samples import sample_from_frame
+from flcav.perception.signs.samples import label_picture
 from flcav.perception.trajectory import evaluate as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS
 from flcav.perception.trajectory.model import TrajectoryNetwork
@@ -56,14 +56,14 @@ def seen(data: Dataset, config: SignsConfig) -> list[SignDetections]:
     out = []
     for number in range(len(data)):
         frame = data.frame(number)
-        sample = sample_from_frame(frame, "front", data.plane(number, "front", "rgb"), config)
+        sample = label_picture(frame, "front", data.plane(number, "front", "rgb"), config)
         out.append(SignDetections(sample.boxes, sample.label, np.ones(len(sample.label))))
     return out
 
 
 def registered(data: Dataset, network: SignDetector, found: list[SignDetections], monkeypatch: pytest.MonkeyPatch):
     answers = iter(found)
-    monkeypatch.setattr(sign_errors, "detect", lambda *_, **__: next(answers))
+    monkeypatch.setattr(sign_errors, "detect_in_picture", lambda *_, **__: next(answers))
     return sign_errors.register_errors(network, data, range(len(data)), 0.3)
 
 

@@ -17,7 +17,7 @@ from flcav.geometry import heading_vectors, wrap_angle
 from flcav.perception.trajectory import samples, tracks
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
 from flcav.perception.trajectory.rasters import RoadMap, road_map
-from flcav.perception.trajectory.samples import extract_columns, find_near, find_pictured, surround
+from flcav.perception.trajectory.samples import extract_columns, find_near, find_pictured, surround_vehicle
 from flcav.perception.trajectory.tracks import OFFSETS_S, extrapolate, tracks_around, tracks_at
 from flcav.world.map.town import load_town
 from flcav.world.scenarios.stage import STEP_S
@@ -241,7 +241,7 @@ def test_the_network_with_cameras_sees_earlier_pictures(monkeypatch):
         return np.zeros((1, 48, 96, 3), np.uint8), np.eye(3)[None], np.eye(4)[None]
 
     monkeypatch.setattr(samples, "_kept", lambda _: read)
-    surround(spins(60.0, 60.5, 61.0), 4, np.zeros(3), CrossView())
+    surround_vehicle(spins(60.0, 60.5, 61.0), 4, np.zeros(3), CrossView())
     assert asked == [2]
 
 

@@ -15,11 +15,9 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.errors import Errors, apply_errors
 from flcav.experiments.roadside.sightings import SightedScene, read_scenes
-from flcav.fusion.average import RoadAverage, average_boxes
-from flcav.fusion.map_context import MapContext, build_context, snap_to_map
-from flcav.fusion.pose_graph import correct_poses
-from flcav.fusion.posts import posts_of
-from flcav.fusion.sightings import Sighting, tell
+from flcav.fusion.average import RoadAverage, Sighting, average_boxes, report_boxes
+from flcav.fusion.distillation import MapContext, build_context, snap_to_map
+from flcav.fusion.pose_graph import correct_poses, posts_of
 from flcav.geometry import Boxes, inverse, wrap_angle, yaw_of
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.metrics import average_precision, match
@@ -167,7 +165,7 @@ def fuse(sightings: list[Sighting], posts: np.ndarray, at_s: float, arm: str) ->
         sightings = [replace(each, navigation=None) for each in sightings]
     elif arm == GRAPH:
         sightings = correct_poses(sightings, posts, at_s)
-    return average_boxes([tell(each) for each in sightings], at_s)
+    return average_boxes([report_boxes(each) for each in sightings], at_s)
 
 
 def _point(
@@ -226,7 +224,7 @@ def _snap(scenes: Mapping[str, SightedScene], context: MapContext) -> Snapped:
         for spin in SPINS:
             at_s = scene.time_s[spin]
             window = [s for s in scene.sightings if at_s - WINDOW_S - 1e-6 <= s.time_s <= at_s + 1e-6]
-            average = average_boxes([tell(each) for each in window], at_s)
+            average = average_boxes([report_boxes(each) for each in window], at_s)
             after = snap_to_map(average.boxes, average.velocity, context)
             truth = scene.truth[spin]
             target = assign_targets(average.boxes, truth.targets, 0.5, "bev")

@@ -22,13 +22,13 @@ from flcav.fusion.association import (
     pair,
     spread_of_calibration,
 )
-from flcav.fusion.detector import PICTURE_THRESHOLD, load_picture_network
 from flcav.fusion.registration import Offset, measure_offset
+from flcav.fusion.road import PICTURE_THRESHOLD, load_picture_network
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.truth import CARS
 from flcav.perception.ops.boxes import rectangle_iou
-from flcav.perception.signs.predict import detect
+from flcav.perception.signs.predict import detect_in_picture
 from flcav.perception.signs.samples import picture_reader
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
@@ -87,7 +87,7 @@ def associate_camera(
     read = picture_reader(data, network.config.background)
     made = []
     for number in numbers:
-        boxes = detect(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
+        boxes = detect_in_picture(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
         made.append(name_actors(data.frame(number), lidar, camera, PairedShot(find(number), boxes)))
     shots, known = [shot for shot, _ in made], [actors for _, actors in made]
     height, width = data.plane(numbers[0], camera, "rgb").shape[:2]

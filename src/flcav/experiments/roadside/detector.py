@@ -14,8 +14,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.maps import import_map
 from flcav.experiments.roadside.labels import RoadLabels, measure_road_labels
-from flcav.fusion.detector import THRESHOLD, road_detector
-from flcav.fusion.road import MIN_RETURNS
+from flcav.fusion.road import MIN_RETURNS, THRESHOLD, road_detector
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
@@ -69,7 +68,7 @@ class TownScore:
 class RoadDetectorResult(Record):
     """Scores of the road detector in validation and test towns."""
 
-    threshold: float  # lowest score of a label, see `flcav.fusion.detector`
+    threshold: float  # lowest score of a label, see `flcav.fusion.road`
     fitted: float  # lowest threshold with `LEAST_PRECISION` on the validation towns, as computed here
     towns: tuple[TownScore, ...]
     labels: RoadLabels  # that vehicles get

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from flcav.fusion.sightings import Navigation, Sighting
+from flcav.fusion.average import Navigation, Sighting
 from flcav.geometry import pose
 
 

@@ -15,9 +15,8 @@ from flcav.config import parse_config
 from flcav.dataset.ground import Ground
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.fusion.detector import load_road_network
 from flcav.fusion.labels import label_sample
-from flcav.fusion.road import RoadView
+from flcav.fusion.road import RoadView, load_road_network
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.model import CONFIGURATIONS, SecondConfig

@@ -18,7 +18,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.roadside.fig4 import LIDAR, OVERLAP, find_range, list_cars
-from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.fusion.road import THRESHOLD, load_road_network
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import frame_reader
 from flcav.perception.metrics.detection import assign_targets

@@ -6,9 +6,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from flcav.dataset.store import Dataset
-from flcav.fusion.detector import load_road_network, road_detector
-from flcav.fusion.posts import find_posts
-from flcav.fusion.sightings import Navigation, Sighting
+from flcav.fusion.average import Navigation, Sighting
+from flcav.fusion.pose_graph import segment_posts
+from flcav.fusion.road import load_road_network, road_detector
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
@@ -63,7 +63,7 @@ def read_scenes(data: Dataset, progress: Report = ignore_progress) -> dict[str, 
             lidar = choose_lidar(frame)
             agent_from_lidar = frame.agent_from_sensor[lidar]
             found = detect(vehicles, frame.lidar[lidar], score_threshold=SCORE)
-            posts = find_posts(transform_points(agent_from_lidar, frame.lidar[lidar][:, :3]), 0.0)
+            posts = segment_posts(transform_points(agent_from_lidar, frame.lidar[lidar][:, :3]), 0.0)
             own = found[found.label == CAR].transform(agent_from_lidar)
             told = Sighting(key.agent, key.time_s, frame.world_from_agent, own, posts, EXACT)
         rows.setdefault(key.scene, []).append((key.index, told))

@@ -15,7 +15,7 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.splits import open_split, record_split
 from flcav.perception.study import RecipeFields, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
-from flcav.perception.training.run import WEIGHTS, Request, train_network
+from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
 from flcav.perception.weights import Card, load_network
 from flcav.pipeline.engine import Notify, Step, Work, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
@@ -95,7 +95,7 @@ class Study(Generic[EvaluationT]):
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
         """Train the network of one seed, resuming an interrupted training; return its card as JSON."""
         data = [open_split(work.inputs[step]) for step in _training_steps(self)]
-        request = Request(data, open_split(work.inputs[VALIDATION]), network, epochs, patience, seed)
+        request = TrainingRequest(data, open_split(work.inputs[VALIDATION]), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> Json:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from flcav.arrays import Array, Ints, Mask
 from flcav.geometry import Boxes
 from flcav.perception.metrics.detection import assign_targets, on_neutral
+from flcav.perception.ops.boxes import Kind
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.storage.records import Class
 
@@ -72,12 +73,12 @@ def describe_counts(counts: Sequence[FoundAtDistance]) -> list[str]:
     return [f"at a score of {SCORE:g} and 3D IoU {OVERLAP:g}, by distance:", *(row.describe() for row in counts)]
 
 
-def _count_frame(seen: Boxes, wanted: Boxes, others: Boxes) -> tuple[NDArray, NDArray, NDArray]:
+def _count_frame(seen: Boxes, wanted: Boxes, others: Boxes, kind: Kind = "3d") -> tuple[NDArray, NDArray, NDArray]:
     """Return the distances [m] of a frame's targets, of those found, and of false detections."""
     if seen.score is None and len(seen):
         raise ValueError("detections without scores cannot be counted")
     kept = seen if seen.score is None else seen[seen.score >= SCORE]
-    matched = assign_targets(kept, wanted, OVERLAP)
+    matched = assign_targets(kept, wanted, OVERLAP, kind)
     away, far = (np.hypot(boxes.center[:, 0], boxes.center[:, 1]) for boxes in (wanted, kept))
     return away, away[matched[matched >= 0]], far[(matched < 0) & ~on_neutral(kept, others)]
 
@@ -130,15 +131,8 @@ def count_found_cars(
     """
     if not detections:
         raise ValueError("cars of 0 frames cannot be counted")
-    cars = found = false = 0
-    for seen, wanted, others in zip(detections, targets, neutral, strict=True):
-        if seen.score is None and len(seen):
-            raise ValueError("detections without scores cannot be counted")
-        kept = seen if seen.score is None else seen[seen.score >= SCORE]
-        matched, near = assign_targets(kept, wanted, OVERLAP, "bev"), is_near(wanted)
-        cars += int(near.sum())
-        found += int(near[matched[matched >= 0]].sum())
-        false += int(((matched < 0) & is_near(kept) & ~on_neutral(kept, others)).sum())
+    frames = [_count_frame(*frame, "bev") for frame in zip(detections, targets, neutral, strict=True)]
+    cars, found, false = (sum(int((away < WITHIN_M).sum()) for away in part) for part in zip(*frames))
     return FoundCars(cars, found, round(false / (len(detections) * looks), 6))
 
 

@@ -19,7 +19,7 @@ import torch
 from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
 from flcav.perception.objects.model import Augmentation, SecondConfig
-from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.samples import Sample, map_sample
 from flcav.perception.objects.truth import MIN_RETURNS, in_range
 from flcav.perception.ops.boxes import iou
 
@@ -74,8 +74,7 @@ def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: floa
         return replace(boxes, center=center, size=boxes.size * scale, yaw=yaw, variance=variance)
 
     free = None if sample.free is None else (sample.free @ plane).astype(np.float32)
-    own = None if sample.own is None else moved(sample.own)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact, own)
+    return map_sample(sample, points, moved, free)
 
 
 def resize_objects(sample: Sample, factor: Array) -> Sample:
@@ -105,14 +104,8 @@ def shift_sample(sample: Sample, by_m: Array) -> Sample:
     """Return the sample shifted in x, y by `by_m` (2,) [m]: the distance of parked cars from the lane varies."""
     points = sample.points.copy()
     points[:, :2] += by_m.astype(np.float32)
-    step = np.append(by_m, 0)
-
-    def moved(boxes: Boxes) -> Boxes:
-        return replace(boxes, center=boxes.center + step)
-
     free = None if sample.free is None else sample.free + by_m.astype(np.float32)
-    own = None if sample.own is None else moved(sample.own)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact, own)
+    return map_sample(sample, points, lambda boxes: replace(boxes, center=boxes.center + np.append(by_m, 0)), free)
 
 
 def tilt_sample(sample: Sample, slope: Array, lift_m: float) -> Sample:
@@ -124,8 +117,7 @@ def tilt_sample(sample: Sample, slope: Array, lift_m: float) -> Sample:
         rise = boxes.center[:, :2] @ slope + lift_m
         return replace(boxes, center=boxes.center + rise[:, None] * (0, 0, 1))
 
-    own = None if sample.own is None else moved(sample.own)
-    return replace(sample, points=points, boxes=moved(sample.boxes), ignore=moved(sample.ignore), own=own)
+    return map_sample(sample, points, moved, sample.free)
 
 
 def in_view(points: Array32) -> Mask:

@@ -34,7 +34,7 @@ from flcav.perception.metrics.operating_point import DISTANCES_M, FoundAtDistanc
 from flcav.perception.metrics.tracks import TracksEvaluation
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import OVERLAP, Reliability, detect_frames
-from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class
+from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class, select_sides
 from flcav.perception.ops.boxes import Kind
 from flcav.perception.outcomes import Measure, Outcomes, Times, Values
 from flcav.perception.task import Evaluated
@@ -158,9 +158,7 @@ def score_detections(
     scenes = tuple(truth.scene for truth in truths)
     scores = []
     for name in classes:
-        found = [select_class(boxes, name) for boxes in detections]
-        targets = [select_class(truth.targets, name) for truth in truths]
-        neutral = [select_class(truth.neutral, name) for truth in truths]
+        found, targets, neutral = select_sides(detections, truths, name)
         hidden = sum(len(select_class(truth.hidden, name)) for truth in truths)
         for kind, overlap in OVERLAPS:
             matches = match(found, targets, neutral, overlap, kind)
@@ -180,12 +178,7 @@ def count_cars(
     """
     if "Car" not in classes:
         return None
-    return count_found_cars(
-        [select_class(boxes, "Car") for boxes in detections],
-        [select_class(truth.targets, "Car") for truth in truths],
-        [select_class(truth.neutral, "Car") for truth in truths],
-        looks=QUARTERS if around else 1,
-    )
+    return count_found_cars(*select_sides(detections, truths, "Car"), looks=QUARTERS if around else 1)
 
 
 def count_objects(
@@ -194,10 +187,8 @@ def count_objects(
     """Return the objects of each class that were found and invented, by distance, see `count_by_distance`."""
     rows: list[FoundAtDistance] = []
     for label in classes:
-        sides = (detections, [truth.targets for truth in truths], [truth.neutral for truth in truths])
-        found, targets, neutral = ([select_class(boxes, label) for boxes in side] for side in sides)
-        rng = stream(seed, "counts", label)
-        rows += count_by_distance(found, targets, neutral, [truth.scene for truth in truths], label, rng)
+        scenes, rng = [truth.scene for truth in truths], stream(seed, "counts", label)
+        rows += count_by_distance(*select_sides(detections, truths, label), scenes, label, rng)
     return tuple(rows)
 
 
@@ -307,11 +298,9 @@ class ObjectsOutcomes:
         hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]
         arrays: dict[str, NDArray] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
         for name in classes:
-            own = [select_class(boxes, name) for boxes in found]
-            targets = [select_class(truth.targets, name) for truth in truths]
-            neutral = [select_class(truth.neutral, name) for truth in truths]
+            sides = select_sides(found, truths, name)
             for key, (kind, overlap) in KEPT.items():
-                matches = match(own, targets, neutral, overlap, kind)
+                matches = match(*sides, overlap, kind)
                 arrays |= {f"{name}/{key}/{field}": value for field, value in vars(matches).items()}
         return Outcomes(np.array([truth.scene for truth in truths]), arrays)
 

@@ -70,13 +70,13 @@ class Targets:
 
     positive: Tensor  # (P,) int64 indices of the positive anchors
     weight: Tensor  # (A,) float32: 1 for positive and negative anchors, 0 for ignored ones
-    residual: Tensor  # (P, 7) float32, see `encode`
+    residual: Tensor  # (P, 7) float32, see `encode_residuals`
     exact: Tensor  # (P,) float32: 1 where residual and direction are learned, else 0
     direction: Tensor  # (P,) int64 direction class: 1 where the yaw is in [-3/4 pi, pi/4), else 0
     variance: Tensor | None = None  # (P, 7) float32 of the residuals, where boxes have one
 
 
-def encode(boxes: Array, anchors: Array) -> Array:
+def encode_residuals(boxes: Array, anchors: Array) -> Array:
     """Return the residuals (P, 7) of boxes (P, 7) from anchors (P, 7) (VoxelNet, eq. 1).
 
     With d the diagonal of the anchor's footprint and its height h_a: (x - x_a) / d, (y - y_a) / d, (z - z_a) / h_a,
@@ -89,11 +89,11 @@ def encode(boxes: Array, anchors: Array) -> Array:
     return np.concatenate((plane, height[:, None], size, (boxes[:, 6] - anchors[:, 6])[:, None]), 1)
 
 
-def decode(residual: Array, direction: Ints, anchors: Array) -> Array:
+def decode_residuals(residual: Array, direction: Ints, anchors: Array) -> Array:
     """Return the boxes (P, 7) of residuals (P, 7), direction classes (P,) and anchors (P, 7); yaw in [-pi, pi).
 
-    The inverse of `encode` where `direction` is the class of the box's yaw. Logarithms of size ratios are clipped to
-    [-2, 2].
+    The inverse of `encode_residuals` where `direction` is the class of the box's yaw. Logarithms of size ratios are
+    clipped to [-2, 2].
     """
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])[:, None]
     plane = residual[:, :2] * diagonal + anchors[:, :2]
@@ -186,7 +186,7 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
         positive=torch.from_numpy(positive),
         weight=torch.from_numpy(counts.astype(np.float32)),
         exact=torch.from_numpy(exact[owner[positive]].astype(np.float32)),
-        residual=torch.from_numpy(encode(targets, anchors[positive]).astype(np.float32)),
+        residual=torch.from_numpy(encode_residuals(targets, anchors[positive]).astype(np.float32)),
         direction=torch.from_numpy(direction_of(targets[:, 6])),
         variance=variance,
     )

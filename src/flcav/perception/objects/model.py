@@ -129,7 +129,7 @@ class HeadOutput(NamedTuple):
     """Raw predictions of the anchor head for A = H * W * classes * headings anchors of B samples."""
 
     score: Tensor  # (B, A, classes) logits
-    box: Tensor  # (B, A, 7) residuals, see `flcav.perception.objects.loss.encode`
+    box: Tensor  # (B, A, 7) residuals, see `flcav.perception.objects.loss.encode_residuals`
     direction: Tensor  # (B, A, 2) logits of the direction classes
     log_variance: Tensor | None = None  # (B, A, 7) of the residuals; None where the network predicts none
 

@@ -22,11 +22,12 @@ from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.perception.agents import frame_reader
+from flcav.perception.device import inference
 from flcav.perception.images import CameraView, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
 from flcav.perception.metrics import calibration_error, fit_logistic, match, round_or_none
 from flcav.perception.metrics.detection import assign_targets
-from flcav.perception.objects.loss import anchor_boxes, anchor_classes, decode, decode_variance
+from flcav.perception.objects.loss import anchor_boxes, anchor_classes, decode_residuals, decode_variance
 from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second, SecondConfig
 from flcav.perception.objects.samples import move_points, validate_points
 from flcav.perception.objects.truth import (
@@ -37,6 +38,7 @@ from flcav.perception.objects.truth import (
     in_range,
     network_from_lidar,
     select_class,
+    select_sides,
 )
 from flcav.perception.ops.boxes import nms
 from flcav.perception.ops.sparse import SparseTensor
@@ -162,10 +164,8 @@ def _suppress(boxes: Boxes, classes: Sequence[str]) -> Boxes:
 
 
 def _detect_ahead(network: Second, clouds: Sequence[Array32], score_threshold: float, batch: int) -> list[Boxes]:
-    training = network.training
-    network.eval()
     found: list[Boxes] = []
-    with torch.inference_mode():
+    with inference(network):
         for first in range(0, len(clouds), batch):
             output = predict(network, clouds[first : first + batch])
             score = calibrate_logits(output.score, network.config).sigmoid().cpu().numpy()
@@ -176,7 +176,6 @@ def _detect_ahead(network: Second, clouds: Sequence[Array32], score_threshold: f
                 spread = output.log_variance.double().clamp(*LOG_VARIANCES).exp().cpu().numpy()
             parts = zip(score, box, direction, spread, strict=True)
             found += [_decode_boxes(network, *one, score_threshold) for one in parts]
-    network.train(training)
     return found
 
 
@@ -251,7 +250,7 @@ def _decode_boxes(
         likely = likely[scores[likely] >= threshold]
         own, scores = own[likely], scores[likely]
         anchors = anchor_boxes(config)[own]
-        rows = decode(box[own], direction[own], anchors)
+        rows = decode_residuals(box[own], direction[own], anchors)
         kept = nms(torch.from_numpy(rows), torch.from_numpy(scores)).numpy()
         found = Boxes.from_array(rows[kept], name, scores[kept])
         if spread is not None:
@@ -330,7 +329,7 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
     detections, truths = detect_frames(network, frames)
     fitted = []
     for name in network.config.classes:
-        matches = _matches(detections, truths, name)
+        matches = match(*select_sides(detections, truths, name), OVERLAP)
         fitted.append(fit_logistic(matches.score, matches.hit))
     network.config = replace(network.config, calibration=tuple(fitted))
 
@@ -354,16 +353,10 @@ def measure_reliability(
     """
     rows = []
     for name in classes:
-        matches = _matches(detections, truths, name)
+        matches = match(*select_sides(detections, truths, name), OVERLAP)
         ece, ratio = calibration_error(matches.score, matches.hit), _variance_ratio(detections, truths, name)
         rows.append(Reliability(name, len(matches.score), round_or_none(ece), round_or_none(ratio)))
     return tuple(rows)
-
-
-def _matches(detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str):
-    found = [select_class(boxes, name) for boxes in detections]
-    targets = [select_class(truth.targets, name) for truth in truths]
-    return match(found, targets, [select_class(truth.neutral, name) for truth in truths], OVERLAP)
 
 
 def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str) -> float:

@@ -1,7 +1,7 @@
 """Training samples of the detector: LiDAR sweeps with labels, from recorded frames."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -76,14 +76,14 @@ def move_sample(sample: Sample, move: Array | None) -> Sample:
     free = sample.free
     if free is not None:
         free = transform_points(move, np.pad(free, ((0, 0), (0, 1))))[:, :2].astype(np.float32)
-    return replace(
-        sample,
-        points=move_points(sample.points, move),
-        boxes=sample.boxes.transform(move),
-        ignore=sample.ignore.transform(move),
-        free=free,
-        own=None if sample.own is None else sample.own.transform(move),
-    )
+    return map_sample(sample, move_points(sample.points, move), lambda boxes: boxes.transform(move), free)
+
+
+def map_sample(sample: Sample, points: Array32, moved: Callable[[Boxes], Boxes], free: Array32 | None) -> Sample:
+    """Return the sample with other points (N, 4) and free positions (K, 2), and all its boxes `moved`, LiDAR frame."""
+    own = None if sample.own is None else moved(sample.own)
+    boxes, ignore = moved(sample.boxes), moved(sample.ignore)
+    return replace(sample, points=points, boxes=boxes, ignore=ignore, free=free, own=own)
 
 
 def move_points(points: Array32, move: Array | None) -> Array32:
@@ -223,13 +223,13 @@ def validate_points(points: Array32, origin: str | Path) -> Array32:
     return points
 
 
-def pack_sweep(frame: Frame, config: SecondConfig) -> bytes:
+def pack_sample(frame: Frame, config: SecondConfig) -> bytes:
     """Return the message of a frame's sweep with its ground truth; raises `InputError` where it has no LiDAR."""
     sample = label_sweep(frame, config)
     return pack({"points": sample.points, **pack_boxes(sample.boxes, "boxes"), **pack_boxes(sample.ignore, "ignore")})
 
 
-def unpack_sweep(message: bytes, config: SecondConfig) -> Sample:
+def unpack_sample(message: bytes, config: SecondConfig) -> Sample:
     """Return the training sample in a message: that of `sample_from_frame`."""
     arrays = unpack(message)
     points = crop_to_range(arrays["points"], config)

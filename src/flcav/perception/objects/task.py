@@ -36,9 +36,9 @@ from flcav.perception.objects.samples import (
     RecordedSweeps,
     Sample,
     compare_rig,
-    pack_sweep,
+    pack_sample,
     select_fitting_frames,
-    unpack_sweep,
+    unpack_sample,
 )
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range, target_criteria
 from flcav.perception.study import StudyRecipe, read_recipe
@@ -47,6 +47,55 @@ from flcav.sensors.frame import Frame
 
 TOWNS = ("suburb", "ring", "grid")  # of the study
 TRACKS = "tracks"  # test of tracking
+
+
+OVERLAP = 0.5  # 3D IoU from which an object is detected
+
+
+def find_errors(
+    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
+) -> Iterator[list[PerceptionError]]:
+    """Yield the misses and false positives of each frame, of detections of score `threshold` or more.
+
+    They are at world coordinates; those that repeat over frames are among them, see `flcav.perception.errors`.
+    detections: one `Boxes` per frame, LiDAR frame. Raises ValueError where these and `frames` differ in length.
+    """
+    for frame, found in zip(frames, detections, strict=True):
+        found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
+        matched = np.zeros(len(found), dtype=bool)
+        missed = _misses(frame, found, matched, config)
+        yield [*missed, *_false_positives(frame, found[~matched], config)]
+
+
+def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
+    """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    label, asked = truth.boxes.label, truth.target | truth.faint
+    missed = asked.copy()
+    for name in config.classes:
+        own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
+        target = assign_targets(found[own], truth.boxes[objects], OVERLAP)
+        matched[own[target >= 0]] = True
+        missed[objects[target[target >= 0]]] = False
+    matched |= on_neutral(found, truth.boxes)
+    rows = zip(annotations.boxes.center, label, truth.returns, annotations.occlusion, annotations.track, missed)
+    return [
+        PerceptionError(*at.tolist(), 1.0, MISS, str(name), int(returns), float(hidden), frame.scene, str(track))
+        for at, name, returns, hidden, track, lost in rows
+        if lost
+    ]
+
+
+def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[PerceptionError]:
+    name = choose_lidar(frame)
+    found = found[in_range(found, config)]
+    returns = points_in_boxes(frame.lidar[name], found).sum(1)
+    world = transform_points(frame.world_from_sensor(name), found.center)
+    return [
+        PerceptionError(*at.tolist(), 1.0, FALSE_POSITIVE, str(label), int(count), float("nan"), frame.scene, "")
+        for at, label, count in zip(world, found.label, returns, strict=True)
+        if count >= 1
+    ]
 
 
 def streets_study() -> StudyRecipe:
@@ -195,11 +244,11 @@ class ObjectsTask(ObjectsOutcomes):
         """Yield the message of each frame: its whole sweep and its boxes."""
         RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
         read = frame_reader(data, config.foreground)
-        return (pack_sweep(read(i), config) for i in frames)
+        return (pack_sample(read(i), config) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: SecondConfig) -> list[Sample]:
         """Return the samples in messages of `pack_samples`."""
-        return [unpack_sweep(message, config) for message in messages]
+        return [unpack_sample(message, config) for message in messages]
 
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
@@ -232,67 +281,3 @@ class ObjectsTask(ObjectsOutcomes):
 
 
 OBJECTS = ObjectsTask()
-
-
-OVERLAP = 0.5  # 3D IoU from which an object is detected
-
-
-def find_errors(
-    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
-) -> Iterator[list[PerceptionError]]:
-    """Yield the misses and false positives of each frame, of detections of score `threshold` or more.
-
-    They are at world coordinates; those that repeat over frames are among them, see `flcav.perception.errors`.
-    detections: one `Boxes` per frame, LiDAR frame. Raises ValueError where these and `frames` differ in length.
-    """
-    for frame, found in zip(frames, detections, strict=True):
-        found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
-        matched = np.zeros(len(found), dtype=bool)
-        missed = _misses(frame, found, matched, config)
-        yield [*missed, *_false_positives(frame, found[~matched], config)]
-
-
-def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
-    """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
-    truth, annotations = ground_truth(frame, config), frame.annotations
-    label, asked = truth.boxes.label, truth.target | truth.faint
-    missed = asked.copy()
-    for name in config.classes:
-        own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
-        target = assign_targets(found[own], truth.boxes[objects], OVERLAP)
-        matched[own[target >= 0]] = True
-        missed[objects[target[target >= 0]]] = False
-    matched |= on_neutral(found, truth.boxes)
-    return [
-        PerceptionError(
-            *(float(value) for value in annotations.boxes.center[i]),
-            weight=1.0,
-            kind=MISS,
-            label=str(label[i]),
-            returns=int(truth.returns[i]),
-            occlusion=float(annotations.occlusion[i]),
-            scene=frame.scene,
-            track=str(annotations.track[i]),
-        )
-        for i in np.flatnonzero(missed)
-    ]
-
-
-def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[PerceptionError]:
-    name = choose_lidar(frame)
-    found = found[in_range(found, config)]
-    returns = points_in_boxes(frame.lidar[name], found).sum(1)
-    world = transform_points(frame.world_from_sensor(name), found.center)
-    return [
-        PerceptionError(
-            *(float(value) for value in world[i]),
-            weight=1.0,
-            kind=FALSE_POSITIVE,
-            label=str(found.label[i]),
-            returns=int(returns[i]),
-            occlusion=float("nan"),
-            scene=frame.scene,
-            track="",
-        )
-        for i in np.flatnonzero(returns >= 1)
-    ]

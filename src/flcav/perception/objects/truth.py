@@ -6,6 +6,7 @@ definition; how each treats the kinds is in docs/tasks.md.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
@@ -182,6 +183,15 @@ def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
 def select_class(boxes: Boxes, name: str) -> Boxes:
     """Return the boxes with the label `name`."""
     return boxes[boxes.label == name]
+
+
+def select_sides(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str
+) -> tuple[list[Boxes], list[Boxes], list[Boxes]]:
+    """Return the detections, the targets and the neutral objects of the class `name` in each frame."""
+    sides = (detections, [truth.targets for truth in truths], [truth.neutral for truth in truths])
+    found, targets, neutral = ([select_class(boxes, name) for boxes in side] for side in sides)
+    return found, targets, neutral
 
 
 def narrow_range(config: SecondConfig, text: str) -> SecondConfig:

@@ -15,7 +15,7 @@ from flcav.perception.images import check_picture
 from flcav.perception.metrics.detection import match_greedily
 from flcav.perception.ops.boxes import rectangle_iou
 from flcav.perception.signs.model import SignDetector, SignsConfig
-from flcav.perception.signs.predict import SignDetections, detect
+from flcav.perception.signs.predict import SignDetections, detect_in_picture
 from flcav.perception.signs.samples import find_targets, size_px
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import unproject_pixels
@@ -52,7 +52,7 @@ def register_errors(
     for done, (number, camera) in enumerate(pairs, start=1):
         frame = data.frame(number)
         picture = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
-        found = detect(network, picture, threshold=threshold)
+        found = detect_in_picture(network, picture, threshold=threshold)
         height, width = picture.shape[:2]
         misses, false = _mistakes(frame, camera, found, (width, height), network.config)
         meets = list(_meets(frame, camera, found, false, solid, network.config))

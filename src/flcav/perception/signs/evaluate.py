@@ -16,7 +16,7 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.perception.outcomes import Outcomes, Times, Values
 from flcav.perception.signs.model import SignDetector, SignsConfig
-from flcav.perception.signs.predict import SignDetections, detect
+from flcav.perception.signs.predict import SignDetections, detect_in_picture
 from flcav.perception.signs.samples import RecordedPictures, size_px
 from flcav.perception.task import Evaluated
 from flcav.storage.records import Class
@@ -209,7 +209,7 @@ class SignsOutcomes:
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
             truths.append(SignTruth(sample.boxes, sample.label, sample.ignore))
-            found.append(detect(network, sample.picture, threshold=LOWEST_SCORE))
+            found.append(detect_in_picture(network, sample.picture, threshold=LOWEST_SCORE))
             progress(done, len(recorded), "")
         arrays = {
             f"{FOUND}/box": _joined([one.box for one in found], 4),

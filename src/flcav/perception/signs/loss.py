@@ -9,12 +9,13 @@ from torch import Tensor
 from torch.nn import functional
 
 from flcav.arrays import Array32
+from flcav.perception.device import inference
 from flcav.perception.ops.boxes import complete_iou
 from flcav.perception.signs.model import STRIDES, SignDetector, SignsConfig, decode_boxes
 from flcav.perception.signs.predict import predict
 from flcav.perception.signs.samples import Sample
 
-MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, either way; `decode` reaches no more
+MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, either way; `decode_boxes` reaches no more
 
 
 @dataclass(frozen=True)
@@ -77,18 +78,6 @@ BOX, OBJECT, CLASS = 1.0, 10.0, 8.0  # weights of the terms
 LEVELS = (4.0, 1.0, 0.4)  # weights of the levels' objectness: on finer levels a smaller share of cells has an object
 
 
-def batch_loss(network: SignDetector, samples: Sequence[Sample]) -> Tensor:
-    """Return the loss of `network` on images of one size, whose sides are multiples of 32; see `detection_loss`."""
-    raw = predict(network, [sample.picture for sample in samples])
-    return detection_loss(raw, assign_anchors(samples, network.config), network.config)
-
-
-def imitation_loss(network: SignDetector, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
-    """Return the loss of a batch whose boxes have class probabilities (boxes, classes) instead of labels."""
-    raw, classes = predict(network, [sample.picture for sample in samples]), torch.from_numpy(np.concatenate(targets))
-    return detection_loss(raw, assign_anchors(number_boxes(samples), network.config), network.config, classes)
-
-
 def number_boxes(samples: Sequence[Sample]) -> list[Sample]:
     """Return the samples with the number of each box among all of them for a label."""
     ends = np.cumsum([len(sample.boxes) for sample in samples])
@@ -148,9 +137,8 @@ def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> lis
     A box has the mean of the anchors that it is assigned to in training, and zeros where there are none. The network's
     training mode is left as it was.
     """
-    training, found = network.training, []
-    network.eval()
-    with torch.inference_mode():
+    found = []
+    with inference(network):
         for sample in samples:
             total, count = (
                 torch.zeros(len(sample.boxes), len(network.config.classes)),
@@ -164,5 +152,4 @@ def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> lis
                 total.index_add_(0, at.label, shares)
                 count.index_add_(0, at.label, torch.ones(len(at.label), 1))
             found.append((total / count.clamp(min=1)).numpy())
-    network.train(training)
     return found

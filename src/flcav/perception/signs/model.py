@@ -179,7 +179,7 @@ class SignDetector(nn.Module):
             bias[:, 5:] = math.log(1 / max(len(self.config.classes) - 1, 1))
 
 
-def decode(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
+def decode_level(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
     """Return the boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of one level's raw predictions.
 
     A centre lies in its cell or up to half a cell outside, a width or height is at most four times the anchor's.

@@ -11,11 +11,11 @@ from flcav.arrays import Array, Ints
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.perception.device import autocast_bfloat16
+from flcav.perception.device import autocast_bfloat16, inference
 from flcav.perception.images import Picture, read_pictures, read_recorded
 from flcav.perception.marks import PictureBoxes
 from flcav.perception.ops.boxes import rectangle_nms
-from flcav.perception.signs.model import STRIDES, SignDetector, decode
+from flcav.perception.signs.model import STRIDES, SignDetector, decode_level
 from flcav.perception.signs.samples import GREY, check_stands, compare_with_background, learn_picture_background
 from flcav.perception.task import Finding, Result
 from flcav.storage.records import Class
@@ -70,21 +70,18 @@ def boxes_found(found: SignDetections, classes: Sequence[str]) -> BoxesFound:
     return BoxesFound(tuple(BoxFound(classes[label], score, *box) for box, label, score in rows))
 
 
-def detect(network: SignDetector, picture: Picture, *, threshold: float) -> SignDetections:
+def detect_in_picture(network: SignDetector, picture: Picture, *, threshold: float) -> SignDetections:
     """Return the detections in an image of any size with a score of at least `threshold`.
 
     The network's training mode is left as it was.
     """
-    training = network.training
-    network.eval()
-    with torch.inference_mode():
+    with inference(network):
         raw = predict(network, [pad_to_stride(picture)])
         cells = [
-            torch.cat((decode(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
+            torch.cat((decode_level(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
             for level, maps in enumerate(raw)
         ]
         found = _chosen(torch.cat(cells), threshold, picture)
-    network.train(training)
     return found
 
 
@@ -130,7 +127,7 @@ def detect_signs(
     dataset's poles alone; it raises `InputError` for files, and for frames of vehicles.
     """
     for origin, rgb, seen in _read(network, path, frames):
-        found = detect(network, seen, threshold=threshold)
+        found = detect_in_picture(network, seen, threshold=threshold)
         names = np.array(network.config.classes)[found.label]
         marks = (PictureBoxes(found.box, names, found.score),)
         yield Finding(origin, rgb, boxes_found(found, network.config.classes), marks)

@@ -58,7 +58,7 @@ class RecordedPictures(Sequence[Sample]):
             return self._kept[index]
         number, camera = self._of[index]
         picture = self._read(number, camera)
-        sample = sample_from_frame(self._data.frame(number), camera, picture, self._config)
+        sample = label_picture(self._data.frame(number), camera, picture, self._config)
         if self._kept_bytes + picture.nbytes <= KEPT_BYTES:
             self._kept[index] = sample
             self._kept_bytes += picture.nbytes
@@ -69,7 +69,7 @@ class RecordedPictures(Sequence[Sample]):
         return self._data.keys[self._of[index][0]].scene
 
 
-def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
+def label_picture(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
     """Return a camera's image with the boxes of its signs and lights, or of its actors, as `config.labels` says.
 
     Boxes smaller than `config.smallest_px` are ignored, and so are signs cut off by the image's edge: a lamp may lie
@@ -156,18 +156,18 @@ def learn_picture_background(data: Dataset, agent: str, camera: str) -> Bytes:
 BOXES = ("boxes", "label", "ignore")  # fields of a sample, and names of arrays after the camera's
 
 
-def pack_frame(data: Dataset, number: int, config: SignsConfig) -> bytes:
+def pack_signs(data: Dataset, number: int, config: SignsConfig) -> bytes:
     """Return the message of a frame: its images with their boxes."""
     frame, arrays = data.frame(number), dict(pack_pictures(data, number))
     for camera in frame.images:
         picture = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
-        sample = sample_from_frame(frame, camera, picture, config)
+        sample = label_picture(frame, camera, picture, config)
         arrays |= {f"{camera}.{field}": getattr(sample, field) for field in BOXES}
     return pack(arrays)
 
 
-def unpack_frame(message: bytes) -> list[Sample]:
-    """Return the samples in a message: those of `sample_from_frame` for each camera."""
+def unpack_signs(message: bytes) -> list[Sample]:
+    """Return the samples in a message: those of `label_picture` for each camera."""
     arrays = unpack(message)
     return [
         Sample(picture, *(arrays[f"{camera}.{field}"] for field in BOXES))
@@ -186,7 +186,7 @@ LOOKS = 12  # number of images searched for a sign of a class
 GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)  # ranges of the factors of brightness and of saturation
 
 
-def draw(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
+def draw_mosaic(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
     """Return an augmented sample of size `config.window_px`: a window of sample `index`, or a mosaic with others."""
     width, height = config.window_px
     across = max(min(int(rng.choice(len(SHARES), p=SHARES)) + 1, height // PART_PX), 1)

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from flcav.arrays import Array32
@@ -15,10 +16,10 @@ from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.errors import THRESHOLD, Registry
 from flcav.perception.signs.errors import register_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, SignsOutcomes, by_picture, mean_average_precision
-from flcav.perception.signs.loss import batch_loss, class_probabilities, imitation_loss
+from flcav.perception.signs.loss import assign_anchors, class_probabilities, detection_loss, number_boxes
 from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
-from flcav.perception.signs.predict import detect_signs
-from flcav.perception.signs.samples import RecordedPictures, Sample, draw, pack_frame, unpack_frame
+from flcav.perception.signs.predict import detect_signs, predict
+from flcav.perception.signs.samples import RecordedPictures, Sample, draw_mosaic, pack_signs, unpack_signs
 from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, Practice
 
@@ -66,12 +67,13 @@ class SignsTask(SignsOutcomes):
         return RecordedPictures(data, config, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
-        """Return an augmented sample, see `flcav.perception.signs.samples.draw`."""
-        return draw(samples, index, config, rng)
+        """Return an augmented sample, see `flcav.perception.signs.samples.draw_mosaic`."""
+        return draw_mosaic(samples, index, config, rng)
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of a batch of images of one size, whose sides are multiples of 32."""
-        return batch_loss(network, samples)
+        raw = predict(network, [sample.picture for sample in samples])
+        return detection_loss(raw, assign_anchors(samples, network.config), network.config)
 
     def class_probabilities(self, network: SignDetector, samples: Sequence[Sample]) -> list[Array32]:
         """Return the class probabilities (boxes, classes) of the boxes of each image."""
@@ -79,7 +81,11 @@ class SignsTask(SignsOutcomes):
 
     def imitation_loss(self, network: SignDetector, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
         """Return the loss of a batch whose boxes have class probabilities instead of labels."""
-        return imitation_loss(network, samples, targets)
+        raw, shares = (
+            predict(network, [sample.picture for sample in samples]),
+            torch.from_numpy(np.concatenate(targets)),
+        )
+        return detection_loss(raw, assign_anchors(number_boxes(samples), network.config), network.config, shares)
 
     def evaluate(
         self,
@@ -104,11 +110,11 @@ class SignsTask(SignsOutcomes):
         """Yield the message of each frame: its images with their boxes."""
         self.check_for_vehicles(config)
         RecordedPictures(data, config, frames)  # raises for frames without cameras
-        return (pack_frame(data, i, config) for i in frames)
+        return (pack_signs(data, i, config) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: SignsConfig) -> list[Sample]:
         """Return the samples in messages of `pack_samples`."""
-        return [sample for message in messages for sample in unpack_frame(message)]
+        return [sample for message in messages for sample in unpack_signs(message)]
 
     def infer(
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None

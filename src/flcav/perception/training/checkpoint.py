@@ -86,7 +86,7 @@ DataIdentity = tuple[
 NAMED = {"data": "other data or agents", "validation": "other validation data or agents"}
 
 
-class Settings(Config):
+class TrainingSettings(Config):
     """Settings of a training, which decide its weights; None where an older card lacks them."""
 
     task: str
@@ -102,7 +102,7 @@ class Settings(Config):
     learning_rate: float
     schedule: str
 
-    def differences(self, other: "Settings") -> str:
+    def differences(self, other: "TrainingSettings") -> str:
         """Return the differences of `other` in words; an empty string if there are none."""
         pairs = [(name, getattr(self, name), getattr(other, name)) for name in type(self).model_fields]
         return ", ".join(
@@ -110,9 +110,9 @@ class Settings(Config):
         )
 
 
-def settings_of(card: Card) -> Settings:
+def settings_of(card: Card) -> TrainingSettings:
     """Return the settings of the training that a card describes."""
-    return Settings.model_validate(
+    return TrainingSettings.model_validate(
         {
             "task": card.task,
             "network": card.network,
@@ -130,7 +130,7 @@ def part_of(entry: DataEntry) -> DataIdentity:
     return entry.manifest, entry.agents
 
 
-def find_finished_card(path: Path, asked: Settings) -> Card | None:
+def find_finished_card(path: Path, asked: TrainingSettings) -> Card | None:
     """Return the card of the weights at `path`; None if there is no such file.
 
     Raises `InputError` if they were trained with other settings than `asked`, so that they are not overwritten.

@@ -247,19 +247,9 @@ def register_errors(
         scene, actor = str(columns.scene[row]), int(columns.actor[row])
         trace = traces[scene]
         assert trace is not None  # the samples come from it
-        x, y, _ = columns.pose[row]
+        x, y, _ = columns.pose[row].tolist()
+        z, label = 0.0 if town is None else town.ground(x, y), str(trace.category[actor])
         found.setdefault(int(columns.frame[row]), []).append(
-            PerceptionError(
-                x=float(x),
-                y=float(y),
-                z=0.0 if town is None else town.ground(float(x), float(y)),
-                weight=1.0,
-                kind=FINAL_ERROR,
-                label=str(trace.category[actor]),
-                returns=0,
-                occlusion=float("nan"),
-                scene=scene,
-                track=str(trace.actor[actor]),
-            )
+            PerceptionError(x, y, z, 1.0, FINAL_ERROR, label, 0, float("nan"), scene, str(trace.actor[actor]))
         )
     return Registry.of(found)

@@ -23,7 +23,7 @@ SHARPNESS = 3.0  # initial inverse temperature of the cosine similarities; it is
 NEAR = 3  # channels of query and key that hold the distance on the ground
 
 
-class Inputs(NamedTuple):
+class ForecastInputs(NamedTuple):
     """Input tensors of a batch of B samples: `raster`, or the last three of n cameras."""
 
     past: Tensor  # (B, PAST + 1, 4) x, y, yaw, speed [m, rad, m/s]
@@ -65,7 +65,7 @@ class RasterEncoder(nn.Module):
         self.layers = nn.Sequential(conv(len(LAYERS), fine, 2), conv(fine, ground, 2))
         self.sum_up = PatchPooling(ground, coarse, self.summary)
 
-    def forward(self, inputs: Inputs) -> GroundFeatures:
+    def forward(self, inputs: ForecastInputs) -> GroundFeatures:
         """Return the features of rasters (B, LAYERS, cells, cells); a place of `ground` is 4 x 4 cells."""
         assert inputs.raster is not None
         ground = self.layers(inputs.raster)
@@ -102,7 +102,7 @@ class CrossViewEncoder(nn.Module):
     pixels: Tensor  # (P, 3) homogeneous coordinates of the image features
     places: Tensor  # (Q, 2) x, y of the queries [SCALE_M]
 
-    def forward(self, inputs: Inputs) -> GroundFeatures:
+    def forward(self, inputs: ForecastInputs) -> GroundFeatures:
         """Return the features of images (B, n, 3, height, width); `ground` has twice the resolution of the queries."""
         assert inputs.pictures is not None
         assert inputs.intrinsics is not None
@@ -230,7 +230,7 @@ class TrajectoryNetwork(nn.Module):
         nn.init.normal_(self.change.weight, std=0.01)
         nn.init.zeros_(self.change.bias)
 
-    def forward(self, inputs: Inputs) -> ForecastTensors:
+    def forward(self, inputs: ForecastInputs) -> ForecastTensors:
         """Return the forecast of a batch."""
         seen = self.view(inputs)
         _, (encoded, _) = self.track(_features(inputs.past))

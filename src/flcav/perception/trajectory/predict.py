@@ -13,10 +13,11 @@ from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose, yaw_of
 from flcav.interface.progress import Report, ignore_progress
+from flcav.perception.device import inference
 from flcav.perception.marks import Light, Mode, Paths, RoadUser
 from flcav.perception.task import Finding, Result
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
-from flcav.perception.trajectory.model import Inputs, TrajectoryNetwork
+from flcav.perception.trajectory.model import ForecastInputs, TrajectoryNetwork
 from flcav.perception.trajectory.rasters import OPEN, STATIC_ROWS, RoadMap, load_roads
 from flcav.perception.trajectory.samples import Sample, Samples, extract_columns, find_near, find_pictured, load_traffic
 from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame, tracks_around
@@ -82,15 +83,15 @@ class Forecasts(Result):
         return lines or ["nobody to predict"]
 
 
-def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:
+def inputs_of(samples: Sequence[Sample], network: nn.Module) -> ForecastInputs:
     """Return the input tensors of samples on the network's device; with rasters if the samples have no images."""
     device = next(network.parameters()).device
     past = torch.from_numpy(np.stack([sample.past for sample in samples])).to(device)
     seen = [sample.surround for sample in samples if sample.surround is not None]
     if not seen:
-        return Inputs(past, raster=rasters_of(samples, device))
+        return ForecastInputs(past, raster=rasters_of(samples, device))
     pictures = np.stack([one.pictures for one in seen]).transpose(0, 1, 4, 2, 3)
-    return Inputs(
+    return ForecastInputs(
         past,
         pictures=torch.from_numpy(np.ascontiguousarray(pictures)).to(device).float() / 127.5 - 1,
         intrinsics=_floats([one.intrinsics for one in seen], device),
@@ -120,18 +121,15 @@ def predict(
 
     The network's training mode is left as it was.
     """
-    training = network.training
-    network.eval()
     paths, probabilities = [], []
     size = VIEWS if network.config.cameras else RASTERS
-    with torch.inference_mode():
+    with inference(network):
         for first in range(0, len(samples), size):
             batch = [samples[i] for i in range(first, min(first + size, len(samples)))]
             forecast = network(inputs_of(batch, network))
             paths.append(forecast.paths.double().cpu().numpy())
             probabilities.append(forecast.logits.softmax(dim=1).double().cpu().numpy())
             progress(first + len(batch), len(samples), "")
-    network.train(training)
     return np.concatenate(paths), np.concatenate(probabilities)
 
 

@@ -46,7 +46,7 @@ class Surround(NamedTuple):
     camera_from_frame: Array  # (n, 4, 4) from the road user's frame to the optical one: x right, y down, z forward
 
 
-def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
+def surround_vehicle(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
     """Return the resized images seen at frame `number` with their calibration relative to a road user at `present`.
 
     They are those of `find_pictured`. `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the
@@ -162,7 +162,7 @@ class Samples(Sequence[Sample]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         row = Columns(*(column[index] for column in self.columns))
-        seen = surround(self._data, int(row.frame), row.pose, self._cameras) if self._cameras else None
+        seen = surround_vehicle(self._data, int(row.frame), row.pose, self._cameras) if self._cameras else None
         return Sample(*row, surround=seen)
 
 

@@ -13,6 +13,7 @@ from flcav.arrays import Ints, Mask
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
+from flcav.perception.device import inference
 from flcav.perception.images import Picture, read_pictures
 from flcav.perception.marks import Bars
 from flcav.perception.metrics import interval_words
@@ -139,15 +140,12 @@ def predict_probabilities(
 
     The network's training mode is left as it was.
     """
-    training = network.training
-    network.eval()
     parts = []
-    with torch.inference_mode():
+    with inference(network):
         for first in range(0, len(small_pictures), BATCH):
             logits = network(tensor_of(network, list(small_pictures[first : first + BATCH])))
             parts.append(logits.softmax(1).cpu().numpy())
             progress(min(first + BATCH, len(small_pictures)), len(small_pictures), "")
-    network.train(training)
     return np.concatenate(parts)
 
 

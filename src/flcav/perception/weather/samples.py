@@ -82,7 +82,9 @@ def augment(sample: Sample, rng: np.random.Generator) -> Sample:
     return Sample(shown.astype(np.uint8), sample.label, sample.scene)
 
 
-def pack_frame(data: Dataset, number: int, named: Callable[[Weather], str | None] = classify_weather) -> bytes:
+def pack_pictures_and_weather(
+    data: Dataset, number: int, named: Callable[[Weather], str | None] = classify_weather
+) -> bytes:
     """Return the message of a frame: its images, the class of its weather, and its scene."""
     weather = data.frame(number).weather
     label = None if weather is None else named(weather)

@@ -24,7 +24,7 @@ from flcav.perception.weather.evaluate import (
     tensor_of,
 )
 from flcav.perception.weather.model import CONFIGURATIONS, Classifier, LeNet, LeNetConfig
-from flcav.perception.weather.samples import Sample, augment, label_pictures, pack_frame, unpack_frame
+from flcav.perception.weather.samples import Sample, augment, label_pictures, pack_pictures_and_weather, unpack_frame
 from flcav.world.weather import ANY, WEATHER_CLASSES
 
 WHOLE_SPACE = "whole space"  # test of weathers drawn from the whole space of parameters
@@ -78,7 +78,8 @@ class WeatherTask(WeatherOutcomes):
 
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the mean cross entropy of a batch."""
-        return batch_loss(network, samples)
+        logits = network(tensor_of(network, [sample.picture for sample in samples]))
+        return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
 
     def class_probabilities(self, network: Classifier, samples: Sequence[Sample]) -> list[Array32]:
         """Return the class probabilities (1, classes) of each image."""
@@ -86,7 +87,8 @@ class WeatherTask(WeatherOutcomes):
 
     def imitation_loss(self, network: Classifier, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
         """Return the mean cross entropy of a batch with class probabilities for targets."""
-        return imitation_loss(network, samples, targets)
+        logits = network(tensor_of(network, [sample.picture for sample in samples]))
+        return functional.cross_entropy(logits, torch.from_numpy(np.concatenate(targets)).to(logits))
 
     def evaluate(
         self,
@@ -102,7 +104,7 @@ class WeatherTask(WeatherOutcomes):
     def pack_samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its images and their class."""
         label_pictures(data, config.classes, frames)  # raises for frames that cannot be used
-        return (pack_frame(data, i) for i in frames)
+        return (pack_pictures_and_weather(data, i) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: LeNetConfig) -> list[Sample]:
         """Return the samples in messages of `pack_samples`."""
@@ -116,15 +118,3 @@ class WeatherTask(WeatherOutcomes):
 
 
 WEATHER = WeatherTask()
-
-
-def batch_loss(network: Classifier, samples: Sequence[Sample]) -> Tensor:
-    """Return the mean cross entropy of `network` on a batch of samples, differentiable in the network's parameters."""
-    logits = network(tensor_of(network, [sample.picture for sample in samples]))
-    return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
-
-
-def imitation_loss(network: Classifier, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
-    """Return the mean cross entropy of `network` with class probabilities (1, classes) of each sample for targets."""
-    logits = network(tensor_of(network, [sample.picture for sample in samples]))
-    return functional.cross_entropy(logits, torch.from_numpy(np.concatenate(targets)).to(logits))

@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 
 from flcav.federation.runtimes.embedded import update_bytes
+from flcav.fusion.average import NavigationErrors, Sighting
 from flcav.fusion.distillation import Distillation, pack_sighting
-from flcav.fusion.navigation import NavigationErrors
-from flcav.fusion.sightings import Sighting
 from flcav.network.ledger import BYTES_PER_MB
 from flcav.perception.client import SharedSamples, as_shared
 from flcav.perception.objects.model import SecondConfig
