@@ -14,8 +14,7 @@ from flcav.perception.task import build_network
 from flcav.perception.training import AdamW, step
 from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, TrajectoryConfig
 from flcav.perception.trajectory.predict import predict
-from flcav.perception.trajectory.rasters import LAYERS
-from flcav.perception.trajectory.roads import road_map
+from flcav.perception.trajectory.rasters import LAYERS, road_map
 from flcav.perception.trajectory.samples import Columns, Sample, Surround, extract_columns
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.trajectory.tracks import tracks_around

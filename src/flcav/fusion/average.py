@@ -1,11 +1,15 @@
 """The road average: boxes of road sensors and vehicles over a window of spins, averaged by their uncertainty.
 
-Boxes are associated with objects spin by spin: an object moves at constant velocity, a box belongs to it within a gate
-of Mahalanobis distance, and the Hungarian method settles which. What one agent tells of an object in several spins may
-be wrong in the same way each time (its pose, its clock), so that it is joined by covariance intersection, which stays
-consistent whatever the correlation (Julier and Uhlmann, ACC 1997), with the weights of Niehsen, "Information fusion
-based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace. What different agents report
-is joined as independent, by inverse variance.
+What an agent reports of a spin are boxes in the world; the uncertainty of its pose, by its navigation, is added to
+their variances. Boxes are associated with objects spin by spin: an object moves at constant velocity, a box belongs to
+it within a gate of Mahalanobis distance, and the Hungarian method settles which. What one agent reports of an object in
+several spins may be wrong in the same way each time (its pose, its clock), so that it is joined by covariance
+intersection, which stays consistent whatever the correlation (Julier and Uhlmann, ACC 1997), with the weights of
+Niehsen, "Information fusion based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace.
+What different agents report is joined as independent, by inverse variance.
+
+Poses of vehicles are either the true ones with drawn errors (`NavigationErrors`), or estimated from what the vehicle's
+GNSS receiver and IMU measured (`flcav.fusion.inertial`).
 """
 
 from collections.abc import Sequence

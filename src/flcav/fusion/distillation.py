@@ -11,6 +11,11 @@ truth, and vehicles know poses and times by their own navigation alone.
 - What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself.
 - What vehicles alone report is dropped where road sensors saw free ground, or have a box of their own.
 - An anchor is a negative only where a road sensor saw free ground.
+
+The map corrects headings and classes: lanes say which way cars face, crossings who walks there. A car on a lane follows
+its direction within a few degrees, so that the lane is one more measurement of its heading, joined by inverse variance.
+Front and back of a car are told apart by few returns, by the lane surely. A slow road user on a sidewalk or crossing is
+a pedestrian, one on a lane elsewhere a cyclist; detectors mistake one for the other.
 """
 
 from collections.abc import Mapping, Sequence

@@ -1,9 +1,15 @@
 """Poses and clocks of vehicles corrected by a pose graph over shared objects and landmarks (GTSAM, extra `fusion`).
 
-Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the objects that agents told of. Factors are the
-vehicles' own navigation, boxes as poses of objects seen from vehicles and from road sensors, whose poses are surveyed,
-and posts segmented from LiDAR as points that the map knows (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE ITS
-Magazine 2(4), 2010). The Huber kernel bounds the weight of wrong associations. Before, clocks are set (`clocks.py`).
+Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the objects that agents reported. Factors are the
+vehicles' navigation, boxes as poses of objects seen from vehicles and from road sensors, whose poses are surveyed, and
+posts segmented from LiDAR as points that the map knows (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE ITS
+Magazine 2(4), 2010). A post is a thin upright column of returns with nothing beside it: a lamp, the mast of a sensor or
+a signal, the post of a sign. The Huber kernel bounds the weight of wrong associations.
+
+Clocks are set before. A vehicle whose clock is fast reports a moving object where it was a little earlier than the time
+that it states. Road sensors, whose clocks are exact, see many of the same objects and the vehicle itself; the offset is
+the one at which both agree, by the likelihood over a grid of offsets with a share of outliers. Only moving objects
+determine it.
 """
 
 from collections.abc import Sequence

@@ -1,7 +1,13 @@
-"""Registration of LiDAR suites by generalised ICP (small_gicp, extra `fusion`), from an imperfect calibration.
+"""Registration of LiDAR clouds by generalised ICP (small_gicp, extra `fusion`): of suites, and of sweeps to odometry.
 
-Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009. Streets stand still and traffic does not, so that the static
-background is registered. The first pass takes pairs as far apart as the calibration may be off, the second near ones.
+Segal, Haehnel, Thrun, "Generalized-ICP", RSS 2009. Suites begin from an imperfect calibration. Streets stand still and
+traffic does not, so that the static background is registered. The first pass takes pairs as far apart as the
+calibration may be off, the second near ones.
+
+In odometry each sweep is registered to a map of the sweeps before it, from where the last motion leads. The map is one
+of Gaussian voxels, and registration voxelised generalised ICP (Koide et al., "Voxelized GICP for fast and accurate 3D
+point cloud registration", ICRA 2021). There are no loop closures: errors add up over the drive. Poses are relative to
+the vehicle's first sweep in a scene.
 """
 
 from collections.abc import Iterator, Sequence

@@ -1,7 +1,14 @@
 """Roadside perception of one LiDAR spin: object boxes, and grids of free and occupied cells, sent to the vehicles.
 
-The boxes come from a trained detector (`flcav.fusion.detector`), or from an *ideal* one: it labels exactly the objects
-from which its own LiDAR has at least `MIN_RETURNS` returns. Every figure that uses the ideal one is an upper bound.
+The boxes come from the trained detector, or from an *ideal* one: it labels exactly the objects from which its LiDAR has
+at least `MIN_RETURNS` returns. Every figure that uses the ideal one is an upper bound.
+
+The trained detector is SECOND on the returns that stand in front of a pole's static background. Its weights come with
+the package (the network "road" of the task objects). It was trained in the towns `TRAINED_IN`; its score threshold was
+fixed there, on frames of other scenes. A sensor that stands still knows the map around it, and what it takes for a car
+off the drivable surface is none. Where the map has heights, it sees the street flattened: each return as high above the
+sensor's foot as it is above the ground below it, since the network knows level streets. How well it works elsewhere is
+in `reproductions/road-detector`.
 """
 
 from collections.abc import Callable

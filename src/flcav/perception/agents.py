@@ -1,4 +1,9 @@
-"""Selection of a dataset's frames by agent: all, vehicles, poles (roadside units), or agents by name."""
+"""Frames of a dataset by agent, and as a network sees them.
+
+Frames are selected by agent: all, vehicles, poles (roadside units), or agents by name. Of a roadside LiDAR some
+networks see only the returns in front of the static background, which is learned from the pole's own sweeps of the same
+dataset.
+"""
 
 from collections import Counter
 from collections.abc import Callable, Mapping

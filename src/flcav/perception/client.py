@@ -1,4 +1,9 @@
-"""Client of a federated task: recording settings, sources of labels, messages of samples, and local training."""
+"""Clients of a federated task: recording settings, sources of labels, messages of samples, and local training.
+
+`TaskClient` sends weights. `OutputClient` sends class probabilities on shared samples, and its network imitates their
+mean, by the cross entropy with a soft target (Hinton et al., "Distilling the Knowledge in a Neural Network", 2015, at
+temperature 1).
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field

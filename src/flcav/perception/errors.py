@@ -1,7 +1,7 @@
 """The error registry: a network's mistakes with their positions in a town, each registered once.
 
-Sensors are placed by it. The `errors.py` of each task defines what a mistake is; this module holds the records, removes
-duplicates, and reads and writes files.
+Sensors are placed by it. Each task's `register_errors` defines what a mistake is; this module holds the records,
+removes duplicates, and reads and writes files.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence

@@ -1,4 +1,12 @@
-"""Evaluation on a folder of KITTI as its benchmark counts, by the rules of `flcav.perception.metrics.kitti`."""
+"""Evaluation as KITTI's object benchmark counts it: easy, moderate and hard, AP|R40 of images, ground and space.
+
+Geiger, Lenz, Urtasun, "Are we ready for Autonomous Driving?", CVPR 2012, and `evaluate_object.cpp` of the benchmark's
+development kit; 40 recall positions by Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV 2019.
+
+An object counts at a level by the height of its rectangle in the image, its occlusion and truncation; one that does not
+is ignored, and so are objects of the similar class. Detections lower than the level's height are ignored. In the image,
+detections in a DontCare region are ignored, too; such a region has no place in space.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace

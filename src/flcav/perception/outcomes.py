@@ -1,7 +1,7 @@
 """Outcomes of a test, from which the task's measure and its bootstrap over scenes follow without the network.
 
 The bootstrap gives 95 % percentile intervals of the measure and of paired differences between two networks, see
-`flcav.statistics`. The `outcomes.py` of each task defines what is kept per unit (a frame, an image or a road user) and
+`flcav.statistics`. The `evaluate.py` of each task defines what is kept per unit (a frame, an image or a road user) and
 how the measure is computed from it.
 """
 

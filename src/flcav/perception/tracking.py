@@ -1,4 +1,4 @@
-"""Multi-object tracking (AB3DMOT): a Kalman filter per object, and Hungarian assignment by likelihood.
+"""Multi-object tracking (AB3DMOT): a Kalman filter per object, Hungarian assignment by likelihood, and its evaluation.
 
 The state is x, y, z, length, width, height, yaw, then the velocity along x and y: that of Weng et al., "3D Multi-Object
 Tracking: A Baseline and New Evaluation Metrics", IROS 2020, sec. III-B, without a vertical velocity. The motion model
@@ -12,6 +12,8 @@ so that the variances a detector predicts count.
 
 Detectors confuse front and rear, so that a track has the axis of its detections, and the direction of its first one
 until it moves. One that moves backwards is turned by 180 degrees, see `head_with_motion`.
+
+Recorded sequences are evaluated by MOTA, AMOTA, identity switches and velocity error (`flcav.perception.metrics`).
 """
 
 from collections import defaultdict

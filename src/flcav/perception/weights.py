@@ -1,4 +1,7 @@
-"""Weights of networks as safetensors files, with configuration and model card as metadata, and as NumPy arrays."""
+"""Weights of networks as safetensors files, with configuration and model card as metadata, and as NumPy arrays.
+
+A model card says how a network was trained and evaluated (Mitchell et al., "Model Cards for Model Reporting", 2019).
+"""
 
 import json
 import sys

@@ -1,4 +1,12 @@
-"""Greedy matching of detections to ground truth by IoU, with neutral objects as in the KITTI benchmark."""
+"""Metrics of detection: greedy matching, average precision at 40 recalls, orientation similarity, calibration error.
+
+Detections are matched to truth by IoU, with neutral objects as in the KITTI benchmark. AP|R40 is the mean over recalls
+1/40, 2/40, ..., 1 of the highest precision at that recall or a higher one (Simonelli et al., "Disentangling Monocular
+3D Object Detection", ICCV 2019, sec. 5; KITTI's measure since then). Average orientation similarity (AOS) is the same
+mean of a weighted precision: a true positive with heading error t counts (1 + cos t) / 2 (Geiger et al., "Are we ready
+for autonomous driving? The KITTI vision benchmark suite", CVPR 2012, sec. 2.5, eqs. 1-2). Intervals are bootstrap ones
+over scenes, see `flcav.statistics`.
+"""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass

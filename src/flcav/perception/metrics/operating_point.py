@@ -1,4 +1,4 @@
-"""Objects that a detector finds and invents at one score, by distance: the count of an operating point.
+"""Objects that a detector finds and invents at one score: the count of an operating point, near by and by distance.
 
 Intervals are bootstrap ones over scenes or, where all frames are of one scene, over frames; these are too narrow where
 frames follow one another.

@@ -1,4 +1,4 @@
-"""Federated distillation: the loss of a vehicle that learns from the road average of boxes.
+"""Two more losses of a detector: federated distillation from the road average, and imitation of an earlier network.
 
 Wang et al. (IEEE Network 37(3), 2023), "federated distillation": each vehicle updates itself by a contrastive loss
 between its boxes and those of the road average. The loss of a batch is the sum of
@@ -9,6 +9,11 @@ between its boxes and those of the road average. The loss of a batch is the sum 
 - InfoNCE (van den Oord et al., "Representation Learning with Contrastive Predictive Coding", 2018, eq. 4) of
   bird's-eye features pooled in boxes: the query is one of the vehicle's own boxes, its positive the box of the road
   average that it is matched with, its negatives are the other boxes of the sweep, of the road average or its own.
+
+Imitation is knowledge distillation against forgetting (Li and Hoiem, "Learning without Forgetting", ECCV 2016; of
+detectors Shmelkov, Schmid, Alahari, "Incremental Learning of Object Detectors without Catastrophic Forgetting", ICCV
+2017). To the loss on labels it adds the distance of box residuals and headings from those of the earlier network, the
+teacher, where that sees an object. It needs no samples of what was learned before.
 """
 
 from collections.abc import Sequence

@@ -1,6 +1,7 @@
 """Evaluation of an object detector: AP and AOS per class, broken down by distance, occlusion and weather; calibration.
 
 AP is that in 3D and in bird's-eye view, at IoU 0.5 and 0.7. Beside it stands a count at one score, of cars near by.
+Matches are kept per frame, to recompute average precision on resampled scenes.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -1,8 +1,13 @@
-"""Loss of SECOND: focal loss of classes, smooth L1 loss of box residuals, cross-entropy of directions.
+"""Anchors, training targets and loss of SECOND: focal loss, smooth L1 of box residuals, cross-entropy of directions.
 
-Yan et al. 2018, sec. 3.3, eqs. 1-4: the error of the yaw enters by its sine. Weights are the published 1 for classes
-and 2 for boxes; the direction's is 1 instead of 0.2, since with the published one a third of the detected cars have a
-reversed heading: front and back differ by few points.
+There is one anchor per class and heading at the centre of every cell of the head's grid. Anchors are matched by IoU in
+bird's-eye view after turning boxes to the nearest axis (Yan et al. 2018, sec. 3.2: for cars positive from 0.6, negative
+below 0.45); the best anchors of an object are positive even below that. Residuals are those of Zhou and Tuzel,
+"VoxelNet", CVPR 2018, eq. 1.
+
+Loss: Yan et al. 2018, sec. 3.3, eqs. 1-4: the error of the yaw enters by its sine. Weights are the published 1 for
+classes and 2 for boxes; the direction's is 1 instead of 0.2, since with the published one a third of the detected cars
+have a reversed heading: front and back differ by few points.
 
 Predicted variances are trained by the Gaussian negative log-likelihood of the residuals' errors (the variance's part of
 He et al., "Bounding Box Regression with Uncertainty", CVPR 2019, eq. 9). The errors are detached, so that this term

@@ -1,8 +1,9 @@
-"""SECOND: a sparse 3D convolutional backbone, a 2D network in bird's-eye view, one anchor head.
+"""SECOND and its configurations: a sparse 3D backbone, a 2D network in bird's-eye view, one anchor head.
 
 Yan, Mao, Li, "SECOND: Sparsely Embedded Convolutional Detection", Sensors 18(10):3337, 2018. The widths of
 `second_paper` are those of the public configuration for KITTI (8x sparse backbone, 5.3 M parameters). In place of the
-sparse backbone a network may have a dense one, of pillars (Lang et al., "PointPillars", CVPR 2019).
+sparse backbone a network may have a dense one, of pillars (Lang et al., "PointPillars", CVPR 2019). Configurations
+include the augmentation of training samples, and are stored beside the weights.
 """
 
 import math

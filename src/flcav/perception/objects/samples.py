@@ -1,4 +1,7 @@
-"""Training samples of the detector: LiDAR sweeps with labels, from recorded frames."""
+"""Training samples of the detector: LiDAR sweeps with labels, from recorded frames or from messages.
+
+In a message the sweep is whole and uncompressed, 16 bytes a point, with the boxes to learn from.
+"""
 
 import math
 from collections.abc import Callable, Sequence

@@ -1,4 +1,8 @@
-"""3D object detection as a perception task: samples, loss, evaluation, inference and error registry of SECOND."""
+"""3D object detection by SECOND as a `Task`, its error registry, and its study recipes.
+
+A miss is a target or faint object (see `flcav.perception.objects.truth`) without a detection. A false positive is a
+detection on no annotated object with at least one LiDAR return in its box. Both lie within the range of the network.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -266,7 +270,7 @@ class ObjectsTask(ObjectsOutcomes):
     ) -> Registry:
         """Return the registry of the network's misses and false positives on frames (None: all).
 
-        threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
+        threshold: lowest score of a detection. See `find_errors`.
         """
         data.check_labelled("objects")
         numbers, read = data.numbers(frames), frame_reader(data, network.config.foreground)

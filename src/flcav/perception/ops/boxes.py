@@ -1,8 +1,9 @@
-"""IoU of rotated boxes, in 3D and in bird's-eye view, and non-maximum suppression by it. Float64 throughout.
+"""IoU and non-maximum suppression of rotated boxes, in 3D and in bird's-eye view, and of axis-aligned rectangles.
 
-Boxes are rows x, y, z of the centre, length, width, height [m], yaw [rad], in any one frame with z up. The intersection
-of two rectangles is the convex hull of the corners of each that lie in the other and of the crossings of their edges.
-Coordinates are relative to the midpoint of the pair, so that precision does not depend on the distance from the origin.
+Boxes are rows x, y, z of the centre, length, width, height [m], yaw [rad], in any one frame with z up; computation is
+in float64. The intersection of two footprints is the convex hull of the corners of each that lie in the other and of
+the crossings of their edges. Coordinates are relative to the midpoint of the pair, so that precision does not depend on
+the distance from the origin. Rectangles are rows x1, y1, x2, y2.
 """
 
 import math

@@ -1,8 +1,9 @@
-"""Pillars: statistics of the points above each cell of the ground, as a dense bird's-eye map.
+"""Point clouds on grids: voxels with the mean of their points, and pillars with statistics of theirs.
 
-The grid is that of Lang et al., "PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019, and
-the statistics take the place of its learned encoder: they cost one pass over the points, and the highest point of a
-pillar tells a network how high an object is.
+Voxels are those of SECOND's published configuration (mean VFE). The grid of pillars is that of Lang et al.,
+"PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019; the statistics take the place of its
+learned encoder: they cost one pass over the points, and the highest point of a pillar tells a network how high an
+object is.
 """
 
 from collections.abc import Sequence

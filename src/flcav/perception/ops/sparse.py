@@ -1,9 +1,10 @@
 """Submanifold and strided sparse 3D convolution: gather, one matrix product per kernel offset, sum by output voxel.
 
-On a CPU compiled kernels do it block by block. Elsewhere the sum by output voxel is an `embedding_bag`,
-which reads each product once, in the order of the outputs. The backward pass is written by hand and keeps the input
-features and the weight alone. Convolutions: Graham et al., "3D Semantic Segmentation with Submanifold Sparse
-Convolutional Networks", CVPR 2018.
+On a CPU compiled kernels work through the pairs of a rulebook in blocks: the products of a block stay in the
+processor's cache; those of all pairs at once would go through main memory. Each product is smaller than those that BLAS
+spreads over threads. Elsewhere the sum by output voxel is an `embedding_bag`, which reads each product once, in the
+order of the outputs. The backward pass is written by hand and keeps the input features and the weight alone.
+Convolutions: Graham et al., "3D Semantic Segmentation with Submanifold Sparse Convolutional Networks", CVPR 2018.
 """
 
 import contextlib

@@ -1,4 +1,4 @@
-"""COCO's mean average precision of the sign detector, also by class and by size of the box."""
+"""COCO's mean average precision of the sign detector, by class and size; outcomes of each image for the bootstrap."""
 
 import contextlib
 import io

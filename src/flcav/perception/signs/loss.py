@@ -1,4 +1,7 @@
-"""Loss of the sign detector: complete IoU of boxes, and binary cross entropies of objectness and classes."""
+"""Targets and loss of the sign detector: boxes assigned to anchors; complete IoU, objectness and class entropies.
+
+`class_probabilities` are what a network says of the same boxes, from which others learn (see `number_boxes`).
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,10 +1,11 @@
-"""A YOLOv5-style one-stage detector.
+"""A YOLOv5-style one-stage detector and its configurations: width, depth, classes, anchors, size of training windows.
 
 A backbone of cross-stage partial stages (Wang et al., "CSPNet", CVPRW 2020), spatial pyramid pooling by repeated
 max pooling (He et al., "Spatial Pyramid Pooling in Deep Convolutional Networks", ECCV 2014), a path-aggregation neck
 (Liu et al., "Path Aggregation Network for Instance Segmentation", CVPR 2018), and anchors on three levels. Terven et
 al., "A Comprehensive Review of YOLO Architectures", 2023, describe how the parts are combined, their widths and depths.
-With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters.
+With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters. The same network also
+finds cars, in the pictures of roadside cameras: configuration `road`.
 """
 
 import math

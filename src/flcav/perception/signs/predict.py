@@ -1,4 +1,7 @@
-"""Inference of the sign detector: decoding, score threshold and class-agnostic non-maximum suppression."""
+"""Inference of the sign detector: decoding, score threshold, class-agnostic non-maximum suppression, and findings.
+
+Inputs are images of files, folders and datasets.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,14 @@
-"""Samples of the sign task: images with target boxes, and ignored boxes that are left out of the loss."""
+"""Samples of the sign task: images with target and ignored boxes, their messages, backgrounds and augmentation.
+
+A network of three channels sees the pictures of a camera that stands still beside the static background. That is the
+median of the camera's pictures in the same dataset, as that of a roadside LiDAR is learned from its own sweeps.
+
+Augmentation is by random crops and scales, mosaics, brightness and saturation; there is no mirroring. The mosaic is
+that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of crops ("windows") instead of whole images made smaller: signs
+are few and small, so most windows are drawn around a sign. Small windows around signs show the network many digits at a
+low cost. Each window but the first looks for a sign of a class drawn at random, so that rare classes (amber lasts
+seconds of a minute) are seen as often as others.
+"""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace

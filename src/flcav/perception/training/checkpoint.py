@@ -1,4 +1,4 @@
-"""Checkpoints of a training run, and the settings that identify it.
+"""State of a training: its optimiser AdamW, its checkpoints, and the settings that identify it.
 
 The settings are all that decides the weights, except the kind of processor and the versions of libraries.
 """

@@ -1,8 +1,17 @@
-"""A multi-modal LSTM encoder-decoder over tracks with bird's-eye features of the surroundings.
+"""A multi-modal LSTM encoder-decoder over tracks, with bird's-eye features of rasters or of several cameras.
 
-Encoder: an LSTM over the past, and a bird's-eye view (`flcav.perception.trajectory.cross_view`). Decoder: one LSTM with
-a different initial state per mode; at each step its inputs are position, last displacement and the ground's features at
+Encoder: an LSTM over the past, and convolutions over rasters or a cross-view transformer. Decoder: one LSTM with a
+different initial state per mode; at each step its inputs are position, last displacement and the ground's features at
 the position, and its output is a change of the displacement. With zero output a path keeps heading and speed.
+
+The cross-view transformer maps images of several cameras to features and a map of the ground (Zhou and Kraehenbuehl,
+"Cross-view Transformers for Real-time Map-view Semantic Segmentation", CVPR 2022, sec. 3): places on the ground attend
+to all places of all images at once, by cosine similarity (eq. 3); a place in an image is embedded by its features, the
+position of the camera and the direction of its ray (eq. 2). In addition, each ray is intersected with a flat ground,
+and attention is biased to near places by a Gaussian of the distance, whose width each head learns, after Chen et al.,
+"Efficient and Robust 2D-to-BEV Representation Learning via Geometry-guided Kernel Transformer", 2022. Differences from
+the paper: small convolutions instead of EfficientNet, one or two attention layers at one resolution, and ground around
+the predicted road user instead of the vehicle with the cameras.
 """
 
 from typing import NamedTuple

@@ -1,4 +1,7 @@
-"""Inference of the trajectory network: input and target tensors, batches, single path; forecasts as JSON records."""
+"""Inference of the trajectory network: tensors in and out, batches, single path, and findings of a dataset's frames.
+
+Findings are the forecasts, drawn on the map around the observing agent, with their JSON record.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass

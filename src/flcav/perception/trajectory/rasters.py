@@ -1,4 +1,7 @@
-"""Bird's-eye rasters around road users: the map, reachable lanes, traffic lights, and other road users' tracks."""
+"""Bird's-eye rasters around road users: the town's map, reachable lanes, traffic lights, and road users' tracks.
+
+`RoadMap` is the lane-level map that they are drawn from: raster, lane centre lines, reachable lanes, traffic lights.
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass

@@ -1,4 +1,7 @@
-"""The trajectory task: trajectory prediction of vehicles as a `Task`."""
+"""The trajectory task: trajectory prediction of vehicles as a `Task`, its loss, and its study recipes.
+
+The loss is a winner-takes-all regression and a mode classification, with cameras also a segmentation of the map.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path

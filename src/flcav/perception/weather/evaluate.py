@@ -1,4 +1,7 @@
-"""Classification metrics of the weather task: accuracy, recall per class, and the confusion matrix."""
+"""Predictions of the weather classifier, their metrics, and the outcome of each image for intervals over scenes.
+
+Metrics are accuracy, recall per class, and the confusion matrix.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass

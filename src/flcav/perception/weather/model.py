@@ -1,8 +1,8 @@
-"""LeNet-5: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", Proc. IEEE 1998, sec. II-B.
+"""LeNet-5 and its configurations: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", 1998, II-B.
 
-Two things differ from the paper in all configurations: images have three channels, and the output layer is linear with
-a softmax instead of radial basis functions around drawn prototypes of digits. With batch normalisation (Ioffe and
-Szegedy, ICML 2015) the maps of C1 and C3 are normalised before the rectifiers.
+Proc. IEEE 86(11). Two things differ from the paper in all configurations: images have three channels, and the output
+layer is linear with a softmax instead of radial basis functions around drawn prototypes of digits. With batch
+normalisation (Ioffe and Szegedy, ICML 2015) the maps of C1 and C3 are normalised before the rectifiers.
 """
 
 from collections.abc import Sequence

@@ -1,4 +1,4 @@
-"""Samples of the weather task: images of 32 x 32 pixels with their class of weather."""
+"""Samples of the weather task: images of 32 x 32 pixels with their class, their augmentation, and their messages."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
