@@ -37,11 +37,8 @@ from flcav.world.map.parameters import GeoReference
 STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
 ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's velocity across and upwards, its own axes
 REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
-SLOW_MPS, QUIET_S, QUIET = (
-    1.0,
-    1.0,
-    2.0,
-)  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
+SLOW_MPS = 1.0  # at rest a vehicle is slower
+QUIET_S, QUIET = 1.0, 2.0  # and its IMU varies by at most so many standard deviations, so long before and after
 HEIGHT_M = 0.5  # standard deviation of the height of the map's ground below a fix
 HEADINGS = 8  # directions of the vehicle at the beginning that are tried
 BACKWARDS_M = 1.0  # no car drives farther backwards, all in all
@@ -107,8 +104,8 @@ def estimate_drive(
     rest = _find_rest(log, inertia, epochs)
     tried = []
     for turn in rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)):
-        given = (position, velocity, turn, covariance)
-        tried.append(_filter(log.imu_time_s, inertia, epochs, fixes, rest, levers, _sigmas(log), *given))
+        begin = (position, velocity, turn, covariance)
+        tried.append(_filter(log.imu_time_s, inertia, (epochs, fixes, rest), levers, _sigmas(log), begin))
     forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both, *_ in tried]
     likelihood = np.nan_to_num(np.where(forwards, [each[-1] for each in tried], -np.inf), nan=-np.inf)
     best = int(likelihood.argmax())
@@ -208,14 +205,17 @@ def _exp(v):
 
 
 @compiled
-def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, velocity, turn, covariance):
+def _filter(times_s, inertia, measured, levers, sigmas, begin):
     """Return the updated and the predicted states (2, E, ...), transitions between epochs, and how well all this fits.
 
-    fixes: (E, 5), see `estimate_drive`. rest: (E,). levers: (2, 3) of antenna and vehicle's origin from the IMU,
-    vehicle's axes. sigmas: see `_sigmas`. How well: normalised squared innovations (E,) of fixes, and the logarithm of
-    the likelihood of all measurements but rest, which each nominal state assumes at times of its own.
+    measured: epochs (E,), fixes (E, 5), see `_list_epochs`, and whether at rest (E,). levers: (2, 3) of antenna and
+    vehicle's origin from the IMU, vehicle's axes. sigmas: see `_sigmas`. begin: position, velocity, turn, covariance.
+    How well: normalised squared innovations (E,) of fixes, and the logarithm of the likelihood of all measurements but
+    rest, which each nominal state assumes at times of its own.
     """
-    count, bias, p, likelihood = len(epochs), np.zeros(9), covariance, 0.0
+    epochs, fixes, rest = measured
+    position, velocity, turn, p = begin
+    count, bias, likelihood = len(epochs), np.zeros(9), 0.0
     positions, velocities, turns = np.zeros((2, count, 3)), np.zeros((2, count, 3)), np.zeros((2, count, 3, 3))
     biases, covariances = np.zeros((2, count, 9)), np.zeros((2, count, STATES, STATES))
     transition, misfit = np.zeros((count, STATES, STATES)), np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
@@ -234,9 +234,8 @@ def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, vel
         transition[e], covariances[1, e] = phi, p
         positions[1, e], velocities[1, e], turns[1, e], biases[1, e] = position, velocity, turn, bias
 
-        h, r, noise, common = _measure(
-            position, velocity, turn, bias, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas
-        )
+        state = (position, velocity, turn, bias)
+        h, r, noise, common = _measure(state, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas)
         off = np.zeros(STATES)
         for i in range(len(r)):  # one after another, since their noise is independent
             seen = p @ h[i]
@@ -274,12 +273,13 @@ def _transit(turn, bias, sample, dt, sigmas):
 
 
 @compiled
-def _measure(position, velocity, turn, bias, sample, fix, rests, levers, sigmas):
+def _measure(state, sample, fix, rests, levers, sigmas):
     """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements.
 
     They are across and upwards velocity, before them the fix and the height of the ground where there are any, after
     them velocity and angular rate at rest; also the number of those before the latter. sample: (3,) angular rate.
     """
+    position, velocity, turn, bias = state
     h, r, noise, rows = np.zeros((12, STATES)), np.zeros(12), np.zeros(12), 0
     rate, back = sample - bias[3:6], turn.T @ velocity
     if np.isfinite(fix[0]):

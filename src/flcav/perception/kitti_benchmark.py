@@ -97,7 +97,7 @@ def average_precision_r40(frames: Sequence[ClassFrame], limit: float) -> float |
     if not targets:
         return None
     busy = [frame for frame in frames if len(frame.score)]
-    reached = [_match(*_arguments(frame), limit, -np.inf, False)[2] for frame in busy]
+    reached = [_match(frame, limit, -np.inf, False)[2] for frame in busy]
     scores = np.concatenate(reached) if reached else np.zeros(0)
     precision = np.zeros(RECALLS)
     for place, threshold in enumerate(find_thresholds(scores, targets)):
@@ -110,7 +110,7 @@ def average_precision_r40(frames: Sequence[ClassFrame], limit: float) -> float |
 
 def count_matches(frame: ClassFrame, limit: float, threshold: float) -> tuple[int, int]:
     """Return the numbers of true and of false positives of a frame, among detections of `threshold` or more."""
-    return _match(*_arguments(frame), limit, threshold, True)[:2]
+    return _match(frame, limit, threshold, True)[:2]
 
 
 def find_thresholds(scores: Array, targets: int) -> list[float]:
@@ -131,26 +131,22 @@ def find_thresholds(scores: Array, targets: int) -> list[float]:
     return found[:RECALLS]
 
 
-def _arguments(frame: ClassFrame) -> tuple[Array, Ints, Ints, Array, Mask]:
-    return frame.score, frame.detection, frame.label, frame.overlap, frame.excused
+def _match(frame: ClassFrame, limit: float, threshold: float, counted: bool) -> tuple[int, int, Array]:
+    """Return `_match_arrays` of a frame."""
+    arrays = (frame.score, frame.detection, frame.label, frame.overlap, frame.excused)
+    return _match_arrays(arrays, limit, threshold, counted)
 
 
 @compiled
-def _match(
-    score: Array,
-    detection: Ints,
-    label: Ints,
-    overlap: Array,
-    excused: Mask,
-    limit: float,
-    threshold: float,
-    counted: bool,
+def _match_arrays(
+    frame: tuple[Array, Ints, Ints, Array, Mask], limit: float, threshold: float, counted: bool
 ) -> tuple[int, int, Array]:
     """Return true positives, false positives, and the scores (T,) of the true ones, among scores from `threshold` on.
 
     Objects take detections in their order: with `counted` that of highest overlap, one that counts before an ignored
     one; without, which is how thresholds are found, that of highest score.
     """
+    score, detection, label, overlap, excused = frame
     taken = np.zeros(len(score), np.bool_)
     true = 0
     reached = np.zeros(len(label))

@@ -357,13 +357,8 @@ def _check_around(task: Task, around: bool) -> None:
 
 def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
     """Return the LiDARs that a network was trained with, by its card, as far as that says."""
-    if isinstance(network, nn.Module):
-        return KnownLidar()
-    try:
-        card = read_card(Path(network or find_shipped(task)))
-    except DamagedFile:
-        raise
-    except InputError:
+    card = None if isinstance(network, nn.Module) else _find_card(Path(network or find_shipped(task)))
+    if card is None:
         return KnownLidar()
     return join_lidars([read_lidar(entry.recipe, entry.agents) for entry in card.data])
 
@@ -393,10 +388,15 @@ def origin_of(task: Task, weights: Path | None) -> Origin:
     Raises `InputError` for None if the task has no weights in the package.
     """
     path = weights or find_shipped(task)
+    card = _find_card(path)
+    return Origin(None, None, str(path)) if card is None else Origin(card.network, card.seed, str(path))
+
+
+def _find_card(path: Path) -> Card | None:
+    """Return the card in a file of weights; None without one. Raises `DamagedFile` for a damaged file or card."""
     try:
-        card = read_card(path)
+        return read_card(path)
     except DamagedFile:
         raise
     except InputError:
-        return Origin(None, None, str(path))
-    return Origin(card.network, card.seed, str(path))
+        return None

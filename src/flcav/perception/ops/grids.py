@@ -82,7 +82,6 @@ def voxelize(
     x, y, z = cell[kept].long().unbind(1)
     keys, order = encode_cells(torch.stack((sample[kept], z, y, x), 1), shape).sort(stable=True)
     keys, count = torch.unique_consecutive(keys, return_counts=True)
-    means = torch.segment_reduce(
-        points[kept[order]], "mean", lengths=count, axis=0, unsafe=True
-    )  # unchecked: may be empty
+    own = points[kept[order]]  # may be empty, for which the checks of `unsafe=False` raise
+    means = torch.segment_reduce(own, "mean", lengths=count, axis=0, unsafe=True)
     return means, keys

@@ -31,6 +31,9 @@ from flcav.perception.ops.rulebook import (
     decode_keys,
 )
 
+Floats = NDArray[np.floating]
+Pairs = tuple[Ints32, Ints32, Ints]  # source and target (P,), and where each kernel offset's pairs begin (K + 1,)
+
 
 @dataclass(frozen=True)
 class SparseTensor:
@@ -101,7 +104,7 @@ class _SparseConvolution(torch.autograd.Function):
             return _grouped(features, weight, rules, rules.by_target)
         out = features.new_zeros(rules.targets, weight.shape[2])
         arrays = (features.detach().contiguous().numpy(), weight.detach().contiguous().numpy())
-        convolve(*arrays, *_pairs(rules), out.numpy())
+        convolve(*arrays, _pairs(rules), out.numpy())
         return out
 
     @staticmethod
@@ -114,21 +117,22 @@ class _SparseConvolution(torch.autograd.Function):
         grad_weight = torch.zeros_like(weight, memory_format=torch.contiguous_format)
         arrays = (features.detach().contiguous().numpy(), gradient.numpy())
         if not wants_features:
-            weight_gradient(*arrays, *_pairs(ctx.rules), grad_weight.numpy())
+            weight_gradient(*arrays, _pairs(ctx.rules), grad_weight.numpy())
             return None, grad_weight, None
         grad_features = torch.zeros_like(features, memory_format=torch.contiguous_format)
         turned = weight.detach().transpose(1, 2).contiguous().numpy()
-        source, target, begins = _pairs(ctx.rules)
+        pairs = _pairs(ctx.rules)
         if _second is None:
-            convolution_gradients(*arrays, turned, source, target, begins, grad_features.numpy(), grad_weight.numpy())
+            convolution_gradients(*arrays, turned, pairs, grad_features.numpy(), grad_weight.numpy())
         else:
-            beside = _second.submit(weight_gradient, *arrays, source, target, begins, grad_weight.numpy())
-            convolve(arrays[1], turned, target, source, begins, grad_features.numpy())
+            beside = _second.submit(weight_gradient, *arrays, pairs, grad_weight.numpy())
+            source, target, begins = pairs
+            convolve(arrays[1], turned, (target, source, begins), grad_features.numpy())
             beside.result()
         return grad_features, grad_weight, None
 
 
-def _pairs(rules: Rulebook) -> tuple[Ints32, Ints32, Ints]:
+def _pairs(rules: Rulebook) -> Pairs:
     """Return source (P,), target (P,), and (K + 1,) where the pairs of each offset begin and the last ones end."""
     return rules.source.numpy(), rules.target.numpy(), np.cumsum((0, *rules.counts), dtype=np.int64)
 
@@ -200,20 +204,19 @@ def _initial(offsets: int, in_channels: int, out_channels: int) -> Tensor:
     return torch.randn(offsets, in_channels, out_channels) * math.sqrt(2 / (in_channels * active))
 
 
-Floats = NDArray[np.floating]
-
 BLOCK = 1 << 18  # most multiplications in the matrix product of a block
 LONGEST = 1024  # most pairs in a block
 
 
 @compiled
-def convolve(features: Floats, weight: Floats, source: Ints32, target: Ints32, begins: Ints, out: Floats) -> None:
+def convolve(features: Floats, weight: Floats, pairs: Pairs, out: Floats) -> None:
     """Sparse convolution, forward pass: add features[s] @ weight[k] to out[t] for every pair (s, t) of kernel offset k.
 
-    features (N, C), weight (K, C, C'), out (M, C'), changed in place. source and target (P,) are the rows s and t of
-    the pairs; those of offset k are numbers begins[k] to begins[k + 1], begins (K + 1,). No target occurs twice in an
+    features (N, C), weight (K, C, C'), out (M, C'), changed in place. pairs: source and target (P,), the rows s
+    and t, and begins (K + 1,): those of offset k are numbers begins[k] to begins[k + 1]. No target occurs twice in an
     offset.
     """
+    source, target, begins = pairs
     block = min(LONGEST, max(1, BLOCK // (weight.shape[1] * weight.shape[2])))
     sent = np.empty((block, weight.shape[1]), dtype=features.dtype)
     product = np.empty((block, weight.shape[2]), dtype=features.dtype)
@@ -226,13 +229,12 @@ def convolve(features: Floats, weight: Floats, source: Ints32, target: Ints32, b
 
 
 @compiled
-def weight_gradient(
-    features: Floats, gradient: Floats, source: Ints32, target: Ints32, begins: Ints, out: Floats
-) -> None:
+def weight_gradient(features: Floats, gradient: Floats, pairs: Pairs, out: Floats) -> None:
     """Gradient of the weights: add features[s]^T gradient[t] to out[k] for every pair (s, t) of kernel offset k.
 
     features (N, C), gradient of the output (M, C'), out (K, C, C'), changed in place; pairs as in `convolve`.
     """
+    source, target, begins = pairs
     block = min(LONGEST, max(1, BLOCK // (out.shape[1] * out.shape[2])))
     sent = np.empty((block, out.shape[1]), dtype=features.dtype)
     arrived = np.empty((block, out.shape[2]), dtype=features.dtype)
@@ -248,14 +250,7 @@ def weight_gradient(
 
 @compiled
 def convolution_gradients(
-    features: Floats,
-    gradient: Floats,
-    turned: Floats,
-    source: Ints32,
-    target: Ints32,
-    begins: Ints,
-    to_features: Floats,
-    to_weight: Floats,
+    features: Floats, gradient: Floats, turned: Floats, pairs: Pairs, to_features: Floats, to_weight: Floats
 ) -> None:
     """Gradients of weights and input features, in one pass over the pairs.
 
@@ -263,6 +258,7 @@ def convolution_gradients(
     gradient[t] @ turned[k] to to_features[s] (N, C), both in place. turned (K, C', C): the weight of each offset,
     transposed. The rest is as in `convolve`.
     """
+    source, target, begins = pairs
     block = min(LONGEST, max(1, BLOCK // (turned.shape[1] * turned.shape[2])))
     sent = np.empty((block, turned.shape[2]), dtype=features.dtype)
     arrived = np.empty((block, turned.shape[1]), dtype=features.dtype)

@@ -80,9 +80,7 @@ class AdamW:
 
 
 TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
-DataIdentity = tuple[
-    str, tuple[str, ...] | None
-]  # a dataset: SHA-256 of its manifest, agents used (None in older cards)
+DataIdentity = tuple[str, tuple[str, ...] | None]  # SHA-256 of a manifest, agents used (None in older cards)
 NAMED = {"data": "other data or agents", "validation": "other validation data or agents"}
 
 

@@ -67,9 +67,7 @@ class Validation:
 
     score: Callable[[nn.Module], float]  # validation score of a network; more is better
     every: int  # steps between validations
-    patience: int | None = (
-        None  # validations without a new best after which training stops, with the best weights; None: it goes on
-    )
+    patience: int | None = None  # validations without a new best after which training stops; None: it goes on
 
     def is_over(self, scores: Sequence[float]) -> bool:
         """Return whether training stops: none of the last `patience` of `scores` is above all scores before them."""
