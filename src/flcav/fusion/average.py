@@ -51,25 +51,25 @@ class RoadAverage:
     member: tuple[Ints, ...]  # for each `BoxReport` the object of each of its boxes
 
 
-def average_boxes(told: Sequence[BoxReport], at_s: float) -> RoadAverage:
+def average_boxes(reports: Sequence[BoxReport], at_s: float) -> RoadAverage:
     """Return the objects at `at_s` [s] that agents report in a window of spins.
 
     An agent's score of an object is the mean over all its spins, zero where it does not report the object; the average
     has the probability that not all agents err, 1 - product of (1 - score).
     """
-    told = list(told)
-    member = _associate(told, at_s)
+    reports = list(reports)
+    member = _associate(reports, at_s)
     flat = np.concatenate([np.zeros(0, dtype=np.int64), *member])
     count = int(flat.max(initial=-1)) + 1
-    names = sorted({one.agent for one in told})
-    spins = np.array([sum(one.agent == name for one in told) for name in names], dtype=np.float64)
-    lengths = [len(one.boxes) for one in told]
-    agent = np.repeat([names.index(one.agent) for one in told], lengths).astype(np.int64)
-    since = np.repeat([one.time_s - at_s for one in told], lengths)
-    rows = np.concatenate([np.zeros((0, 7)), *(one.boxes.array() for one in told)])
-    variance = np.concatenate([np.zeros((0, 7)), *(variance_of(one.boxes) for one in told)])
-    score = np.concatenate([np.zeros(0), *(_scores(one.boxes) for one in told)])
-    label = np.concatenate([np.zeros(0, dtype=np.str_), *(one.boxes.label for one in told)])
+    names = sorted({one.agent for one in reports})
+    spins = np.array([sum(one.agent == name for one in reports) for name in names], dtype=np.float64)
+    lengths = [len(one.boxes) for one in reports]
+    agent = np.repeat([names.index(one.agent) for one in reports], lengths).astype(np.int64)
+    since = np.repeat([one.time_s - at_s for one in reports], lengths)
+    rows = np.concatenate([np.zeros((0, 7)), *(one.boxes.array() for one in reports)])
+    variance = np.concatenate([np.zeros((0, 7)), *(variance_of(one.boxes) for one in reports)])
+    score = np.concatenate([np.zeros(0), *(_scores(one.boxes) for one in reports)])
+    label = np.concatenate([np.zeros(0, dtype=np.str_), *(one.boxes.label for one in reports)])
 
     lines = _Lines(count)
     lines.add(flat, rows[:, :2], variance[:, :2], since)
@@ -118,14 +118,14 @@ class _Lines:
         return (wtt * wx - wt * wxt) / det, (w * wxt - wt * wx) / det, np.stack((wtt, -wt, w)) / det
 
 
-def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[Ints, ...]:
+def _associate(reports: Sequence[BoxReport], at_s: float) -> tuple[Ints, ...]:
     """Return for each `BoxReport` the number of the object that each of its boxes belongs to, from 0."""
-    most = sum(len(one.boxes) for one in told)
+    most = sum(len(one.boxes) for one in reports)
     lines, labels, count = _Lines(most), np.zeros(most, dtype=np.int64), 0
     known: dict[str, int] = {}
     member: dict[int, Ints] = {}
-    for number in sorted(range(len(told)), key=lambda i: told[i].time_s):
-        boxes, t = told[number].boxes, told[number].time_s - at_s
+    for number in sorted(range(len(reports)), key=lambda i: reports[i].time_s):
+        boxes, t = reports[number].boxes, reports[number].time_s - at_s
         xy, variance = boxes.center[:, :2], variance_of(boxes)[:, :2]
         label = np.array([known.setdefault(str(name), len(known)) for name in boxes.label], dtype=np.int64)
         own = np.full(len(boxes), -1)
@@ -144,7 +144,7 @@ def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[Ints, ...]:
         count += len(new)
         lines.add(own, xy, variance, t)
         member[number] = own
-    return tuple(member[number] for number in range(len(told)))
+    return tuple(member[number] for number in range(len(reports)))
 
 
 def _intersect(row: Ints, mean: Array, variance: Array, count: int) -> tuple[Array, Array]:
@@ -201,7 +201,7 @@ class Sighting:
 
 
 def report_boxes(sighting: Sighting) -> BoxReport:
-    """Return what an agent tells of a spin: boxes in the world, with the uncertainty of its pose in their variances.
+    """Return what an agent reports of a spin: boxes in the world, with the uncertainty of its pose in their variances.
 
     A heading error moves a box at distance r by r times the error, across the line of sight.
     """

@@ -14,7 +14,7 @@ truth, and vehicles know poses and times by their own navigation alone.
 
 The map corrects headings and classes: lanes say which way cars face, crossings who walks there. A car on a lane follows
 its direction within a few degrees, so that the lane is one more measurement of its heading, joined by inverse variance.
-Front and back of a car are told apart by few returns, by the lane surely. A slow road user on a sidewalk or crossing is
+Front and back of a car differ by few returns, and the lane decides. A slow road user on a sidewalk or crossing is
 a pedestrian, one on a lane elsewhere a cyclist; detectors mistake one for the other.
 """
 
@@ -124,7 +124,7 @@ def _sample(lane: MapLane) -> Array:
     return np.column_stack((xy, yaw, np.full(len(xy), lane.width_m / 2)))
 
 
-TOLD = 0.1  # lowest score of a detection that a vehicle tells of
+TOLD = 0.1  # lowest score of a detection that a vehicle reports
 FREE = 0.5  # what vehicles alone report is dropped where road sensors saw more than this share of its footprint free
 PARTS = (8, 4)  # of a footprint, along and across, by which that share is measured
 RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the object's: poses are off
@@ -198,35 +198,35 @@ def average_spin(
     context: MapContext | None = None,
     around: Sequence[Sighting] = (),
 ) -> list[Guidance]:
-    """Return what the edge server tells each vehicle of a spin, in the order of the vehicles among the sightings.
+    """Return what the edge server sends each vehicle about a spin, in the order of the vehicles among the sightings.
 
     sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
-    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: they are as told.
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: as reported.
     context: the map that headings and classes are snapped to; None: they are as averaged. around: sightings of other
     spins in the window, before and after, averaged with those of this one. Without any all speeds count as 0.
     """
-    told = [_classify(each, config) if each.navigation is None else each for each in (*sightings, *around)]
+    reported = [_classify(each, config) if each.navigation is None else each for each in (*sightings, *around)]
     times_s = [each.time_s for each in sightings]
     surveyed_s = [each.time_s for each in sightings if each.navigation is None]
     at_s = float(np.median(surveyed_s or times_s or [0.0]))
     if posts is not None:
-        told = correct_poses(told, posts, at_s)
-    average = average_boxes([report_boxes(each) for each in told], at_s)
+        reported = correct_poses(reported, posts, at_s)
+    average = average_boxes([report_boxes(each) for each in reported], at_s)
     boxes = average.boxes if context is None else snap_to_map(average.boxes, average.velocity, context)
-    road, sure = _count_votes(told, average, threshold)
+    road, sure = _count_votes(reported, average, threshold)
     kept = select_labels(boxes, road, views, threshold)
     confirmed = (road | (sure > 1))[kept]
-    asking = [each for each in told[: len(sightings)] if each.navigation is not None]
+    asking = [each for each in reported[: len(sightings)] if each.navigation is not None]
     moved = [average.velocity[kept] * (each.time_s - at_s) for each in asking]
     return [place_in(_shift(boxes[kept], by), confirmed, each) for each, by in zip(asking, moved, strict=True)]
 
 
-def _count_votes(told: Sequence[Sighting], average: RoadAverage, threshold: float) -> tuple[Mask, Ints]:
+def _count_votes(reported: Sequence[Sighting], average: RoadAverage, threshold: float) -> tuple[Mask, Ints]:
     """Return (K,) whether a road sensor has each object, (K,) how many vehicles are sure of it, over a window."""
     count = len(average.boxes)
     road, sure = np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
-    for agent in {each.agent for each in told}:
-        own = [(each, member) for each, member in zip(told, average.member, strict=True) if each.agent == agent]
+    for agent in {each.agent for each in reported}:
+        own = [(each, member) for each, member in zip(reported, average.member, strict=True) if each.agent == agent]
         seen, score = np.zeros(count), np.zeros(count)
         for each, member in own:  # an object has at most one box of a sighting
             seen[member] += 1
@@ -252,7 +252,7 @@ def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
 
 
 def select_labels(boxes: Boxes, road: Mask, views: Sequence[RoadView], threshold: float) -> Mask:
-    """Return (N,) which boxes of an average are told to vehicles; `road` (N,): whether a road sensor has the box."""
+    """Return (N,) which boxes of an average are sent to vehicles; `road` (N,): whether a road sensor has the box."""
     assert boxes.score is not None
     seen = boxes[road]
     near = np.linalg.norm(boxes.center[:, None, :2] - seen.center[None, :, :2], axis=2) < seen.size[None, :, 0] / 2
@@ -276,7 +276,7 @@ def place_in(boxes: Boxes, confirmed: Mask, seen: Sighting) -> Guidance:
 
 
 def distil_sample(
-    frame: Frame, own: Boxes, told: Guidance, views: Sequence[RoadView], config: SecondConfig, lidar: str
+    frame: Frame, own: Boxes, guidance: Guidance, views: Sequence[RoadView], config: SecondConfig, lidar: str
 ) -> Sample:
     """Return a vehicle's frame with the labels of federated distillation; network's frame.
 
@@ -286,12 +286,12 @@ def distil_sample(
     """
     mount = frame.assumed.agent_from_sensor[lidar]
     points = crop_to_range(frame.lidar[lidar], config)
-    boxes = told.boxes.transform(inverse(mount))
+    boxes = guidance.boxes.transform(inverse(mount))
     asked = np.isin(boxes.label, config.classes)
-    targets = asked & told.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
+    targets = asked & guidance.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
     cells = cell_centers(config)
     below = np.column_stack((cells, np.full(len(cells), -mount[2, 3])))
-    world = transform_points(told.world_from_agent @ mount, below)[:, :2]
+    world = transform_points(guidance.world_from_agent @ mount, below)[:, :2]
     free = np.zeros(len(cells), dtype=bool)
     for view in views:
         free |= view.at(view.ground, world)

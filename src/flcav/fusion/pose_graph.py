@@ -67,19 +67,19 @@ def _optimise(
         key = gtsam.symbol("o", number)
         start.insert(key, gtsam.Pose2(*seen[0].place))
         for each in seen:
-            told = latest[each.sighting]
-            if told.navigation is None:
+            reported = latest[each.sighting]
+            if reported.navigation is None:
                 graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(*each.place), noise(each.variance)))
             else:
-                own = planar(told.world_from_agent).between(gtsam.Pose2(*each.place))
+                own = planar(reported.world_from_agent).between(gtsam.Pose2(*each.place))
                 vehicle = gtsam.symbol("v", each.sighting)
                 graph.add(gtsam.BetweenFactorPose2(vehicle, key, own, noise(each.variance)))
     landmarks = 0
-    for number, (first, told) in enumerate(zip(stated, latest, strict=True)):
-        if told.navigation is None or first.navigation is None:
+    for number, (first, reported) in enumerate(zip(stated, latest, strict=True)):
+        if reported.navigation is None or first.navigation is None:
             continue
         key = gtsam.symbol("v", number)
-        start.insert(key, planar(told.world_from_agent))
+        start.insert(key, planar(reported.world_from_agent))
         known = first.navigation
         sigmas = np.array((known.position_m, known.position_m, known.heading_rad))
         graph.add(
@@ -87,7 +87,7 @@ def _optimise(
                 key, planar(first.world_from_agent), gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, 1e-3))
             )
         )
-        for own, place in match_posts(told, posts):
+        for own, place in match_posts(reported, posts):
             point = gtsam.symbol("l", landmarks)
             landmarks += 1
             start.insert(point, place)
@@ -98,23 +98,25 @@ def _optimise(
     best = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, best)
 
-    def moved(number: int, told: Sighting) -> Sighting:
-        if told.navigation is None:
-            return told
+    def moved(number: int, reported: Sighting) -> Sighting:
+        if reported.navigation is None:
+            return reported
         at = best.atPose2(gtsam.symbol("v", number))
         x, y, yaw = np.diag(marginals.marginalCovariance(gtsam.symbol("v", number)))
         known = Navigation(float(np.sqrt((x + y) / 2)), float(np.sqrt(yaw)))
-        corrected = pose(at.x(), at.y(), float(told.world_from_agent[2, 3]), at.theta())
-        return replace(told, world_from_agent=corrected, navigation=known)
+        corrected = pose(at.x(), at.y(), float(reported.world_from_agent[2, 3]), at.theta())
+        return replace(reported, world_from_agent=corrected, navigation=known)
 
-    return [moved(number, told) for number, told in enumerate(latest)]
+    return [moved(number, reported) for number, reported in enumerate(latest)]
 
 
-def match_posts(told: Sighting, posts: Array) -> list[tuple[Array, Array]]:
+def match_posts(reported: Sighting, posts: Array) -> list[tuple[Array, Array]]:
     """Return pairs of a post as observed (2,), agent's frame, and on the map (2,), each used once, nearest first."""
-    if not len(told.posts) or not len(posts):
+    if not len(reported.posts) or not len(posts):
         return []
-    feet = transform_points(told.world_from_agent, np.column_stack((told.posts, np.zeros(len(told.posts)))))[:, :2]
+    feet = transform_points(
+        reported.world_from_agent, np.column_stack((reported.posts, np.zeros(len(reported.posts))))
+    )[:, :2]
     apart = np.linalg.norm(feet[:, None] - posts[None], axis=2)
     pairs: list[tuple[Array, Array]] = []
     for flat in np.argsort(apart, axis=None):
@@ -122,7 +124,7 @@ def match_posts(told: Sighting, posts: Array) -> list[tuple[Array, Array]]:
         if apart[foot, place] > POST_GATE_M:
             break
         apart[foot, :], apart[:, place] = np.inf, np.inf
-        pairs.append((told.posts[foot], posts[place]))
+        pairs.append((reported.posts[foot], posts[place]))
     return pairs
 
 
@@ -143,12 +145,12 @@ def _share_objects(sightings: Sequence[Sighting], found: RoadAverage) -> list[li
     surveyed = [each.time_s for each in sightings if each.navigation is None]
     instants = np.unique(np.round(surveyed or [each.time_s for each in sightings], 3))
     seen: dict[tuple[int, int], list[_Seen]] = {}
-    for sighting, (told, member) in enumerate(zip(sightings, found.member, strict=True)):
-        instant = int(np.abs(instants - told.time_s).argmin())
-        rows, variance = told.boxes.transform(told.world_from_agent).array(), variance_of(told.boxes)
+    for sighting, (reported, member) in enumerate(zip(sightings, found.member, strict=True)):
+        instant = int(np.abs(instants - reported.time_s).argmin())
+        rows, variance = reported.boxes.transform(reported.world_from_agent).array(), variance_of(reported.boxes)
         for box, number in enumerate(member.tolist()):
             place = rows[box, [0, 1, YAW]]
-            place[:2] += found.velocity[number] * (instants[instant] - told.time_s)
+            place[:2] += found.velocity[number] * (instants[instant] - reported.time_s)
             if np.cos(place[2] - found.boxes.yaw[number]) < 0:
                 place[2] = wrap_angle(place[2] + np.pi)
             seen.setdefault((number, instant), []).append(_Seen(sighting, place, variance[box, [0, 1, YAW]]))
@@ -211,8 +213,8 @@ def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
 def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[ObjectPath]:
     """Return the paths of moving objects that road sensors report at two instants or more."""
     found: dict[int, dict[float, list[tuple[Array, float]]]] = {}
-    told = [report_boxes(each) for each in surveyed]
-    for each, member in zip(told, average_boxes(told, at_s).member, strict=True):
+    reported = [report_boxes(each) for each in surveyed]
+    for each, member in zip(reported, average_boxes(reported, at_s).member, strict=True):
         certain = 1 / variance_of(each.boxes)[:, :2].mean(axis=1)
         for number, place, weight in zip(member.tolist(), each.boxes.center[:, :2], certain.tolist(), strict=True):
             found.setdefault(number, {}).setdefault(round(each.time_s, 3), []).append((place, weight))
@@ -234,7 +236,7 @@ def _average(seen: Sequence[tuple[Array, float]]) -> Array:
 def estimate_offset(own: Sequence[Sighting], traces: Sequence[ObjectPath]) -> float:
     """Return by how much a vehicle's clock is fast [s]; 0 where `traces` do not determine it.
 
-    own: what the vehicle tells of, and where it was itself.
+    own: what the vehicle reports, with its poses.
     """
     if not traces:
         return 0.0

@@ -158,10 +158,10 @@ def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int]
             points = flatten_ground(points, world_from_lidar, relief)
         found = detect(network, points, score_threshold=threshold)
         category = np.array([CATEGORY[str(name)] for name in found.label], dtype=np.str_)
-        told = replace(found, label=category).transform(world_from_lidar)
+        boxes = replace(found, label=category).transform(world_from_lidar)
         if relief is not None:
-            told = replace(told, center=told.center + rise_from(world_from_lidar, told.center, relief))
-        return told if surface is None else keep_on_surface(told, surface)
+            boxes = replace(boxes, center=boxes.center + rise_from(world_from_lidar, boxes.center, relief))
+        return boxes if surface is None else keep_on_surface(boxes, surface)
 
     return find
 

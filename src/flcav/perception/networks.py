@@ -30,7 +30,7 @@ from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, Sample
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
-from flcav.perception.weights import Card, find_shipped, join_lidars, load_network, read_card, read_lidar
+from flcav.perception.weights import Card, find_recorded_lidar, find_shipped, join_lidars, load_network, read_card
 
 Named = str | Task
 Data = Dataset | Path | str
@@ -360,7 +360,7 @@ def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
     card = None if isinstance(network, nn.Module) else _find_card(Path(network or find_shipped(task)))
     if card is None:
         return KnownLidar()
-    return join_lidars([read_lidar(entry.recipe, entry.agents) for entry in card.data])
+    return join_lidars([find_recorded_lidar(entry.recipe, entry.agents) for entry in card.data])
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:

@@ -133,7 +133,7 @@ def write_card(card: Card, path: Path) -> None:
     write_bytes(path, card.markdown().encode())
 
 
-def read_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None = None) -> KnownLidar:
+def find_recorded_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None = None) -> KnownLidar:
     """Return beams and range of the agents' first LiDAR by the recipe of a recording, or as an import knows them.
 
     recipe: of a manifest, or of a card's entry, which names the rig. agents: whose LiDAR; that of the poles where all

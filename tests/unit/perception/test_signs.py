@@ -9,7 +9,7 @@ import torch
 
 from flcav.perception.ops.boxes import complete_iou
 from flcav.perception.signs.evaluate import ClassPrecision, SignTruth, mean_average_precision
-from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign_anchors, detection_loss
+from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign_levels, detection_loss
 from flcav.perception.signs.model import CONFIGURATIONS, STRIDES, SignDetector, SignsConfig, decode_boxes, decode_level
 from flcav.perception.signs.predict import SignDetections, detect_in_picture
 from flcav.perception.signs.samples import GREY, Sample, crop_sample, draw_mosaic, draw_window, join_mosaic
@@ -94,13 +94,13 @@ def found_places(one):
 
 def test_targets_are_those_of_the_definition():
     samples = [painted(seed) for seed in range(4)]
-    for level, one in enumerate(assign_anchors(samples, TINY)):
+    for level, one in enumerate(assign_levels(samples, TINY)):
         assert sorted(found_places(one)) == sorted(expected_places(samples, TINY, level))
-    assert sum(len(one.image) for one in assign_anchors(samples, TINY)) > 20
+    assert sum(len(one.image) for one in assign_levels(samples, TINY)) > 20
 
 
 def test_every_target_can_be_reached_by_its_anchor():
-    for level, one in enumerate(assign_anchors([painted(seed) for seed in range(4)], TINY)):
+    for level, one in enumerate(assign_levels([painted(seed) for seed in range(4)], TINY)):
         cell = torch.stack((one.column, one.row), 1)
         center = (one.box[:, :2] + one.box[:, 2:]) / 2 / STRIDES[level] - cell
         assert bool(((center >= -0.5) & (center <= 1.5)).all())
@@ -110,7 +110,7 @@ def test_the_loss_is_the_sum_of_its_parts():
     samples = [painted(0), replace(painted(1), ignore=np.array([[0.0, 0, 30, 30]]))]
     generator = torch.Generator().manual_seed(0)
     raw = [torch.randn(2, 3, 64 // s, 96 // s, 8, generator=generator) for s in STRIDES]
-    targets = assign_anchors(samples, TINY)
+    targets = assign_levels(samples, TINY)
     expected = 0.0
     for level, (maps, one) in enumerate(zip(raw, targets, strict=True)):
         wanted, counted = torch.zeros(maps.shape[:4]), one.counted[:, None].repeat(1, 3, 1, 1)
@@ -140,7 +140,7 @@ def test_half_precision_hardly_changes_the_loss():
     samples = [painted(seed) for seed in range(4)]
     network = build_network(SIGNS, TINY, 0)
     pictures = torch.from_numpy(np.stack([sample.picture for sample in samples])).permute(0, 3, 1, 2).float() / 255
-    whole = detection_loss(network(pictures), assign_anchors(samples, TINY), TINY)
+    whole = detection_loss(network(pictures), assign_levels(samples, TINY), TINY)
     loss = SIGNS.loss(network, samples)
     assert loss.dtype == torch.float32
     assert loss.item() == pytest.approx(whole.item(), rel=0.02)

@@ -129,7 +129,7 @@ def _slopes(boxes: Array, anchors: Array) -> Array:
 
 
 def direction_of(yaw: Array) -> Ints:
-    """Return the direction class (P,) of each yaw: 0 in [pi/4, 5/4 pi), else 1. It tells front from back."""
+    """Return the direction class (P,) of each yaw: 0 in [pi/4, 5/4 pi), else 1. It distinguishes front from back."""
     return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)
 
 

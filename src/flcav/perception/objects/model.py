@@ -290,8 +290,6 @@ def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -
         anchors=_anchors(classes),
         range_m=(0, -24, -3, 48, 24, 1),
         voxel_m=(0.1, 0.1, 0.1),
-        sparse_channels=(16, 16, 32, 32),
-        sparse_out=32,
         bev_layers=(2, 2),
         bev_channels=(32, 64),
         bev_up_channels=(48, 48),
@@ -304,15 +302,12 @@ def pillars_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8
 
     Raises `InputError` for unknown classes.
     """
-    return SecondConfig(
-        anchors=_anchors(classes),
-        range_m=(0, -24, -3, 48, 24, 1),
+    return replace(
+        tiny_config(classes, ground_z_m),
         voxel_m=(0.25, 0.25, 4),
         pillar_channels=(24, 48),
         bev_layers=(1, 1),
         bev_channels=(48, 64),
-        bev_up_channels=(48, 48),
-        ground_z_m=ground_z_m,
     )
 
 
@@ -336,8 +331,6 @@ def small_config(
         anchors=tuple(KITTI_CAR if anchor.name == "Car" else anchor for anchor in _anchors(classes)),
         range_m=(0, -28.8, -3, 51.2, 28.8, 1),
         voxel_m=(0.1, 0.1, 0.1),
-        sparse_channels=(16, 16, 32, 32),
-        sparse_out=32,
         bev_layers=(3, 3),
         bev_channels=(48, 96),
         bev_up_channels=(64, 64),

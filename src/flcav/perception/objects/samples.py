@@ -30,7 +30,7 @@ from flcav.perception.objects.truth import (
     turn_of,
 )
 from flcav.perception.task import KnownLidar
-from flcav.perception.weights import read_lidar
+from flcav.perception.weights import find_recorded_lidar
 from flcav.sensors.frame import Frame
 
 RANGE_SLACK = 0.2  # difference of a LiDAR's range from the one of the training that is not worth a word
@@ -154,7 +154,7 @@ def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trai
         for agent, lidar in agents.items()
         if kind_of(agent) != POLE
     ]
-    here = read_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
+    here = find_recorded_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
     return describe_rig(mounts, here, config, trained)
 
 

@@ -2,8 +2,8 @@
 
 Voxels are those of SECOND's published configuration (mean VFE). The grid of pillars is that of Lang et al.,
 "PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019; the statistics take the place of its
-learned encoder: they cost one pass over the points, and the highest point of a pillar tells a network how high an
-object is.
+learned encoder: they cost one pass over the points, and the highest point of a pillar is the height of an
+object.
 """
 
 from collections.abc import Sequence

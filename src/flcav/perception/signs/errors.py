@@ -26,7 +26,7 @@ OVERLAP = 0.5  # least IoU of a true positive
 WITHIN = 0.5  # least share of a detection on a neutral (too small or cut off) box for it to be no mistake
 
 
-def register_errors(
+def register_sign_errors(
     network: SignDetector,
     data: Dataset,
     frames: Sequence[int],

@@ -15,14 +15,14 @@ from flcav.arrays import Array32
 from flcav.perception.device import inference
 from flcav.perception.ops.boxes import complete_iou
 from flcav.perception.signs.model import STRIDES, SignDetector, SignsConfig, decode_boxes
-from flcav.perception.signs.predict import predict
+from flcav.perception.signs.predict import predict_levels
 from flcav.perception.signs.samples import Sample
 
 MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, either way; `decode_boxes` reaches no more
 
 
 @dataclass(frozen=True)
-class Targets:
+class LevelTargets:
     """Training targets of a batch at one level: P pairs of a box with an anchor of a cell."""
 
     image: Tensor  # (P,) index in the batch
@@ -34,7 +34,7 @@ class Targets:
     counted: Tensor  # (B, rows, columns) whether a cell enters the objectness loss
 
 
-def assign_anchors(samples: Sequence[Sample], config: SignsConfig) -> list[Targets]:
+def assign_levels(samples: Sequence[Sample], config: SignsConfig) -> list[LevelTargets]:
     """Return the training targets at each of `STRIDES` for images of one size.
 
     A box is assigned to every anchor whose width and height are within a factor of four of its own, in the cell of its
@@ -50,7 +50,7 @@ def assign_anchors(samples: Sequence[Sample], config: SignsConfig) -> list[Targe
         number, anchor, cell = _places(box, torch.tensor(config.anchors_px[level]), stride, grid)
         counted = torch.stack([_counted(sample, stride, grid) for sample in samples])
         levels.append(
-            Targets(
+            LevelTargets(
                 torch.from_numpy(image)[number], anchor, cell[:, 1], cell[:, 0], box[number], label[number], counted
             )
         )
@@ -91,7 +91,7 @@ def number_boxes(samples: Sequence[Sample]) -> list[Sample]:
 
 
 def detection_loss(
-    raw: Sequence[Tensor], targets: Sequence[Targets], config: SignsConfig, classes: Tensor | None = None
+    raw: Sequence[Tensor], targets: Sequence[LevelTargets], config: SignsConfig, classes: Tensor | None = None
 ) -> Tensor:
     """Return the loss of raw predictions, one tensor per level as `SignDetector.forward`: the weighted sum of terms.
 
@@ -130,8 +130,8 @@ def _largest_at(maps: Tensor, place: tuple[Tensor, ...], values: Tensor) -> Tens
     return maps.flatten().scatter_reduce(0, flat, values, "amax").view_as(maps)
 
 
-def _to_device(targets: Targets, device: torch.device) -> Targets:
-    return Targets(**{name: tensor.to(device) for name, tensor in vars(targets).items()})
+def _to_device(targets: LevelTargets, device: torch.device) -> LevelTargets:
+    return LevelTargets(**{name: tensor.to(device) for name, tensor in vars(targets).items()})
 
 
 def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> list[Array32]:
@@ -149,7 +149,7 @@ def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> lis
             )
             numbered = replace(sample, label=np.arange(len(sample.boxes)))
             for maps, at in zip(
-                predict(network, [sample.picture]), assign_anchors([numbered], network.config), strict=True
+                predict_levels(network, [sample.picture]), assign_levels([numbered], network.config), strict=True
             ):
                 shares = maps[at.image, at.anchor, at.row, at.column, 5:].sigmoid().cpu()
                 total.index_add_(0, at.label, shares)

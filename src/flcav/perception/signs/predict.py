@@ -79,7 +79,7 @@ def detect_in_picture(network: SignDetector, picture: Picture, *, threshold: flo
     The network's training mode is left as it was.
     """
     with inference(network):
-        raw = predict(network, [pad_to_stride(picture)])
+        raw = predict_levels(network, [pad_to_stride(picture)])
         cells = [
             torch.cat((decode_level(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
             for level, maps in enumerate(raw)
@@ -94,7 +94,7 @@ def pad_to_stride(picture: Picture) -> Picture:
     return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
 
 
-def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
+def predict_levels(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
     """Return the network's raw predictions on images of one size, whose sides are multiples of the largest stride.
 
     One tensor per level as `SignDetector.forward`, in float32. Channels are last in memory and convolutions are in

@@ -14,11 +14,11 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
 from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.signs.errors import register_errors
+from flcav.perception.signs.errors import register_sign_errors
 from flcav.perception.signs.evaluate import SignsEvaluation, SignsOutcomes, by_picture, mean_average_precision
-from flcav.perception.signs.loss import assign_anchors, class_probabilities, detection_loss, number_boxes
+from flcav.perception.signs.loss import assign_levels, class_probabilities, detection_loss, number_boxes
 from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
-from flcav.perception.signs.predict import detect_signs, predict
+from flcav.perception.signs.predict import detect_signs, predict_levels
 from flcav.perception.signs.samples import RecordedPictures, Sample, draw_mosaic, pack_signs, unpack_signs
 from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, Practice
@@ -72,8 +72,8 @@ class SignsTask(SignsOutcomes):
 
     def loss(self, network: SignDetector, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of a batch of images of one size, whose sides are multiples of 32."""
-        raw = predict(network, [sample.picture for sample in samples])
-        return detection_loss(raw, assign_anchors(samples, network.config), network.config)
+        raw = predict_levels(network, [sample.picture for sample in samples])
+        return detection_loss(raw, assign_levels(samples, network.config), network.config)
 
     def class_probabilities(self, network: SignDetector, samples: Sequence[Sample]) -> list[Array32]:
         """Return the class probabilities (boxes, classes) of the boxes of each image."""
@@ -82,10 +82,10 @@ class SignsTask(SignsOutcomes):
     def imitation_loss(self, network: SignDetector, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
         """Return the loss of a batch whose boxes have class probabilities instead of labels."""
         raw, shares = (
-            predict(network, [sample.picture for sample in samples]),
+            predict_levels(network, [sample.picture for sample in samples]),
             torch.from_numpy(np.concatenate(targets)),
         )
-        return detection_loss(raw, assign_anchors(number_boxes(samples), network.config), network.config, shares)
+        return detection_loss(raw, assign_levels(number_boxes(samples), network.config), network.config, shares)
 
     def evaluate(
         self,
@@ -130,11 +130,11 @@ class SignsTask(SignsOutcomes):
         threshold: float = THRESHOLD,
         progress: Report = ignore_progress,
     ) -> Registry:
-        """Return the missed signs and the false positives, see `flcav.perception.signs.errors.register_errors`."""
+        """Return the missed signs and the false positives, see `flcav.perception.signs.errors.register_sign_errors`."""
         if network.config.labels != "signs":
             raise InputError(f"errors of signs: this network finds {', '.join(network.config.classes)}, which are none")
         data.check_labelled("signs")
-        return register_errors(network, data, data.numbers(frames), threshold, progress)
+        return register_sign_errors(network, data, data.numbers(frames), threshold, progress)
 
 
 SIGNS = SignsTask()

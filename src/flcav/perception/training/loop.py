@@ -107,7 +107,7 @@ def train(
     early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
     from its file and ends with the same weights. `watch` receives loss, learning rate and validation score; `correct`
     changes the gradients before they are clipped. Training goes on with the moments of an `optimizer` of the network,
-    which it changes; None: they begin at zero. A damaged checkpoint is told, and training begins anew. Raises
+    which it changes; None: they begin at zero. A damaged checkpoint is reported, and training begins anew. Raises
     `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch

@@ -18,7 +18,7 @@ from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.task import Evaluated
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.predict import find_medoid, predict
+from flcav.perception.trajectory.predict import find_medoid, predict_paths
 from flcav.perception.trajectory.samples import Samples, samples_of
 from flcav.perception.trajectory.tracks import constant_velocity
 from flcav.statistics.bootstrap import REDRAWS
@@ -210,7 +210,7 @@ class TrajectoryOutcomes:
     ) -> Outcomes:
         """Return the displacement errors of each sample [m], see `compute_errors`."""
         samples = samples_of(data, network.config, frames)
-        paths, probabilities = predict(network, samples, progress)
+        paths, probabilities = predict_paths(network, samples, progress)
         columns = samples.columns
         future = columns.future.astype(np.float64)
         errors = compute_errors(paths, probabilities, future, constant_velocity(columns.past))
@@ -232,7 +232,7 @@ class TrajectoryOutcomes:
         }
 
 
-def register_errors(
+def register_path_errors(
     network: TrajectoryNetwork, data: Dataset, samples: Samples, progress: Report = ignore_progress
 ) -> Registry:
     """Return the first miss of each road user and scene: a single path with a final error above `MISS_M`.
@@ -240,7 +240,7 @@ def register_errors(
     Its position is that of the road user at the present, on the ground of the town.
     """
     columns = samples.columns
-    paths, probabilities = predict(network, samples, progress)
+    paths, probabilities = predict_paths(network, samples, progress)
     said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
     wrong = np.linalg.norm(said - columns.future[:, -1], axis=1) > MISS_M
     town = data.town()

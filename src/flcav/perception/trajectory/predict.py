@@ -117,7 +117,7 @@ def _floats(arrays: list[Array], device: torch.device) -> Tensor:
     return torch.from_numpy(np.stack(arrays).astype(np.float32)).to(device)
 
 
-def predict(
+def predict_paths(
     network: TrajectoryNetwork, samples: Sequence[Sample], progress: Report = ignore_progress
 ) -> tuple[Array, Array]:
     """Return the forecasts of N samples: paths (N, K, FUTURE, 2) [m] in the samples' frames and probabilities (N, K).
@@ -219,7 +219,7 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     columns = extract_columns(trace, tracks, key, number, load_roads(data), config.patch, wanted, complete=False)
     users: list[RoadUser] = []
     if len(columns.past):
-        paths, probabilities = predict(network, Samples(data, columns, config.cameras))
+        paths, probabilities = predict_paths(network, Samples(data, columns, config.cameras))
         first = find_medoid(paths, probabilities)
         present, plain = columns.pose, constant_velocity(columns.past)
         for i, actor in enumerate(columns.actor):

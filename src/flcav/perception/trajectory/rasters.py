@@ -92,14 +92,12 @@ def road_map(town: Town) -> RoadMap:
     real = _where_streets_meet(lanes)
     points, owner, yaw, ahead = [], [], [], []
     for i, lane in enumerate(lanes):
-        line = LineString(lane.centre_line)
-        along = np.linspace(0.0, line.length, max(2, round(line.length / DOT_M) + 1))
-        xy = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
+        along, xy = _dots(lane)
         follows = any(other in number and lanes[number[other]].junction in real for other in lane.successors)
         points.append(xy)
         owner.append(np.full(len(xy), i))
         yaw.append(np.arctan2(*np.gradient(xy, axis=0).T[::-1]))
-        ahead.append(np.zeros(len(xy)) if lane.junction in real else line.length - along if follows else along + np.inf)
+        ahead.append(np.zeros(len(xy)) if lane.junction in real else along[-1] - along if follows else along + np.inf)
     return RoadMap(
         layers=layers,
         raster=_raster(layers, town.bounds),
@@ -166,10 +164,15 @@ def _reach(lanes: list[MapLane], number: Mapping[str, int]) -> Iterable[Array]:
         yield np.concatenate([surface[lane] for lane in sorted(left)])
 
 
-def _surface(lane: MapLane) -> Array:
+def _dots(lane: MapLane) -> tuple[Array, Array]:
+    """Return distances (P,) along a lane's centre line, about `DOT_M` apart, and the points (P, 2) there [m]."""
     line = LineString(lane.centre_line)
     along = np.linspace(0.0, line.length, max(2, round(line.length / DOT_M) + 1))
-    xy = shapely.get_coordinates(shapely.line_interpolate_point(line, along))
+    return along, shapely.get_coordinates(shapely.line_interpolate_point(line, along))
+
+
+def _surface(lane: MapLane) -> Array:
+    _, xy = _dots(lane)
     ahead = np.gradient(xy, axis=0)
     left = np.stack((-ahead[:, 1], ahead[:, 0]), axis=1) / np.maximum(np.linalg.norm(ahead, axis=1), 1e-9)[:, None]
     half = lane.width_m / 2

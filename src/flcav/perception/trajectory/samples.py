@@ -206,7 +206,7 @@ def _parts(data: Dataset, patch: Patch, cameras: CrossView | None, frames: Seque
         yield extract_columns(trace, tracks, key, number, load_roads(data), patch, wanted)
 
 
-def select_fitting_frames(data: Dataset, cameras: bool) -> Sequence[int]:
+def select_pictured_frames(data: Dataset, cameras: bool) -> Sequence[int]:
     """Return the numbers of the frames that can have samples: all; with `cameras` those of vehicles, if any.
 
     With cameras only road users around an observing vehicle are predicted, none around a pole.

@@ -22,12 +22,12 @@ from flcav.perception.trajectory.evaluate import (
     TrajectoryEvaluation,
     TrajectoryOutcomes,
     evaluate_paths,
-    register_errors,
+    register_path_errors,
 )
 from flcav.perception.trajectory.model import LEARNED, ForecastTensors, TrajectoryNetwork
-from flcav.perception.trajectory.predict import forecast_frames, futures_of, inputs_of, predict, rasters_of
+from flcav.perception.trajectory.predict import forecast_frames, futures_of, inputs_of, predict_paths, rasters_of
 from flcav.perception.trajectory.rasters import LAYERS
-from flcav.perception.trajectory.samples import Sample, pack_frames, samples_of, select_fitting_frames, unpack_frames
+from flcav.perception.trajectory.samples import Sample, pack_frames, samples_of, select_pictured_frames, unpack_frames
 
 SHARED = 0.05  # share of the regression over all modes, against unused modes: Rupprecht et al., ICCV 2017, eq. 5
 MODE_WEIGHT = 1.0  # weight of the mode classification
@@ -115,8 +115,8 @@ class TrajectoryTask(TrajectoryOutcomes):
         return samples_of(data, config, frames)
 
     def fitting(self, data: Dataset, config: TrajectoryConfig) -> Sequence[int]:
-        """Return the numbers of the frames that can have samples, see `select_fitting_frames`."""
-        return select_fitting_frames(data, config.cameras is not None)
+        """Return the numbers of the frames that can have samples, see `select_pictured_frames`."""
+        return select_pictured_frames(data, config.cameras is not None)
 
     def draw(self, samples: Sequence[Sample], index: int, config: TrajectoryConfig, rng: np.random.Generator) -> Sample:
         """Return the sample without augmentation: its frame already removes rotation and translation."""
@@ -142,7 +142,7 @@ class TrajectoryTask(TrajectoryOutcomes):
     ) -> TrajectoryEvaluation:
         """Return displacement errors of single path, K modes and constant velocity by slice, see `evaluate_paths`."""
         samples = samples_of(data, network.config, frames)
-        paths, probabilities = predict(network, samples, progress)
+        paths, probabilities = predict_paths(network, samples, progress)
         seen = samples.columns
         return evaluate_paths(paths, probabilities, seen.past, seen.future, seen.at_junction, seen.scene)
 
@@ -168,8 +168,8 @@ class TrajectoryTask(TrajectoryOutcomes):
         threshold: float = 0.0,
         progress: Report = ignore_progress,
     ) -> Registry:
-        """Return the misses, see `flcav.perception.trajectory.evaluate.register_errors`; `threshold` has no effect."""
-        return register_errors(network, data, samples_of(data, network.config, frames), progress)
+        """Return the misses, see `register_path_errors`; `threshold` has no effect."""
+        return register_path_errors(network, data, samples_of(data, network.config, frames), progress)
 
 
 TRAJECTORY = TrajectoryTask()

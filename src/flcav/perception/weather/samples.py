@@ -67,7 +67,7 @@ SHIFT_PX = 3  # largest shift of augmentation
 GAIN, GAMMA, SATURATION = 0.05, 0.2, 0.25  # largest absolute logarithms of augmentation's random factors
 
 
-def augment(sample: Sample, rng: np.random.Generator) -> Sample:
+def augment_picture(sample: Sample, rng: np.random.Generator) -> Sample:
     """Return the sample with random mirroring, a random shift of up to 3 pixels, and random gain, gamma and saturation.
 
     The last three imitate differences between cameras; they are small, since the light itself shows the weather.

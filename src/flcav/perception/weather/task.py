@@ -24,7 +24,13 @@ from flcav.perception.weather.evaluate import (
     tensor_of,
 )
 from flcav.perception.weather.model import CONFIGURATIONS, Classifier, LeNet, LeNetConfig
-from flcav.perception.weather.samples import Sample, augment, label_pictures, pack_pictures_and_weather, unpack_frame
+from flcav.perception.weather.samples import (
+    Sample,
+    augment_picture,
+    label_pictures,
+    pack_pictures_and_weather,
+    unpack_frame,
+)
 from flcav.world.weather import ANY, WEATHER_CLASSES
 
 WHOLE_SPACE = "whole space"  # test of weathers drawn from the whole space of parameters
@@ -74,7 +80,7 @@ class WeatherTask(WeatherOutcomes):
 
     def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
         """Return an augmented sample, see `flcav.perception.weather.samples`."""
-        return augment(samples[index], rng)
+        return augment_picture(samples[index], rng)
 
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the mean cross entropy of a batch."""
