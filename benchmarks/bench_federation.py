@@ -28,8 +28,7 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import sample_from_frame
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network
-from flcav.perception.weather.config import LeNetConfig
-from flcav.perception.weather.model import SIDE
+from flcav.perception.weather.model import SIDE, LeNetConfig
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays

@@ -20,7 +20,7 @@ from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import build_network
-from flcav.perception.weather.config import LeNetConfig
+from flcav.perception.weather.model import LeNetConfig
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 

@@ -11,8 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from flcav.fusion.odometry import Odometry
-from flcav.fusion.registration import measure_offset
+from flcav.fusion.registration import Odometry, measure_offset
 from flcav.geometry import inverse
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource

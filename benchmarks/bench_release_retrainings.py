@@ -22,8 +22,7 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import choose_frames
-from flcav.perception.objects.config import Augmentation
-from flcav.perception.objects.model import Second, pillars_config, second
+from flcav.perception.objects.model import Augmentation, Second, pillars_config, second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.training.loop import train
 from flcav.perception.weights import load_network

@@ -34,13 +34,12 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import Card, data_entry
 from flcav.perception.objects.model import Second, pillars_config, second, tiny_config
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.training.loop import train
-from flcav.perception.weights import load_network, save_network
+from flcav.perception.weights import Card, data_entry, load_network, save_network
 from flcav.releases.proposal import propose
 from flcav.releases.verification.testing import CONDITIONS, PLAIN, choose_test_frames, run_tests
 from flcav.releases.verification.verify import verify

@@ -11,11 +11,10 @@ import torch
 from cpu_time import cpu_ms
 
 from flcav.config import read_config
-from flcav.perception.signs.config import CONFIGURATIONS
-from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.outcomes import LOWEST_SCORE
-from flcav.perception.signs.predict import detect
-from flcav.perception.signs.samples import Sample, sample_from_frame
+from flcav.perception.signs.evaluate import LOWEST_SCORE
+from flcav.perception.signs.model import CONFIGURATIONS, SignDetector
+from flcav.perception.signs.predict import detect_in_picture
+from flcav.perception.signs.samples import Sample, label_picture
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network
 from flcav.perception.training import AdamW, step
@@ -35,7 +34,7 @@ def main() -> None:
     batch = SIGNS.practice.batch
     works: list[Callable[[], object]] = []
     for config in CONFIGURATIONS.values():
-        samples = [sample_from_frame(frame, "camera", frame.images["camera"].rgb, config) for frame in frames]
+        samples = [label_picture(frame, "camera", frame.images["camera"].rgb, config) for frame in frames]
         works += [
             training(build_network(SIGNS, config, 0), samples, batch),
             inference(build_network(SIGNS, config, 0), samples),
@@ -63,7 +62,7 @@ def training(network: SignDetector, samples: list[Sample], batch: int) -> Callab
 
 def inference(network: SignDetector, samples: list[Sample]) -> Callable[[], object]:
     """Return a function that detects signs in one picture."""
-    return lambda: detect(network, samples[0].picture, threshold=LOWEST_SCORE)
+    return lambda: detect_in_picture(network, samples[0].picture, threshold=LOWEST_SCORE)
 
 
 if __name__ == "__main__":

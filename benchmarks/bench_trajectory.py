@@ -13,9 +13,8 @@ from flcav.dataset.layout import FrameKey
 from flcav.perception.task import build_network
 from flcav.perception.training import AdamW, step
 from flcav.perception.trajectory.config import CONFIGURATIONS, FUTURE, PAST, TrajectoryConfig
-from flcav.perception.trajectory.predict import predict
-from flcav.perception.trajectory.rasters import LAYERS
-from flcav.perception.trajectory.roads import road_map
+from flcav.perception.trajectory.predict import predict_paths
+from flcav.perception.trajectory.rasters import LAYERS, road_map
 from flcav.perception.trajectory.samples import Columns, Sample, Surround, extract_columns
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.trajectory.tracks import tracks_around
@@ -37,7 +36,7 @@ def main() -> None:
         optimizer = AdamW(network, 1e-3)
         repeats = REPEATS if name.startswith("tiny") else 2
         training, inference = cpu_ms(
-            (lambda: step(TRAJECTORY, network, optimizer, samples), lambda: predict(network, samples)),  # noqa: B023
+            (lambda: step(TRAJECTORY, network, optimizer, samples), lambda: predict_paths(network, samples)),  # noqa: B023
             repeats,
         )
         count = sum(parameter.numel() for parameter in network.parameters())

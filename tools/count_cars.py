@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, pose
-from flcav.perception.metrics.found_cars import OVERLAP, SCORE, WITHIN_M
+from flcav.perception.metrics.operating_point import OVERLAP, SCORE, WITHIN_M
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect
@@ -30,7 +30,7 @@ from flcav.perception.objects.truth import (
     in_range,
     network_from_lidar,
 )
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 from flcav.sensors.frame import Frame
 
 RETURNS, TOUCH = 20, 0.1

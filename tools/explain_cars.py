@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse, points_in_boxes
-from flcav.perception.metrics.found_cars import OVERLAP, SCORE, is_near
-from flcav.perception.metrics.matching import assign_targets, on_neutral
+from flcav.perception.metrics.detection import assign_targets, on_neutral
+from flcav.perception.metrics.operating_point import OVERLAP, SCORE, is_near
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.predict import detect_in, look_around
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import QUARTERS, asked_of, choose_lidar
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 
 LOWEST = 0.02  # score of the faintest detections that are looked at
 DOUBLE = 0.9  # IoU from which two labels are one car's

@@ -13,11 +13,11 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
-from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.labels.quality import RETURNS
 from flcav.pipeline.labels.tracks import load_tracks

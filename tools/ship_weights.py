@@ -9,9 +9,8 @@ import argparse
 from pathlib import Path
 
 from flcav import perception
-from flcav.perception.card import write_card
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.weights import SHIPPED, load_network, read_card, save_network
+from flcav.perception.weights import SHIPPED, load_network, read_card, save_network, write_card
 
 PACKAGE = Path(perception.__path__[0])
 

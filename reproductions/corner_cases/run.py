@@ -19,7 +19,7 @@ from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
 from flcav.geometry.boxes import Boxes, concatenate
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
 from flcav.perception.objects.evaluate import score_detections
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames

@@ -22,8 +22,8 @@ from flcav.perception.client import camera_ahead
 from flcav.perception.networks import resolve_network
 from flcav.perception.task import build_network
 from flcav.perception.training import batches
+from flcav.perception.weather.evaluate import tensor_of
 from flcav.perception.weather.model import Classifier, LeNet
-from flcav.perception.weather.predict import tensor_of
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.sources.embedded import EmbeddedSource

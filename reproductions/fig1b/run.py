@@ -29,7 +29,7 @@ from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.ops.sparse import SparseTensor
-from flcav.perception.signs.config import STRIDES
+from flcav.perception.signs.model import STRIDES
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Finding, Task
 from flcav.perception.tasks import task_named

@@ -22,14 +22,14 @@ from flcav.fusion.association import (
     pair,
     spread_of_calibration,
 )
-from flcav.fusion.detector import PICTURE_THRESHOLD, load_picture_network
 from flcav.fusion.registration import Offset, measure_offset
+from flcav.fusion.road import PICTURE_THRESHOLD, load_picture_network
 from flcav.geometry import Boxes, inverse
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.truth import CARS
-from flcav.perception.ops.rectangles import iou
-from flcav.perception.signs.background import picture_reader
-from flcav.perception.signs.predict import detect
+from flcav.perception.ops.boxes import rectangle_iou
+from flcav.perception.signs.predict import detect_in_picture
+from flcav.perception.signs.samples import picture_reader
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 from flcav.sensors.rig import CalibrationError
 from flcav.storage.markdown import format_table
@@ -88,7 +88,7 @@ def associate_camera(
     read = picture_reader(data, network.config.background)
     made = []
     for number in numbers:
-        boxes = detect(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
+        boxes = detect_in_picture(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
         made.append(name_actors(data.frame(number), lidar, camera, PairedShot(find(number), boxes)))
     shots, known = [shot for shot, _ in made], [actors for _, actors in made]
     height, width = data.plane(numbers[0], camera, "rgb").shape[:2]
@@ -174,7 +174,7 @@ def _actors_of_boxes(boxes: NDArray[np.float64], views: Views) -> NDArray[np.int
     shown = np.flatnonzero(views.pixels > 0)
     if not len(boxes) or not len(shown):
         return np.full(len(boxes), -1)
-    overlap = iou(torch.from_numpy(boxes), torch.from_numpy(views.visible_box[shown] + HALF_PX)).numpy()
+    overlap = rectangle_iou(torch.from_numpy(boxes), torch.from_numpy(views.visible_box[shown] + HALF_PX)).numpy()
     return np.where(overlap.max(axis=1) >= OVERLAP, shown[overlap.argmax(axis=1)], -1)
 
 

@@ -21,13 +21,12 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.fusion.average import BoxReport, average_boxes
-from flcav.fusion.detector import THRESHOLD, load_road_network
-from flcav.fusion.registration import Offset, measure_offset, register
-from flcav.fusion.road import MIN_RETURNS
+from flcav.fusion.registration import Offset, measure_offset, register_clouds
+from flcav.fusion.road import MIN_RETURNS, THRESHOLD, load_road_network
 from flcav.geometry import Boxes, inverse, points_in_boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.foreground import frame_reader, pole_backgrounds
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.agents import frame_reader, pole_backgrounds
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.truth import CARS
 from flcav.pipeline.provenance import Provenance, provenance
@@ -127,7 +126,7 @@ def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str,
     clouds = [_background(data, agent, lidar) for agent, lidar in SUITES]
     guess = [inverse(calibrated[0]) @ each for each in calibrated]
     exact = [inverse(truth[0]) @ each for each in truth]
-    registered = [np.eye(4), *(register(clouds[0], c, g) for c, g in zip(clouds[1:], guess[1:], strict=True))]
+    registered = [np.eye(4), *(register_clouds(clouds[0], c, g) for c, g in zip(clouds[1:], guess[1:], strict=True))]
     suites = tuple(
         Suite(
             NAMES[row],

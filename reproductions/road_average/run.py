@@ -14,19 +14,17 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.experiment import Experiment, Options, Outcome
-from flcav.fusion.average import RoadAverage, average_boxes
-from flcav.fusion.detector import load_road_network, road_detector
-from flcav.fusion.map_context import MapContext, build_context, snap_to_map
-from flcav.fusion.pose_graph import correct_poses
-from flcav.fusion.posts import find_posts, posts_of
-from flcav.fusion.sightings import Navigation, Sighting, tell
+from flcav.fusion.average import Navigation, RoadAverage, Sighting, average_boxes, report_boxes
+from flcav.fusion.distillation import MapContext, build_context, snap_to_map
+from flcav.fusion.pose_graph import correct_poses, posts_of, segment_posts
+from flcav.fusion.road import load_road_network, road_detector
 from flcav.geometry import Boxes, concatenate, inverse, pose, transform_points, wrap_angle, yaw_of
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import average_precision, match
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.networks import resolve_network
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar, ground_truth
@@ -128,7 +126,7 @@ def read_scenes(data: Dataset, progress: Report = ignore_progress) -> dict[str, 
             lidar = choose_lidar(frame)
             agent_from_lidar = frame.agent_from_sensor[lidar]
             found = detect(vehicles, frame.lidar[lidar], score_threshold=SCORE)
-            posts = find_posts(transform_points(agent_from_lidar, frame.lidar[lidar][:, :3]), 0.0)
+            posts = segment_posts(transform_points(agent_from_lidar, frame.lidar[lidar][:, :3]), 0.0)
             own = found[found.label == CAR].transform(agent_from_lidar)
             told = Sighting(key.agent, key.time_s, frame.world_from_agent, own, posts, EXACT)
         rows.setdefault(key.scene, []).append((key.index, told))
@@ -299,7 +297,7 @@ def fuse(sightings: list[Sighting], posts: np.ndarray, at_s: float, arm: str) ->
         sightings = [replace(each, navigation=None) for each in sightings]
     elif arm == GRAPH:
         sightings = correct_poses(sightings, posts, at_s)
-    return average_boxes([tell(each) for each in sightings], at_s)
+    return average_boxes([report_boxes(each) for each in sightings], at_s)
 
 
 def _point(
@@ -358,7 +356,7 @@ def _snap(scenes: Mapping[str, SightedScene], context: MapContext) -> Snapped:
         for spin in SPINS:
             at_s = scene.time_s[spin]
             window = [s for s in scene.sightings if at_s - WINDOW_S - 1e-6 <= s.time_s <= at_s + 1e-6]
-            average = average_boxes([tell(each) for each in window], at_s)
+            average = average_boxes([report_boxes(each) for each in window], at_s)
             after = snap_to_map(average.boxes, average.velocity, context)
             truth = scene.truth[spin]
             target = assign_targets(average.boxes, truth.targets, 0.5, "bev")

@@ -14,16 +14,14 @@ from flcav.dataset.ground import Ground
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.experiment import Experiment, Options, Outcome, import_map
-from flcav.fusion.detector import THRESHOLD, load_road_network, road_detector
 from flcav.fusion.labels import label_sample
-from flcav.fusion.road import MIN_RETURNS, RoadView
+from flcav.fusion.road import MIN_RETURNS, THRESHOLD, RoadView, load_road_network, road_detector
 from flcav.geometry import Boxes, inverse
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import match
-from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import CONFIGURATIONS
+from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.objects.model import CONFIGURATIONS, SecondConfig
 from flcav.perception.objects.truth import CARS, LOOKALIKE, choose_lidar, in_range, network_from_lidar
 from flcav.pipeline.frames import Frames, group_frames
 from flcav.pipeline.labels.pseudo_labels import Spin, road_views, select_frames_near
@@ -190,7 +188,7 @@ class TownScore:
 class RoadDetectorResult(Record):
     """Scores of the road detector in validation and test towns."""
 
-    threshold: float  # lowest score of a label, see `flcav.fusion.detector`
+    threshold: float  # lowest score of a label, see `flcav.fusion.road`
     fitted: float  # lowest threshold with `LEAST_PRECISION` on the validation towns, as computed here
     towns: tuple[TownScore, ...]
     labels: RoadLabels  # that vehicles get

@@ -19,10 +19,10 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.experiment import Experiment, Options, Outcome
-from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.fusion.road import THRESHOLD, load_road_network
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.foreground import frame_reader
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.agents import frame_reader
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style

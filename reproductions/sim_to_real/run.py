@@ -23,7 +23,7 @@ from flcav.perception.agents import POLE, kind_of
 from flcav.perception.images import kitti_view
 from flcav.perception.kitti_benchmark import in_image, is_kitti, truth_of
 from flcav.perception.metrics import interval_words, match
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.metrics.operating_point import FoundAtDistance, describe_counts
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.evaluate import count_objects, score_detections
@@ -39,7 +39,7 @@ from flcav.perception.objects.predict import (
 )
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import CARS, FrameTruth, asked_of, choose_lidar, select_class
-from flcav.perception.ops.rotated import Kind
+from flcav.perception.ops.boxes import Kind
 from flcav.pipeline.engine import Notify, Step, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style

@@ -9,8 +9,7 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.study import Study, StudyResult, describe_limits, list_counts, make_experiment, training_rows
 from flcav.perception.objects.evaluate import BreakdownRow, ObjectsEvaluation, Score
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.study import STREETS_STUDY, TRACKS
-from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.task import OBJECTS, TRACKS, streets_study
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
@@ -129,6 +128,6 @@ def _bar(name: str, rows: Sequence[Score | BreakdownRow]) -> Bar:
 
 
 STUDY = Study(OBJECTS, OBJECTS.study(), draw=_draw, extra={TRACKS: add_tracks}, is_share=_is_share)
-STREETS = Study(OBJECTS, STREETS_STUDY, draw=_draw, is_share=_is_share)
+STREETS = Study(OBJECTS, streets_study(), draw=_draw, is_share=_is_share)
 
 EXPERIMENT = make_experiment(STUDY, tables)

@@ -5,9 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from flcav.experiments.study import SeedResult, Study, StudyResult, describe_limits, make_experiment
-from flcav.perception.trajectory import study
 from flcav.perception.trajectory.evaluate import ALL, PathErrors, TrajectoryEvaluation
-from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.trajectory.task import TRAJECTORY, cameras_study
 from flcav.report import style
 from flcav.report.charts.studies import Bar, path_errors
 from flcav.statistics.seeds import MeanOverSeeds
@@ -116,6 +115,6 @@ def _is_share(name: str) -> bool:
 
 
 STUDY = Study(TRAJECTORY, TRAJECTORY.study(), draw=_draw, is_share=_is_share)
-CAMERAS = Study(TRAJECTORY, study.CAMERAS, draw=_draw, is_share=_is_share)
+CAMERAS = Study(TRAJECTORY, cameras_study(), draw=_draw, is_share=_is_share)
 
 EXPERIMENT = make_experiment(STUDY, tables)

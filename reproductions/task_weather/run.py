@@ -8,8 +8,7 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.study import Study, StudyResult, describe_limits, list_counts, make_experiment
 from flcav.perception.weather.evaluate import Classification, evaluate_whole_space
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.study import WHOLE_SPACE
-from flcav.perception.weather.task import WEATHER
+from flcav.perception.weather.task import WEATHER, WHOLE_SPACE
 from flcav.report import style
 from flcav.report.charts.studies import confusions
 from flcav.statistics.estimates import Estimate, score_interval

@@ -8,11 +8,10 @@ import pytest
 from flcav import perception
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.perception.card import LICENCE
 from flcav.perception.networks import resolve_network
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training.checkpoint import settings_of
-from flcav.perception.weights import SHIPPED, find_shipped, read_card, to_arrays
+from flcav.perception.weights import LICENCE, SHIPPED, find_shipped, read_card, to_arrays
 
 EACH_MB, ALL_MB = 4.0, 12.0
 FOLDER = Path(next(iter(perception.__path__)))

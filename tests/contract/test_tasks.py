@@ -24,17 +24,16 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies.corrections import Scaffold
 from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.perception.card import CARD_KEY
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.device import select_device
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.training import Checkpointing, Validation, train
-from flcav.perception.training.run import Request, train_network
+from flcav.perception.training.run import TrainingRequest, train_network
 from flcav.perception.weather.evaluate import evaluate_whole_space
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import load_network, save_network, to_arrays
+from flcav.perception.weights import CARD_KEY, load_network, save_network, to_arrays
 from flcav.report import style
 from flcav.report.pictures.inference import draw
 from flcav.reproductions.fig1b.columns import show_layers
@@ -262,7 +261,7 @@ def test_the_layers_that_fig1b_shows_are_all_seen(task, data):
 @each_task
 def test_a_whole_training_leaves_weights_with_their_card_and_curves(task, data, tmp_path, monkeypatch):
     monkeypatch.setattr(type(task), "configurations", {"small": small(task)})
-    card = train_network(task, Request([data, data], data, epochs=1, seed=2), tmp_path)
+    card = train_network(task, TrainingRequest([data, data], data, epochs=1, seed=2), tmp_path)
     assert (card.task, card.network, card.seed, card.samples) == (task.name, "small", 2, 12)
     assert card.metrics == task.evaluate(load_network(task, tmp_path / "weights.safetensors"), data).as_json()
     with safe_open(tmp_path / "weights.safetensors", framework="pt") as file:

@@ -3,10 +3,9 @@ from pathlib import Path
 
 import torch
 
-from flcav.perception.card import Card, DataEntry
 from flcav.perception.objects.model import pillars_config, second
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.weights import load_network, read_card, save_network
+from flcav.perception.weights import Card, DataEntry, load_network, read_card, save_network
 from flcav.releases.checking import RepositorySources, open_sources
 from flcav.releases.installation import Installed, update_vehicle
 from flcav.releases.repositories.metadata import Directive

@@ -14,7 +14,7 @@ from flcav.cli.main import run as command
 from flcav.config import InputError
 from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
-from flcav.perception.objects.distillation import imitation
+from flcav.perception.objects import distillation
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.pipeline.analysis.histories import ORIGIN, HistoryOrigin
@@ -169,7 +169,7 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(
     same = {name: np.array_equal(own, head[PRETRAIN]) for name, own in head.items()}
     assert same == {PRETRAIN: True, "bare": False, "frozen": True, "imitating": False}
     np.testing.assert_array_equal(head["imitating"], head["bare"])  # a teacher of one step sees nothing
-    monkeypatch.setattr(imitation, "SEEN", 0.0)
+    monkeypatch.setattr(distillation, "SEEN", 0.0)
     (tmp_path / "again").mkdir()
     for stage in ("grid-edge-fl-objects-imitating", "cloud-fl-objects-imitating"):
         perform(recipe, tmp_path, tmp_path / "again", (stage,))

@@ -101,7 +101,7 @@ def import_(
     with progress.show_progress(f"import {out}") as report:
         how: Any = {}
         if estimate_poses:
-            from flcav.fusion.odometry import DrivenSource
+            from flcav.fusion.registration import DrivenSource
 
             how = {"posed": DrivenSource}
         notes = import_dataset(format, folder, out, split=split, progress=report, **how)

@@ -50,20 +50,22 @@ def train(
     from flcav.interface import progress
     from flcav.perception.device import select_device
     from flcav.perception.tasks import task_named
-    from flcav.perception.training.run import CHECKPOINT, WEIGHTS, Request, prepare, train_prepared
+    from flcav.perception.training.run import CHECKPOINT, WEIGHTS, TrainingRequest, prepare_training, train_prepared
 
     if validation is None:
         refuse_unused("a training without --validation", "patience")
     learner, place = task_named(task), select_device(device)
     held = Dataset.open(validation) if validation else None
-    request = Request([Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place, agents)
+    request = TrainingRequest(
+        [Dataset.open(folder) for folder in data], held, network, epochs, patience, seed, place, agents
+    )
 
     def kept() -> str:
         saved = out / CHECKPOINT
         return f"the same command goes on from {saved}" if saved.exists() else "nothing saved yet"
 
     with when_interrupted(kept):
-        prepared = prepare(learner, request, out)
+        prepared = prepare_training(learner, request, out)
         if prepared.finished is not None:
             train_prepared(prepared)  # its card may be missing
             echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from flcav.dataset.layout import FrameKey
 from flcav.driving.seen import TIMES_S, predict_motion
 from flcav.geometry import Boxes, concatenate, heading_vectors, wrap_angle
-from flcav.perception.tracking.tracker import Tracker
+from flcav.perception.tracking import Tracker
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.predict import find_medoid, predict
-from flcav.perception.trajectory.roads import RoadMap
+from flcav.perception.trajectory.predict import find_medoid, predict_paths
+from flcav.perception.trajectory.rasters import RoadMap
 from flcav.perception.trajectory.samples import Sample, extract_columns
 from flcav.perception.trajectory.tracks import OFFSETS_S, Tracks, out_of_frame
 from flcav.world.trace import Trace
@@ -142,7 +142,7 @@ class Following:
         samples = [Sample(*row) for row in zip(*columns)]
         if not samples:
             return
-        paths, shares = predict(network, samples)
+        paths, shares = predict_paths(network, samples)
         single = paths[np.arange(len(paths)), find_medoid(paths, shares)]
         world = out_of_frame(single, columns.pose)
         for row, actor in enumerate(columns.actor.tolist()):

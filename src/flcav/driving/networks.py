@@ -20,12 +20,12 @@ from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import detect
+from flcav.perception.signs.predict import detect_in_picture
 from flcav.perception.tasks import task_named
 from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.roads import RoadMap, road_map
+from flcav.perception.trajectory.rasters import RoadMap, road_map
+from flcav.perception.weather.evaluate import predict_probabilities
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import reduce_picture
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
@@ -79,7 +79,10 @@ class LightReader:
 
     def read(self, frame: Frame, network: SignDetector, time_s: float) -> dict[str, str | None]:
         """Read the lights in the frame's picture; return the letter of each that may be read, None where it was not."""
-        found, read = detect(network, frame.images[CAMERA].rgb, threshold=LIGHT_SCORE), dict[str, str | None]()
+        found, read = (
+            detect_in_picture(network, frame.images[CAMERA].rgb, threshold=LIGHT_SCORE),
+            dict[str, str | None](),
+        )
         for row, x, y in self.project(frame):
             read.setdefault(self._link[row], None)
             box = found.box

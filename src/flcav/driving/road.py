@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.driving.seen import EGO
-from flcav.fusion.detector import THRESHOLD, load_road_network
+from flcav.fusion.road import THRESHOLD, load_road_network
 from flcav.geometry import Boxes, concatenate
 from flcav.network.ledger import from_names, pack_arrays
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import link_vehicles, unit_positions
 from flcav.perception.objects.predict import detect
-from flcav.perception.tracking.tracker import Tracked, Tracker
+from flcav.perception.tracking import Tracked, Tracker
 from flcav.sensors.lidar.background import Background, learn_background
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar_pole

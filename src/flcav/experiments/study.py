@@ -14,11 +14,10 @@ from flcav.config import InputError, Json, parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.experiment import Experiment, Options, Outcome
-from flcav.perception.card import Card
 from flcav.perception.study import RecipeFields, Studied, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
-from flcav.perception.training.run import WEIGHTS, Request, train_network
-from flcav.perception.weights import load_network
+from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
+from flcav.perception.weights import Card, load_network
 from flcav.pipeline.engine import Notify, Step, Work, run_steps
 from flcav.pipeline.provenance import Provenance, provenance
 from flcav.plugins import load_named
@@ -102,7 +101,7 @@ class Study(Generic[EvaluationT]):
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
         """Train the network of one seed, resuming an interrupted training; return its card as JSON."""
         data = [open_split(work.inputs[step]) for step in _training_steps(self)]
-        request = Request(data, open_split(work.inputs[VALIDATION]), network, epochs, patience, seed)
+        request = TrainingRequest(data, open_split(work.inputs[VALIDATION]), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> Json:

@@ -13,17 +13,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import shapely
-from numpy.typing import NDArray
 from scipy.optimize import least_squares, linear_sum_assignment
 from scipy.spatial.distance import cdist
 from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.dataset.rectangles import HALF_PX
 from flcav.geometry import Boxes, rotations, transform_points
 from flcav.sensors.lens import project_points
-
-Array = NDArray[np.float64]
 
 SIDE_PX, SIDE_SHARE = 2.0, 0.08  # standard deviation of a side: hypot of pixels and of a share of the box's own size
 GATE = chi2.ppf(0.999, (1, 2, 3, 4))  # largest squared distance of a pair, by the number of sides that count
@@ -67,11 +65,11 @@ class PairedShot:
 class Pairs:
     """The pairs of one shot, and what has no partner."""
 
-    car: NDArray[np.int64]  # (P,) index into the shot's cars
-    box: NDArray[np.int64]  # (P,) index into the shot's boxes
+    car: Ints  # (P,) index into the shot's cars
+    box: Ints  # (P,) index into the shot's boxes
     residual_px: Array  # (P,) root mean square of the offsets of the sides that lie inside the picture
-    lone_cars: NDArray[np.int64]  # cars that project into the picture
-    lone_boxes: NDArray[np.int64]
+    lone_cars: Ints  # cars that project into the picture
+    lone_boxes: Ints
 
     def __len__(self) -> int:
         return len(self.car)
@@ -179,7 +177,7 @@ def fit_extrinsics(
     """
     cars = [shot.cars[own.car] for shot, own in zip(shots, pairs, strict=True)]
     boxes = np.concatenate([shot.boxes[own.box] for shot, own in zip(shots, pairs, strict=True)])
-    points = np.concatenate([outline(each) for each in cars])
+    points = np.concatenate([outline_cars(each) for each in cars])
     sigma = np.array([side_px(box) for box in boxes])[:, None]
     centers = np.concatenate([each.center for each in cars])
     share = 1 / (cdist(centers, centers) < STILL_M).sum(axis=1, keepdims=True)
@@ -203,7 +201,7 @@ def fit_extrinsics(
     )
 
 
-def outline(cars: Boxes) -> Array:
+def outline_cars(cars: Boxes) -> Array:
     """Return the (N, K, 3) points of cars' outlines, in the frame of their boxes [m]."""
     own = OUTLINE * (0.5, 0.5, 1.0) - (0, 0, 0.5)
     tilt = np.zeros((len(cars), 2)) if cars.tilt is None else cars.tilt
@@ -216,7 +214,7 @@ def side_px(box: Array) -> float:
     return float(np.hypot(SIDE_PX, SIDE_SHARE * np.sqrt((box[2] - box[0]) * (box[3] - box[1]))))
 
 
-def sides_inside(boxes: Array, view: AssociatedCamera) -> NDArray[np.bool_]:
+def sides_inside(boxes: Array, view: AssociatedCamera) -> Mask:
     """Return (..., 4) whether each side of boxes (..., 4) lies inside the picture: not on its border."""
     return (boxes > BORDER_PX) & (boxes < np.array(view.size * 2) - BORDER_PX)
 
@@ -234,7 +232,7 @@ def _sides(points: Array, view: AssociatedCamera) -> Array:
 
 def _project_with_slope(cars: Boxes, view: AssociatedCamera) -> tuple[Array, Array]:
     """Return the boxes (N, 4) of `_sides` of cars, and their (N, 4, 6) derivative by an error of the extrinsics."""
-    points, step = outline(cars), 1e-5
+    points, step = outline_cars(cars), 1e-5
     moved = [
         _sides(points, replace(view, camera_from_lidar=apply_error(view.camera_from_lidar, step * axis)))
         for axis in np.eye(6)

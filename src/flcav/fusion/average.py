@@ -1,23 +1,28 @@
 """The road average: boxes of road sensors and vehicles over a window of spins, averaged by their uncertainty.
 
-Boxes are associated with objects spin by spin: an object moves at constant velocity, a box belongs to it within a gate
-of Mahalanobis distance, and the Hungarian method settles which. What one agent tells of an object in several spins may
-be wrong in the same way each time (its pose, its clock), so that it is joined by covariance intersection, which stays
-consistent whatever the correlation (Julier and Uhlmann, ACC 1997), with the weights of Niehsen, "Information fusion
-based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace. What different agents tell is
-joined as independent, by inverse variance.
+What an agent reports of a spin are boxes in the world; the uncertainty of its pose, by its navigation, is added to
+their variances. Boxes are associated with objects spin by spin: an object moves at constant velocity, a box belongs to
+it within a gate of Mahalanobis distance, and the Hungarian method settles which. What one agent reports of an object in
+several spins may be wrong in the same way each time (its pose, its clock), so that it is joined by covariance
+intersection, which stays consistent whatever the correlation (Julier and Uhlmann, ACC 1997), with the weights of
+Niehsen, "Information fusion based on fast covariance intersection filtering", FUSION 2002: in proportion to 1 / trace.
+What different agents report is joined as independent, by inverse variance.
+
+Poses of vehicles are either the true ones with drawn errors (`NavigationErrors`), or estimated from what the vehicle's
+GNSS receiver and IMU measured (`flcav.fusion.inertial`).
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import Field
 from scipy.optimize import linear_sum_assignment
 
-from flcav.geometry import Boxes, wrap_angle
-
-Array = NDArray[np.float64]
+from flcav.arrays import Array, Ints
+from flcav.config import Config
+from flcav.geometry import Boxes, pose, wrap_angle
 
 YAW = 6  # column of a box and of its variance
 GATE = 18.4  # largest squared Mahalanobis distance in x, y of a box from its object: 99.99 % of chi-squared, 2 dof
@@ -42,29 +47,29 @@ class RoadAverage:
 
     boxes: Boxes  # (K,) world frame, at the time asked for, with scores and variances
     velocity: Array  # (K, 2) along x and y of the world [m/s]
-    agents: NDArray[np.int64]  # (K,) number of agents that saw the object
-    member: tuple[NDArray[np.int64], ...]  # for each `BoxReport` the object of each of its boxes
+    agents: Ints  # (K,) number of agents that saw the object
+    member: tuple[Ints, ...]  # for each `BoxReport` the object of each of its boxes
 
 
-def average_boxes(told: Sequence[BoxReport], at_s: float) -> RoadAverage:
-    """Return the objects at `at_s` [s] that agents tell of in a window of spins.
+def average_boxes(reports: Sequence[BoxReport], at_s: float) -> RoadAverage:
+    """Return the objects at `at_s` [s] that agents report in a window of spins.
 
-    An agent's score of an object is the mean over all its spins, zero where it does not tell of the object; the average
+    An agent's score of an object is the mean over all its spins, zero where it does not report the object; the average
     has the probability that not all agents err, 1 - product of (1 - score).
     """
-    told = list(told)
-    member = _associate(told, at_s)
+    reports = list(reports)
+    member = _associate(reports, at_s)
     flat = np.concatenate([np.zeros(0, dtype=np.int64), *member])
     count = int(flat.max(initial=-1)) + 1
-    names = sorted({one.agent for one in told})
-    spins = np.array([sum(one.agent == name for one in told) for name in names], dtype=np.float64)
-    lengths = [len(one.boxes) for one in told]
-    agent = np.repeat([names.index(one.agent) for one in told], lengths).astype(np.int64)
-    since = np.repeat([one.time_s - at_s for one in told], lengths)
-    rows = np.concatenate([np.zeros((0, 7)), *(one.boxes.array() for one in told)])
-    variance = np.concatenate([np.zeros((0, 7)), *(variance_of(one.boxes) for one in told)])
-    score = np.concatenate([np.zeros(0), *(_scores(one.boxes) for one in told)])
-    label = np.concatenate([np.zeros(0, dtype=np.str_), *(one.boxes.label for one in told)])
+    names = sorted({one.agent for one in reports})
+    spins = np.array([sum(one.agent == name for one in reports) for name in names], dtype=np.float64)
+    lengths = [len(one.boxes) for one in reports]
+    agent = np.repeat([names.index(one.agent) for one in reports], lengths).astype(np.int64)
+    since = np.repeat([one.time_s - at_s for one in reports], lengths)
+    rows = np.concatenate([np.zeros((0, 7)), *(one.boxes.array() for one in reports)])
+    variance = np.concatenate([np.zeros((0, 7)), *(variance_of(one.boxes) for one in reports)])
+    score = np.concatenate([np.zeros(0), *(_scores(one.boxes) for one in reports)])
+    label = np.concatenate([np.zeros(0, dtype=np.str_), *(one.boxes.label for one in reports)])
 
     lines = _Lines(count)
     lines.add(flat, rows[:, :2], variance[:, :2], since)
@@ -99,7 +104,7 @@ class _Lines:
     def __init__(self, most: int) -> None:
         self._sums = np.zeros((5, most, 2))  # w, w t, w t^2, w x, w x t
 
-    def add(self, row: NDArray[np.int64], xy: Array, variance: Array, t: Array | float) -> None:
+    def add(self, row: Ints, xy: Array, variance: Array, t: Array | float) -> None:
         """Add boxes (N,) of the objects `row`, with x, y and their variance (N, 2), seen at `t` [s]."""
         weight, t = 1 / variance, np.broadcast_to(np.reshape(t, (-1, 1)), xy.shape)
         for number, value in enumerate((weight, weight * t, weight * t * t, weight * xy, weight * xy * t)):
@@ -113,14 +118,14 @@ class _Lines:
         return (wtt * wx - wt * wxt) / det, (w * wxt - wt * wx) / det, np.stack((wtt, -wt, w)) / det
 
 
-def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[NDArray[np.int64], ...]:
+def _associate(reports: Sequence[BoxReport], at_s: float) -> tuple[Ints, ...]:
     """Return for each `BoxReport` the number of the object that each of its boxes belongs to, from 0."""
-    most = sum(len(one.boxes) for one in told)
+    most = sum(len(one.boxes) for one in reports)
     lines, labels, count = _Lines(most), np.zeros(most, dtype=np.int64), 0
     known: dict[str, int] = {}
-    member: dict[int, NDArray[np.int64]] = {}
-    for number in sorted(range(len(told)), key=lambda i: told[i].time_s):
-        boxes, t = told[number].boxes, told[number].time_s - at_s
+    member: dict[int, Ints] = {}
+    for number in sorted(range(len(reports)), key=lambda i: reports[i].time_s):
+        boxes, t = reports[number].boxes, reports[number].time_s - at_s
         xy, variance = boxes.center[:, :2], variance_of(boxes)[:, :2]
         label = np.array([known.setdefault(str(name), len(known)) for name in boxes.label], dtype=np.int64)
         own = np.full(len(boxes), -1)
@@ -139,10 +144,10 @@ def _associate(told: Sequence[BoxReport], at_s: float) -> tuple[NDArray[np.int64
         count += len(new)
         lines.add(own, xy, variance, t)
         member[number] = own
-    return tuple(member[number] for number in range(len(told)))
+    return tuple(member[number] for number in range(len(reports)))
 
 
-def _intersect(row: NDArray[np.int64], mean: Array, variance: Array, count: int) -> tuple[Array, Array]:
+def _intersect(row: Ints, mean: Array, variance: Array, count: int) -> tuple[Array, Array]:
     """Return mean (count, 7) and information (count, 7) of the covariance intersection of boxes with the same `row`.
 
     mean, variance: (N, 7). With weights u_i = (1 / tr_i) / sum (1 / tr_j): information sum u_i / P_i, and mean
@@ -155,7 +160,7 @@ def _intersect(row: NDArray[np.int64], mean: Array, variance: Array, count: int)
     return _sums(row, each * mean, count) / information, information
 
 
-def _mean_heading(row: NDArray[np.int64], yaw: Array, variance: Array, count: int) -> Array:
+def _mean_heading(row: Ints, yaw: Array, variance: Array, count: int) -> Array:
     """Return the heading (count,) [rad] of each object: the mean axis of its boxes, and the way most of them face."""
     weight = 1 / variance
     sin, cos = (np.bincount(row, weight * wave(2 * yaw), count) for wave in (np.sin, np.cos))
@@ -164,7 +169,7 @@ def _mean_heading(row: NDArray[np.int64], yaw: Array, variance: Array, count: in
     return wrap_angle(np.where(ahead >= 0, axis, axis + np.pi))
 
 
-def _sums(row: NDArray[np.int64], values: Array, count: int) -> Array:
+def _sums(row: Ints, values: Array, count: int) -> Array:
     """Return (count, 7) the sums of `values` (N, 7) over the rows of the same number."""
     out = np.zeros((count, values.shape[1]))
     np.add.at(out, row, values)
@@ -173,3 +178,72 @@ def _sums(row: NDArray[np.int64], values: Array, count: int) -> Array:
 
 def _scores(boxes: Boxes) -> Array:
     return np.ones(len(boxes)) if boxes.score is None else boxes.score
+
+
+@dataclass(frozen=True)
+class Navigation:
+    """Standard deviations of a vehicle's own pose and clock, as its navigation states them."""
+
+    position_m: float
+    heading_rad: float
+
+
+@dataclass(frozen=True)
+class Sighting:
+    """Observation of one agent in one spin: its pose by navigation, boxes and posts."""
+
+    agent: str
+    time_s: float  # by its clock
+    world_from_agent: Array  # (4, 4) by its navigation; of a road sensor as surveyed
+    boxes: Boxes  # agent's frame, its origin on the ground, with scores and variances
+    posts: Array = field(default_factory=lambda: np.zeros((0, 2)))  # (L, 2) feet of posts, agent's frame [m]
+    navigation: Navigation | None = None  # None: surveyed, a road sensor
+
+
+def report_boxes(sighting: Sighting) -> BoxReport:
+    """Return what an agent reports of a spin: boxes in the world, with the uncertainty of its pose in their variances.
+
+    A heading error moves a box at distance r by r times the error, across the line of sight.
+    """
+    boxes = sighting.boxes.transform(sighting.world_from_agent)
+    return BoxReport(sighting.agent, sighting.time_s, add_pose_variance(boxes, sighting))
+
+
+def add_pose_variance(boxes: Boxes, sighting: Sighting) -> Boxes:
+    """Return boxes, world frame, with the variance of an agent's pose added to theirs; of road sensors as they are."""
+    if sighting.navigation is None:
+        return boxes
+    known, variance = sighting.navigation, variance_of(boxes)
+    arm = boxes.center[:, :2] - sighting.world_from_agent[:2, 3]
+    variance[:, :2] += known.position_m**2 + (arm[:, ::-1] * known.heading_rad) ** 2
+    variance[:, YAW] += known.heading_rad**2
+    return replace(boxes, variance=variance)
+
+
+class NavigationErrors(Config):
+    """Standard deviations of the errors of vehicles' poses and clocks; those of poses are drawn for each frame."""
+
+    position_m: float = Field(default=0.0, ge=0, le=10)  # of a vehicle's position, along x and along y
+    heading_deg: float = Field(default=0.0, ge=0, le=45)  # of its heading
+    clock_s: float = Field(default=0.0, ge=0, le=1)  # of its clock's offset, one in each scene
+
+    @property
+    def stated(self) -> Navigation:
+        """Return what a vehicle states of its accuracy."""
+        return state_accuracy(self.position_m, float(np.radians(self.heading_deg)))
+
+    def navigate(self, world_from_agent: Array, rng: np.random.Generator) -> Array:
+        """Return a vehicle's pose (4, 4) as its navigation has it, with errors drawn from `rng`."""
+        off_m, turned = self.position_m * rng.standard_normal(2), np.radians(self.heading_deg) * rng.standard_normal()
+        known = world_from_agent @ pose(0, 0, 0, float(turned))
+        known[:2, 3] = world_from_agent[:2, 3] + off_m
+        return known
+
+
+ESTIMATED: Literal["estimated"] = "estimated"
+PoseSource = NavigationErrors | Literal["estimated"]  # "estimated": see `flcav.fusion.inertial`; clocks are exact
+
+
+def state_accuracy(position_m: float, heading_rad: float) -> Navigation:
+    """Return standard deviations as a vehicle states them: at least a centimetre and .001 rad."""
+    return Navigation(max(position_m, 0.01), max(heading_rad, 0.001))

@@ -1,4 +1,4 @@
-"""Labels by federated distillation: what vehicles tell the edge server, and what they learn from the road average.
+"""Labels by federated distillation: what vehicles report to the edge server, and what they learn from the road average.
 
 Wang et al. (IEEE Network 37(3), 2023): road sensors and vehicles send boxes with their uncertainties to the edge
 server, which averages them over a window of spins (`flcav.fusion.average`); each vehicle learns from the average at
@@ -9,8 +9,13 @@ truth, and vehicles know poses and times by their own navigation alone.
   each with a score that reaches the threshold of pseudo-labels in the mean of its spins, 0 in those without the box.
   Vehicles run one network and see one street: that two of them are half sure of a wall is no evidence of a car.
 - What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself.
-- What vehicles alone tell of is dropped where road sensors saw free ground, or have a box of their own.
+- What vehicles alone report is dropped where road sensors saw free ground, or have a box of their own.
 - An anchor is a negative only where a road sensor saw free ground.
+
+The map corrects headings and classes: lanes say which way cars face, crossings who walks there. A car on a lane follows
+its direction within a few degrees, so that the lane is one more measurement of its heading, joined by inverse variance.
+Front and back of a car differ by few returns, and the lane decides. A slow road user on a sidewalk or crossing is
+a pedestrian, one on a lane elsewhere a cyclist; detectors mistake one for the other.
 """
 
 from collections.abc import Mapping, Sequence
@@ -18,27 +23,109 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
 from pydantic import Field
+from scipy.spatial import KDTree
+from shapely import STRtree
+from shapely.geometry import Polygon
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import Config
-from flcav.fusion.average import RoadAverage, average_boxes, variance_of
+from flcav.fusion.average import (
+    YAW,
+    Navigation,
+    RoadAverage,
+    Sighting,
+    add_pose_variance,
+    average_boxes,
+    report_boxes,
+    variance_of,
+)
 from flcav.fusion.labels import cell_centers
-from flcav.fusion.map_context import MapContext, snap_to_map
 from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
-from flcav.fusion.sightings import Navigation, Sighting, add_pose_variance, tell
-from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points
+from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points, wrap_angle
 from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
+from flcav.world.map.layers import MapLane, MapLayers
 
-Array = NDArray[np.float64]
+STEP_M = 1.0  # between two points of a lane's centre line
+LANE_RAD = np.radians(4.0)  # standard deviation of a car's heading about its lane's
+ALONG_RAD = np.radians(30.0)  # a car that is turned farther from every lane does not follow one: it turns, or is parked
+WALKING_MPS = 2.5  # fastest pedestrian
+CARS = ("car", "van", "Car")
+PEDESTRIAN, CYCLIST = ("pedestrian", "Pedestrian"), ("bicycle", "Cyclist")
 
-TOLD = 0.1  # lowest score of a detection that a vehicle tells of
-FREE = 0.5  # what vehicles alone tell of is dropped where road sensors saw more than this share of its footprint free
+
+@dataclass(frozen=True)
+class MapContext:
+    """The parts of a town's map that labels are snapped to."""
+
+    points: KDTree  # (Q, 2) points of the centre lines of driving lanes
+    yaw: Array  # (Q,) direction of driving there [rad]
+    half_width_m: Array  # (Q,)
+    walked: STRtree  # sidewalks and crossings
+
+
+def build_context(layers: MapLayers) -> MapContext:
+    """Return the context of a lane-level map; raises ValueError where it has no driving lane."""
+    parts = [_sample(lane) for lane in layers.lanes if lane.kind == "driving" and len(lane.centre_line) > 1]
+    if not parts:
+        raise ValueError("the map has no driving lane")
+    rows = np.concatenate(parts)
+    areas = [Polygon(outline) for outline in (*layers.sidewalks, *(each.outline for each in layers.crossings))]
+    return MapContext(KDTree(rows[:, :2]), rows[:, 2], rows[:, 3], STRtree(areas))
+
+
+def snap_to_map(boxes: Boxes, velocity: Array, context: MapContext) -> Boxes:
+    """Return the boxes (N,), world frame, with headings of cars on lanes and classes of people snapped to the map.
+
+    velocity: (N, 2) [m/s]. Of several lanes at a place, as on a junction, the one nearest to the box's axis counts.
+    """
+    yaw, variance, label = boxes.yaw.copy(), variance_of(boxes), boxes.label.tolist()
+    for row in np.flatnonzero(np.isin(boxes.label, CARS)):
+        near = np.array(context.points.query_ball_point(boxes.center[row, :2], r=3.0), dtype=np.int64)
+        if not len(near):
+            continue
+        apart = np.linalg.norm(context.points.data[near] - boxes.center[row, :2], axis=1)
+        near = near[apart <= context.half_width_m[near]]
+        axis = np.abs((context.yaw[near] - yaw[row] + np.pi / 2) % np.pi - np.pi / 2)
+        if not len(near) or axis.min() > ALONG_RAD:
+            continue
+        lane = context.yaw[near[axis.argmin()]]
+        off = (yaw[row] - lane + np.pi / 2) % np.pi - np.pi / 2
+        share = LANE_RAD**2 / (LANE_RAD**2 + variance[row, YAW])
+        yaw[row] = wrap_angle(lane + share * off)
+        variance[row, YAW] *= share
+    people = np.flatnonzero(np.isin(boxes.label, (*PEDESTRIAN, *CYCLIST)))
+    walked = np.zeros(len(people), dtype=bool)
+    walked[context.walked.query(shapely.points(boxes.center[people, :2]), predicate="within")[0]] = True
+    slow = np.hypot(*velocity[people].T) <= WALKING_MPS
+    for row, on_foot, fast in zip(people, walked, ~slow, strict=True):
+        names = PEDESTRIAN if on_foot and not fast else CYCLIST
+        if on_foot != fast:  # the map and the speed agree
+            label[row] = names[0 if label[row] in (PEDESTRIAN[0], CYCLIST[0]) else 1]
+    return replace(boxes, yaw=yaw, label=np.array(label, dtype=np.str_), variance=variance)
+
+
+def _sample(lane: MapLane) -> Array:
+    """Return (Q, 4) points of a lane: x, y, direction, half the width."""
+    steps = np.diff(lane.centre_line, axis=0)
+    lengths = np.hypot(*steps.T)
+    counts = np.maximum(np.ceil(lengths / STEP_M).astype(int), 1)
+    number = np.repeat(np.arange(len(steps)), counts)
+    share = (np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts) + 0.5) / counts[number]
+    xy = lane.centre_line[:-1][number] + share[:, None] * steps[number]
+    yaw = np.arctan2(steps[:, 1], steps[:, 0])[number]
+    return np.column_stack((xy, yaw, np.full(len(xy), lane.width_m / 2)))
+
+
+TOLD = 0.1  # lowest score of a detection that a vehicle reports
+FREE = 0.5  # what vehicles alone report is dropped where road sensors saw more than this share of its footprint free
 PARTS = (8, 4)  # of a footprint, along and across, by which that share is measured
 RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the object's: poses are off
 
@@ -61,7 +148,7 @@ class Guidance:
     """Message of the edge server on one frame of a vehicle: the road average, in the vehicle's frame."""
 
     boxes: Boxes  # (K,) label = detection class, or the actor category of a lookalike; with scores and variances
-    confirmed: NDArray[np.bool_]  # (K,) whether a road sensor has the box, or two sure vehicles; others are ignored
+    confirmed: Mask  # (K,) whether a road sensor has the box, or two sure vehicles; others are ignored
     world_from_agent: Array  # (4, 4) the vehicle's pose as the edge server has it
 
     def message(self) -> bytes:
@@ -111,37 +198,35 @@ def average_spin(
     context: MapContext | None = None,
     around: Sequence[Sighting] = (),
 ) -> list[Guidance]:
-    """Return what the edge server tells each vehicle of a spin, in the order of the vehicles among the sightings.
+    """Return what the edge server sends each vehicle about a spin, in the order of the vehicles among the sightings.
 
     sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
-    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: they are as told.
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: as reported.
     context: the map that headings and classes are snapped to; None: they are as averaged. around: sightings of other
     spins in the window, before and after, averaged with those of this one. Without any all speeds count as 0.
     """
-    told = [_classify(each, config) if each.navigation is None else each for each in (*sightings, *around)]
+    reported = [_classify(each, config) if each.navigation is None else each for each in (*sightings, *around)]
     times_s = [each.time_s for each in sightings]
     surveyed_s = [each.time_s for each in sightings if each.navigation is None]
     at_s = float(np.median(surveyed_s or times_s or [0.0]))
     if posts is not None:
-        told = correct_poses(told, posts, at_s)
-    average = average_boxes([tell(each) for each in told], at_s)
+        reported = correct_poses(reported, posts, at_s)
+    average = average_boxes([report_boxes(each) for each in reported], at_s)
     boxes = average.boxes if context is None else snap_to_map(average.boxes, average.velocity, context)
-    road, sure = _count_votes(told, average, threshold)
+    road, sure = _count_votes(reported, average, threshold)
     kept = select_labels(boxes, road, views, threshold)
     confirmed = (road | (sure > 1))[kept]
-    asking = [each for each in told[: len(sightings)] if each.navigation is not None]
+    asking = [each for each in reported[: len(sightings)] if each.navigation is not None]
     moved = [average.velocity[kept] * (each.time_s - at_s) for each in asking]
     return [place_in(_shift(boxes[kept], by), confirmed, each) for each, by in zip(asking, moved, strict=True)]
 
 
-def _count_votes(
-    told: Sequence[Sighting], average: RoadAverage, threshold: float
-) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+def _count_votes(reported: Sequence[Sighting], average: RoadAverage, threshold: float) -> tuple[Mask, Ints]:
     """Return (K,) whether a road sensor has each object, (K,) how many vehicles are sure of it, over a window."""
     count = len(average.boxes)
     road, sure = np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
-    for agent in {each.agent for each in told}:
-        own = [(each, member) for each, member in zip(told, average.member, strict=True) if each.agent == agent]
+    for agent in {each.agent for each in reported}:
+        own = [(each, member) for each, member in zip(reported, average.member, strict=True) if each.agent == agent]
         seen, score = np.zeros(count), np.zeros(count)
         for each, member in own:  # an object has at most one box of a sighting
             seen[member] += 1
@@ -166,10 +251,8 @@ def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
     return replace(seen, boxes=replace(seen.boxes, label=label)[label != ""])
 
 
-def select_labels(
-    boxes: Boxes, road: NDArray[np.bool_], views: Sequence[RoadView], threshold: float
-) -> NDArray[np.bool_]:
-    """Return (N,) which boxes of an average are told to vehicles; `road` (N,): whether a road sensor has the box."""
+def select_labels(boxes: Boxes, road: Mask, views: Sequence[RoadView], threshold: float) -> Mask:
+    """Return (N,) which boxes of an average are sent to vehicles; `road` (N,): whether a road sensor has the box."""
     assert boxes.score is not None
     seen = boxes[road]
     near = np.linalg.norm(boxes.center[:, None, :2] - seen.center[None, :, :2], axis=2) < seen.size[None, :, 0] / 2
@@ -186,14 +269,14 @@ def share_of_free_ground(boxes: Boxes, views: Sequence[RoadView]) -> Array:
     return free.mean(axis=1)
 
 
-def place_in(boxes: Boxes, confirmed: NDArray[np.bool_], seen: Sighting) -> Guidance:
+def place_in(boxes: Boxes, confirmed: Mask, seen: Sighting) -> Guidance:
     """Return the boxes, world frame, as guidance of a vehicle: in its frame, with the variance of its pose added."""
     placed = add_pose_variance(boxes, seen).transform(inverse(seen.world_from_agent))
     return Guidance(placed, confirmed, seen.world_from_agent)
 
 
 def distil_sample(
-    frame: Frame, own: Boxes, told: Guidance, views: Sequence[RoadView], config: SecondConfig, lidar: str
+    frame: Frame, own: Boxes, guidance: Guidance, views: Sequence[RoadView], config: SecondConfig, lidar: str
 ) -> Sample:
     """Return a vehicle's frame with the labels of federated distillation; network's frame.
 
@@ -203,12 +286,12 @@ def distil_sample(
     """
     mount = frame.assumed.agent_from_sensor[lidar]
     points = crop_to_range(frame.lidar[lidar], config)
-    boxes = told.boxes.transform(inverse(mount))
+    boxes = guidance.boxes.transform(inverse(mount))
     asked = np.isin(boxes.label, config.classes)
-    targets = asked & told.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
+    targets = asked & guidance.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
     cells = cell_centers(config)
     below = np.column_stack((cells, np.full(len(cells), -mount[2, 3])))
-    world = transform_points(told.world_from_agent @ mount, below)[:, :2]
+    world = transform_points(guidance.world_from_agent @ mount, below)[:, :2]
     free = np.zeros(len(cells), dtype=bool)
     for view in views:
         free |= view.at(view.ground, world)

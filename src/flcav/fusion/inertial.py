@@ -24,8 +24,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError
 from flcav.geometry import rotations_about_z
 from flcav.machine.compiled import compiled
@@ -34,16 +34,11 @@ from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.geodesy import convert_to_map
 from flcav.world.map.parameters import GeoReference
 
-Array = NDArray[np.float64]
-
 STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
 ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's velocity across and upwards, its own axes
 REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
-SLOW_MPS, QUIET_S, QUIET = (
-    1.0,
-    1.0,
-    2.0,
-)  # at rest: slower, and the IMU varies, so long before and after, so many sigmas
+SLOW_MPS = 1.0  # at rest a vehicle is slower
+QUIET_S, QUIET = 1.0, 2.0  # and its IMU varies by at most so many standard deviations, so long before and after
 HEIGHT_M = 0.5  # standard deviation of the height of the map's ground below a fix
 HEADINGS = 8  # directions of the vehicle at the beginning that are tried
 BACKWARDS_M = 1.0  # no car drives farther backwards, all in all
@@ -55,7 +50,7 @@ IMPOSSIBLE = 10.0  # mean of fixes' normalised squared innovations, of 3 dimensi
 
 
 @dataclass(frozen=True)
-class Estimate:
+class MotionEstimate:
     """Estimated poses of a vehicle at T times, and their covariance."""
 
     world_from_agent: Array  # (T, 4, 4)
@@ -88,7 +83,7 @@ class _States(NamedTuple):
 
 def estimate_drive(
     log: NavigationLog, mounts: Mounts, geo: GeoReference, ground: Callable[[Array, Array], Array], at_s: Array
-) -> Estimate:
+) -> MotionEstimate:
     """Return the poses of a vehicle at the times `at_s` (T,) within its log, by all of the log.
 
     geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. Of the
@@ -109,8 +104,8 @@ def estimate_drive(
     rest = _find_rest(log, inertia, epochs)
     tried = []
     for turn in rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)):
-        given = (position, velocity, turn, covariance)
-        tried.append(_filter(log.imu_time_s, inertia, epochs, fixes, rest, levers, _sigmas(log), *given))
+        begin = (position, velocity, turn, covariance)
+        tried.append(_filter(log.imu_time_s, inertia, (epochs, fixes, rest), levers, _sigmas(log), begin))
     forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both, *_ in tried]
     likelihood = np.nan_to_num(np.where(forwards, [each[-1] for each in tried], -np.inf), nan=-np.inf)
     best = int(likelihood.argmax())
@@ -132,7 +127,7 @@ def _measure_way(times_s: Array, both: tuple[Array, ...]) -> float:
 
 def _list_epochs(
     log: NavigationLog, places: Array, ground: Callable[[Array, Array], Array], at_s: Array
-) -> tuple[NDArray[np.int64], Array]:
+) -> tuple[Ints, Array]:
     """Return the IMU samples (E,) nearest to fixes and to `at_s`, and the fixes (E, 5), NaN where there are none.
 
     A fix is x, y, z, how long after the sample it is, and the height of the ground there. places: (M, 3) of all fixes.
@@ -146,7 +141,7 @@ def _list_epochs(
     return epochs, fixes
 
 
-def _nearest(times_s: Array, at_s: Array) -> NDArray[np.int64]:
+def _nearest(times_s: Array, at_s: Array) -> Ints:
     """Return the index of the sample nearest to each of `at_s`."""
     after = np.clip(np.searchsorted(times_s, at_s), 1, len(times_s) - 1)
     return after - (at_s - times_s[after - 1] < times_s[after] - at_s)
@@ -185,7 +180,7 @@ def _begin(log: NavigationLog, places: Array, lever: Array) -> tuple[Array, Arra
     return places[first] - (0, 0, lever[2]), velocity, np.diag(np.concatenate(deviations) ** 2)
 
 
-def _find_rest(log: NavigationLog, inertia: Array, epochs: NDArray[np.int64]) -> NDArray[np.bool_]:
+def _find_rest(log: NavigationLog, inertia: Array, epochs: Ints) -> Mask:
     """Return (E,) whether the IMU varies no more around an epoch than by its white noise."""
     aside = max(round(QUIET_S * log.unit.rate_hz), 2)
     around = np.clip(epochs[:, None] + np.arange(-aside, aside + 1), 0, len(inertia) - 1)
@@ -210,14 +205,17 @@ def _exp(v):
 
 
 @compiled
-def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, velocity, turn, covariance):
+def _filter(times_s, inertia, measured, levers, sigmas, begin):
     """Return the updated and the predicted states (2, E, ...), transitions between epochs, and how well all this fits.
 
-    fixes: (E, 5), see `estimate_drive`. rest: (E,). levers: (2, 3) of antenna and vehicle's origin from the IMU,
-    vehicle's axes. sigmas: see `_sigmas`. How well: normalised squared innovations (E,) of fixes, and the logarithm of
-    the likelihood of all measurements but rest, which each nominal state assumes at times of its own.
+    measured: epochs (E,), fixes (E, 5), see `_list_epochs`, and whether at rest (E,). levers: (2, 3) of antenna and
+    vehicle's origin from the IMU, vehicle's axes. sigmas: see `_sigmas`. begin: position, velocity, turn, covariance.
+    How well: normalised squared innovations (E,) of fixes, and the logarithm of the likelihood of all measurements but
+    rest, which each nominal state assumes at times of its own.
     """
-    count, bias, p, likelihood = len(epochs), np.zeros(9), covariance, 0.0
+    epochs, fixes, rest = measured
+    position, velocity, turn, p = begin
+    count, bias, likelihood = len(epochs), np.zeros(9), 0.0
     positions, velocities, turns = np.zeros((2, count, 3)), np.zeros((2, count, 3)), np.zeros((2, count, 3, 3))
     biases, covariances = np.zeros((2, count, 9)), np.zeros((2, count, STATES, STATES))
     transition, misfit = np.zeros((count, STATES, STATES)), np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
@@ -236,9 +234,8 @@ def _filter(times_s, inertia, epochs, fixes, rest, levers, sigmas, position, vel
         transition[e], covariances[1, e] = phi, p
         positions[1, e], velocities[1, e], turns[1, e], biases[1, e] = position, velocity, turn, bias
 
-        h, r, noise, common = _measure(
-            position, velocity, turn, bias, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas
-        )
+        state = (position, velocity, turn, bias)
+        h, r, noise, common = _measure(state, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas)
         off = np.zeros(STATES)
         for i in range(len(r)):  # one after another, since their noise is independent
             seen = p @ h[i]
@@ -276,12 +273,13 @@ def _transit(turn, bias, sample, dt, sigmas):
 
 
 @compiled
-def _measure(position, velocity, turn, bias, sample, fix, rests, levers, sigmas):
+def _measure(state, sample, fix, rests, levers, sigmas):
     """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements.
 
     They are across and upwards velocity, before them the fix and the height of the ground where there are any, after
     them velocity and angular rate at rest; also the number of those before the latter. sample: (3,) angular rate.
     """
+    position, velocity, turn, bias = state
     h, r, noise, rows = np.zeros((12, STATES)), np.zeros(12), np.zeros(12), 0
     rate, back = sample - bias[3:6], turn.T @ velocity
     if np.isfinite(fix[0]):
@@ -359,7 +357,7 @@ def _log(turn: Array) -> Array:
     return cross * (angle / sine if sine > 1e-9 else 1.0)
 
 
-def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> Estimate:
+def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> MotionEstimate:
     """Return the poses of the vehicle's origin, `lever` from the IMU, so long after each state (T,)."""
     count = len(after_s)
     poses, covariance = np.zeros((count, 4, 4)), np.zeros((count, 6, 6))
@@ -370,4 +368,4 @@ def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> Esti
         jacobian = np.zeros((6, STATES))
         jacobian[:3, :3], jacobian[:3, 6:9], jacobian[3:, 6:9] = np.eye(3), -turn @ _skew(lever), np.eye(3)
         covariance[i] = jacobian @ state.covariance[i] @ jacobian.T
-    return Estimate(poses, covariance)
+    return MotionEstimate(poses, covariance)

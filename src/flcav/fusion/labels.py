@@ -15,9 +15,10 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, find_free_cells
 from flcav.geometry import Boxes, concatenate, inverse, points_in_boxes, transform_points
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
@@ -46,12 +47,12 @@ def label_sample(
     """
     world_from_lidar = frame.world_from_sensor(lidar)
     points = crop_to_range(frame.lidar[lidar], config)
-    told = concatenate([view.boxes for view in views])
-    told = told[_distinct(told)].transform(inverse(world_from_lidar))
-    label = detection_labels(told.label, config.classes)
-    road = Boxes(told.center, told.size, told.yaw, label)
-    targets = (label != "") & (points_in_boxes(points, told, margin_m=0.1).sum(axis=1) > 0)
-    ignored = ((label != "") & ~targets) | is_lookalike(told.label, config.classes)
+    roadside = concatenate([view.boxes for view in views])
+    roadside = roadside[_distinct(roadside)].transform(inverse(world_from_lidar))
+    label = detection_labels(roadside.label, config.classes)
+    road = Boxes(roadside.center, roadside.size, roadside.yaw, label)
+    targets = (label != "") & (points_in_boxes(points, roadside, margin_m=0.1).sum(axis=1) > 0)
+    ignored = ((label != "") & ~targets) | is_lookalike(roadside.label, config.classes)
 
     cells = cell_centers(config)
     height = float(frame.agent_from_sensor[lidar][2, 3])
@@ -59,7 +60,7 @@ def label_sample(
     looked = np.zeros(len(cells), dtype=bool)
     for view in views:
         looked |= view.at(view.ground, cells_world) | view.at(view.occupied, cells_world)
-    own = detections[~_contradicted(detections, told, cells, looked)]
+    own = detections[~_contradicted(detections, roadside, cells, looked)]
     above = points[:, 2] + height
     if relief is not None:
         above = relief.above(transform_points(world_from_lidar, points[:, :3].astype(np.float64)))
@@ -86,14 +87,14 @@ def label_by_tracks(
     """
     assert tracks.score is not None
     points = crop_to_range(frame.lidar[lidar], config)
-    told = concatenate([view.boxes for view in views]).transform(inverse(frame.world_from_sensor(lidar)))
+    roadside = concatenate([view.boxes for view in views]).transform(inverse(frame.world_from_sensor(lidar)))
     targets = (tracks.score >= threshold) & (points_in_boxes(points, tracks, margin_m=0.1).sum(axis=1) > 0)
     boxes = replace(tracks, score=None, variance=None)
-    ignored = concatenate([boxes[~targets], told[is_lookalike(told.label, config.classes)]])
+    ignored = concatenate([boxes[~targets], roadside[is_lookalike(roadside.label, config.classes)]])
     return move_sample(Sample(points, boxes[targets], ignored), network_from_lidar(frame, config, lidar))
 
 
-def _distinct(boxes: Boxes) -> NDArray[np.int64]:
+def _distinct(boxes: Boxes) -> Ints:
     """Return the indices of boxes that are no duplicates of an earlier one: two poles may label the same car."""
     kept: list[int] = []
     for i, center in enumerate(boxes.center):
@@ -102,28 +103,28 @@ def _distinct(boxes: Boxes) -> NDArray[np.int64]:
     return np.array(kept, dtype=np.int64)
 
 
-def cell_centers(config: SecondConfig) -> NDArray[np.float64]:
+def cell_centers(config: SecondConfig) -> Array:
     """Return the centres (K, 2) of the cells of `CELL_M` over the detector's range, x first, LiDAR frame [m]."""
     x0, y0, _, x1, y1, _ = config.range_m
     x, y = np.arange(x0 + CELL_M / 2, x1, CELL_M), np.arange(y0 + CELL_M / 2, y1, CELL_M)
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
-def _contradicted(detections: Boxes, told: Boxes, cells: NDArray, looked: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _contradicted(detections: Boxes, roadside: Boxes, cells: NDArray, looked: Mask) -> Mask:
     """Return (N,): whether the road labelled an object at a detection's place, or observed the place.
 
-    `told` are the roadside boxes, `cells` (K, 2) cell centres, both in the LiDAR frame; `looked` (K,) says which cells
-    the roadside sensors observed.
+    `roadside` are the boxes of roadside sensors, `cells` (K, 2) cell centres, both in the LiDAR frame; `looked` (K,)
+    says which cells these sensors observed.
     """
     flat = [1.0, 1.0, 0.0]
     footprints = Boxes(detections.center * flat, detections.size * flat + [0, 0, 1], detections.yaw, detections.label)
     inside = points_in_boxes(np.c_[cells, np.zeros(len(cells))], footprints)
     seen = (inside & looked).sum(axis=1) > CONTRADICTED * np.maximum(inside.sum(axis=1), 1)
-    offset = np.linalg.norm(detections.center[:, None, :2] - told.center[None, :, :2], axis=-1)
-    return seen | (offset < told.size[None, :, 0] / 2).any(axis=1)
+    offset = np.linalg.norm(detections.center[:, None, :2] - roadside.center[None, :, :2], axis=-1)
+    return seen | (offset < roadside.size[None, :, 0] / 2).any(axis=1)
 
 
-def _free_ground(points: NDArray[np.float32], above: NDArray, cells: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _free_ground(points: Array32, above: NDArray, cells: Array) -> Mask:
     """Return (K,): whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
     `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `above` (N,) are the points' heights over the
@@ -135,7 +136,7 @@ def _free_ground(points: NDArray[np.float32], above: NDArray, cells: NDArray[np.
     inside = ((index >= 0) & (index < shape)).all(axis=1)
     index, z = index[inside], above[inside]
 
-    def hit(returns: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    def hit(returns: Mask) -> Mask:
         grid = np.zeros(shape, dtype=bool)
         grid[index[returns, 0], index[returns, 1]] = True
         return grid

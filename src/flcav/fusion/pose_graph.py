@@ -1,26 +1,30 @@
 """Poses and clocks of vehicles corrected by a pose graph over shared objects and landmarks (GTSAM, extra `fusion`).
 
-Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the objects that agents told of. Factors are the
-vehicles' own navigation, boxes as poses of objects seen from vehicles and from road sensors, whose poses are surveyed,
-and posts segmented from LiDAR as points that the map knows (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE ITS
-Magazine 2(4), 2010). The Huber kernel bounds the weight of wrong associations. Before, clocks are set (`clocks.py`).
+Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the objects that agents reported. Factors are the
+vehicles' navigation, boxes as poses of objects seen from vehicles and from road sensors, whose poses are surveyed, and
+posts segmented from LiDAR as points that the map knows (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE ITS
+Magazine 2(4), 2010). A post is a thin upright column of returns with nothing beside it: a lamp, the mast of a sensor or
+a signal, the post of a sign. The Huber kernel bounds the weight of wrong associations.
+
+Clocks are set before. A vehicle whose clock is fast reports a moving object where it was a little earlier than the time
+that it states. Road sensors, whose clocks are exact, see many of the same objects and the vehicle itself; the offset is
+the one at which both agree, by the likelihood over a grid of offsets with a share of outliers. Only moving objects
+determine it.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from scipy.ndimage import label
 
+from flcav.arrays import Array, Array32
 from flcav.config import InputError
-from flcav.fusion.average import YAW, RoadAverage, average_boxes, variance_of
-from flcav.fusion.clocks import set_clocks
-from flcav.fusion.sightings import Navigation, Sighting, tell
+from flcav.fusion.average import YAW, Navigation, RoadAverage, Sighting, average_boxes, report_boxes, variance_of
 from flcav.geometry import pose, transform_points, wrap_angle, yaw_of
 from flcav.interface.wording import format_install_command
-
-Array = NDArray[np.float64]
+from flcav.world.map.town import Town
 
 POST_M = 0.15  # standard deviation of a post's foot
 POST_GATE_M = 1.5  # farthest a post may lie from its place on the map, beside the error of the pose
@@ -37,7 +41,7 @@ def correct_poses(sightings: Sequence[Sighting], posts: Array, at_s: float) -> l
     corrected = list(sightings)
     for _ in range(PASSES):
         corrected = set_clocks(corrected, at_s)
-        found = average_boxes([tell(each) for each in corrected], at_s)
+        found = average_boxes([report_boxes(each) for each in corrected], at_s)
         corrected = _optimise(sightings, corrected, found, posts)
     return corrected
 
@@ -63,19 +67,19 @@ def _optimise(
         key = gtsam.symbol("o", number)
         start.insert(key, gtsam.Pose2(*seen[0].place))
         for each in seen:
-            told = latest[each.sighting]
-            if told.navigation is None:
+            reported = latest[each.sighting]
+            if reported.navigation is None:
                 graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(*each.place), noise(each.variance)))
             else:
-                own = planar(told.world_from_agent).between(gtsam.Pose2(*each.place))
+                own = planar(reported.world_from_agent).between(gtsam.Pose2(*each.place))
                 vehicle = gtsam.symbol("v", each.sighting)
                 graph.add(gtsam.BetweenFactorPose2(vehicle, key, own, noise(each.variance)))
     landmarks = 0
-    for number, (first, told) in enumerate(zip(stated, latest, strict=True)):
-        if told.navigation is None or first.navigation is None:
+    for number, (first, reported) in enumerate(zip(stated, latest, strict=True)):
+        if reported.navigation is None or first.navigation is None:
             continue
         key = gtsam.symbol("v", number)
-        start.insert(key, planar(told.world_from_agent))
+        start.insert(key, planar(reported.world_from_agent))
         known = first.navigation
         sigmas = np.array((known.position_m, known.position_m, known.heading_rad))
         graph.add(
@@ -83,7 +87,7 @@ def _optimise(
                 key, planar(first.world_from_agent), gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, 1e-3))
             )
         )
-        for own, place in match_posts(told, posts):
+        for own, place in match_posts(reported, posts):
             point = gtsam.symbol("l", landmarks)
             landmarks += 1
             start.insert(point, place)
@@ -94,23 +98,25 @@ def _optimise(
     best = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
     marginals = gtsam.Marginals(graph, best)
 
-    def moved(number: int, told: Sighting) -> Sighting:
-        if told.navigation is None:
-            return told
+    def moved(number: int, reported: Sighting) -> Sighting:
+        if reported.navigation is None:
+            return reported
         at = best.atPose2(gtsam.symbol("v", number))
         x, y, yaw = np.diag(marginals.marginalCovariance(gtsam.symbol("v", number)))
         known = Navigation(float(np.sqrt((x + y) / 2)), float(np.sqrt(yaw)))
-        corrected = pose(at.x(), at.y(), float(told.world_from_agent[2, 3]), at.theta())
-        return replace(told, world_from_agent=corrected, navigation=known)
+        corrected = pose(at.x(), at.y(), float(reported.world_from_agent[2, 3]), at.theta())
+        return replace(reported, world_from_agent=corrected, navigation=known)
 
-    return [moved(number, told) for number, told in enumerate(latest)]
+    return [moved(number, reported) for number, reported in enumerate(latest)]
 
 
-def match_posts(told: Sighting, posts: Array) -> list[tuple[Array, Array]]:
+def match_posts(reported: Sighting, posts: Array) -> list[tuple[Array, Array]]:
     """Return pairs of a post as observed (2,), agent's frame, and on the map (2,), each used once, nearest first."""
-    if not len(told.posts) or not len(posts):
+    if not len(reported.posts) or not len(posts):
         return []
-    feet = transform_points(told.world_from_agent, np.column_stack((told.posts, np.zeros(len(told.posts)))))[:, :2]
+    feet = transform_points(
+        reported.world_from_agent, np.column_stack((reported.posts, np.zeros(len(reported.posts))))
+    )[:, :2]
     apart = np.linalg.norm(feet[:, None] - posts[None], axis=2)
     pairs: list[tuple[Array, Array]] = []
     for flat in np.argsort(apart, axis=None):
@@ -118,7 +124,7 @@ def match_posts(told: Sighting, posts: Array) -> list[tuple[Array, Array]]:
         if apart[foot, place] > POST_GATE_M:
             break
         apart[foot, :], apart[:, place] = np.inf, np.inf
-        pairs.append((told.posts[foot], posts[place]))
+        pairs.append((reported.posts[foot], posts[place]))
     return pairs
 
 
@@ -131,7 +137,7 @@ class _Seen(NamedTuple):
 
 
 def _share_objects(sightings: Sequence[Sighting], found: RoadAverage) -> list[list[_Seen]]:
-    """Return the objects that several agents tell of at about one instant, each as these agents saw it.
+    """Return the objects that several agents report at about one instant, each as these agents saw it.
 
     The instants are those of the road sensors, or of all agents where there are none. A box is moved to the nearest
     instant by its object's velocity, and turned by 180 degrees where it faces against the object.
@@ -139,12 +145,12 @@ def _share_objects(sightings: Sequence[Sighting], found: RoadAverage) -> list[li
     surveyed = [each.time_s for each in sightings if each.navigation is None]
     instants = np.unique(np.round(surveyed or [each.time_s for each in sightings], 3))
     seen: dict[tuple[int, int], list[_Seen]] = {}
-    for sighting, (told, member) in enumerate(zip(sightings, found.member, strict=True)):
-        instant = int(np.abs(instants - told.time_s).argmin())
-        rows, variance = told.boxes.transform(told.world_from_agent).array(), variance_of(told.boxes)
+    for sighting, (reported, member) in enumerate(zip(sightings, found.member, strict=True)):
+        instant = int(np.abs(instants - reported.time_s).argmin())
+        rows, variance = reported.boxes.transform(reported.world_from_agent).array(), variance_of(reported.boxes)
         for box, number in enumerate(member.tolist()):
             place = rows[box, [0, 1, YAW]]
-            place[:2] += found.velocity[number] * (instants[instant] - told.time_s)
+            place[:2] += found.velocity[number] * (instants[instant] - reported.time_s)
             if np.cos(place[2] - found.boxes.yaw[number]) < 0:
                 place[2] = wrap_angle(place[2] + np.pi)
             seen.setdefault((number, instant), []).append(_Seen(sighting, place, variance[box, [0, 1, YAW]]))
@@ -162,3 +168,131 @@ def _import_gtsam() -> Any:
     except ImportError:
         raise InputError(f"a pose graph needs GTSAM, which is in: {format_install_command('fusion')}") from None
     return gtsam
+
+
+CLOCK_S = 0.3  # standard deviation of an offset, before anything is seen
+OFFSETS_S: Array = np.linspace(-0.9, 0.9, 91)  # within three of these
+LEAST_SPEED_MPS = 2.0  # slower objects say little about clocks
+TRACE_M = 0.2  # standard deviation of a trace, and of a vehicle's origin from the middle of its body
+BEYOND_S = 0.6  # farthest a trace is continued before its first and after its last instant
+OUTLIERS = 0.05  # share of places that belong to no trace
+LEAST_EVIDENCE = 2.0  # log-likelihood that an offset has above none: two standard deviations
+
+
+@dataclass(frozen=True)
+class ObjectPath:
+    """The path of an object by road sensors alone."""
+
+    times_s: Array  # (T,) increasing, two or more
+    places: Array  # (T, 2) x, y, world frame [m]
+
+    def place_at(self, times_s: Array) -> Array:
+        """Return places (..., 2) at times (...): on straight lines between instants; infinite beyond `BEYOND_S`."""
+        known, at = self.times_s, np.asarray(times_s)
+        before = np.clip(np.searchsorted(known, at) - 1, 0, len(known) - 2)
+        share = (at - known[before]) / (known[before + 1] - known[before])
+        found = self.places[before] + (self.places[before + 1] - self.places[before]) * share[..., None]
+        found[(at < known[0] - BEYOND_S) | (at > known[-1] + BEYOND_S)] = np.inf
+        return found
+
+
+def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
+    """Return the sightings with the times of vehicles set to the clock of the road sensors, where these see them move.
+
+    at_s: time at which objects of different spins are associated [s]. Offsets that explain no more than none, by
+    `LEAST_EVIDENCE`, are left.
+    """
+    traces = trace_objects([each for each in sightings if each.navigation is None], at_s)
+    offset = {
+        agent: estimate_offset([each for each in sightings if each.agent == agent], traces)
+        for agent in {each.agent for each in sightings if each.navigation is not None}
+    }
+    return [replace(each, time_s=each.time_s - offset.get(each.agent, 0.0)) for each in sightings]
+
+
+def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[ObjectPath]:
+    """Return the paths of moving objects that road sensors report at two instants or more."""
+    found: dict[int, dict[float, list[tuple[Array, float]]]] = {}
+    reported = [report_boxes(each) for each in surveyed]
+    for each, member in zip(reported, average_boxes(reported, at_s).member, strict=True):
+        certain = 1 / variance_of(each.boxes)[:, :2].mean(axis=1)
+        for number, place, weight in zip(member.tolist(), each.boxes.center[:, :2], certain.tolist(), strict=True):
+            found.setdefault(number, {}).setdefault(round(each.time_s, 3), []).append((place, weight))
+    traces = []
+    for seen in found.values():
+        times = np.array(sorted(seen))
+        places = np.array([_average(seen[time]) for time in times.tolist()])
+        if len(times) > 1 and np.linalg.norm(places[-1] - places[0]) >= LEAST_SPEED_MPS * (times[-1] - times[0]):
+            traces.append(ObjectPath(times, places))
+    return traces
+
+
+def _average(seen: Sequence[tuple[Array, float]]) -> Array:
+    """Return the mean (2,) of places by their weights."""
+    places, weights = (np.array(column) for column in zip(*seen, strict=True))
+    return weights @ places / weights.sum()
+
+
+def estimate_offset(own: Sequence[Sighting], traces: Sequence[ObjectPath]) -> float:
+    """Return by how much a vehicle's clock is fast [s]; 0 where `traces` do not determine it.
+
+    own: what the vehicle reports, with its poses.
+    """
+    if not traces:
+        return 0.0
+    evidence = -0.5 * (OFFSETS_S / CLOCK_S) ** 2
+    for each in own:
+        assert each.navigation is not None
+        boxes = report_boxes(each).boxes
+        places = np.vstack((boxes.center[:, :2], each.world_from_agent[:2, 3]))
+        variance = np.append(variance_of(boxes)[:, :2].mean(axis=1), each.navigation.position_m**2) + TRACE_M**2
+        weight = np.append(np.ones(len(boxes)) if boxes.score is None else boxes.score, 1.0)
+        expected = np.stack([trace.place_at(each.time_s - OFFSETS_S) for trace in traces])
+        apart = np.linalg.norm(places[:, None, None] - expected[None], axis=3).min(axis=1)  # (places, offsets)
+        evidence += weight @ np.log(OUTLIERS + np.exp(-0.5 * apart**2 / variance[:, None]))
+    best = int(evidence.argmax())
+    return float(OFFSETS_S[best]) if evidence[best] - evidence[len(OFFSETS_S) // 2] > LEAST_EVIDENCE else 0.0
+
+
+CELL_M = 0.2  # edge of a cell of the bird's-eye grid
+BAND_M = (0.5, 2.2)  # heights above the road in which posts are looked for: above kerbs, below the plates of signs
+LEAST_M = 0.9  # least height of a column of returns
+WIDEST_M = 0.45  # largest extent of a post along x and along y
+REACH_M = 40.0  # farther posts have too few returns
+LEAST_RETURNS = 4
+
+
+def segment_posts(points: Array32, height_m: float) -> Array:
+    """Return the feet (L, 2) x, y [m] of the posts in a sweep (N, >= 3), in the frame of the points.
+
+    height_m: of the frame's origin above the road. Columns touch where their cells do, also at corners.
+    """
+    z = points[:, 2] + height_m
+    near = (z > BAND_M[0]) & (z < BAND_M[1]) & (np.abs(points[:, :2]) < REACH_M).all(axis=1)
+    xy, z = points[near, :2].astype(np.float64), z[near].astype(np.float64)
+    cells = round(2 * REACH_M / CELL_M)
+    at = np.minimum(((xy + REACH_M) / CELL_M).astype(np.int64), cells - 1)
+    grid = np.zeros((cells, cells), dtype=bool)
+    grid[at[:, 0], at[:, 1]] = True
+    columns = np.zeros(grid.shape, dtype=np.int64)
+    count = int(label(grid, np.ones((3, 3)), output=columns))  # pyright: ignore[reportArgumentType]
+    number = columns[at[:, 0], at[:, 1]] - 1
+    returns = np.bincount(number, minlength=count)
+
+    def extent(values: Array) -> tuple[Array, Array]:
+        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        np.minimum.at(low, number, values)
+        np.maximum.at(high, number, values)
+        return low, high
+
+    (low_x, high_x), (low_y, high_y), (low_z, high_z) = (extent(values) for values in (xy[:, 0], xy[:, 1], z))
+    thin = (high_x - low_x <= WIDEST_M) & (high_y - low_y <= WIDEST_M)
+    posts = (returns >= LEAST_RETURNS) & thin & (high_z - low_z >= LEAST_M)
+    return np.column_stack(((low_x + high_x) / 2, (low_y + high_y) / 2))[posts]
+
+
+def posts_of(town: Town) -> Array:
+    """Return the feet (P, 2) x, y [m] of the posts on a town's map: lamps, masts of sensors and signals, sign posts."""
+    parts = (town.lamps[:, :2], town.poles.position[:, :2], town.signs.position[:, :2], town.signals.foot)
+    feet = np.concatenate([part.reshape(-1, 2) for part in parts])
+    return np.unique(feet, axis=0)

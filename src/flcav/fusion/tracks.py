@@ -12,12 +12,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
 from flcav.geometry import Boxes, concatenate, heading_vectors
-
-Array = NDArray[np.float64]
 
 LEAST_SCORE = 0.1  # of a track
 VEHICLE_M = 2.0  # length from which an object is fitted: those on foot and on two wheels bend
@@ -40,7 +38,7 @@ LENGTH_M = 2.35, 1.4  # length of a vehicle by its height: a hatchback of 1.46 m
 
 
 @dataclass(frozen=True)
-class Sweep:
+class VehicleSweep:
     """One LiDAR spin of a vehicle, by the pose that its navigation gives; world frame."""
 
     time_s: float
@@ -49,7 +47,9 @@ class Sweep:
     origin: Array  # (3,) of the LiDAR [m]
 
 
-def track_objects(sweeps: Sequence[Sweep], at_s: float, others: Sequence[BoxReport] = (), least: float = 0.0) -> Boxes:
+def track_objects(
+    sweeps: Sequence[VehicleSweep], at_s: float, others: Sequence[BoxReport] = (), least: float = 0.0
+) -> Boxes:
     """Return the objects at `at_s` [s] of a vehicle's sweeps around it, world frame.
 
     An object's score is its mean over the sweeps, zero in those without a detection of it; with boxes of `others`, such
@@ -73,7 +73,7 @@ def track_objects(sweeps: Sequence[Sweep], at_s: float, others: Sequence[BoxRepo
     return Boxes.from_array(rows, boxes.label, score)
 
 
-def _average_feet(sweeps: Sequence[Sweep], average: RoadAverage) -> Array:
+def _average_feet(sweeps: Sequence[VehicleSweep], average: RoadAverage) -> Array:
     """Return the mean height (K,) of the undersides that the vehicle itself saw of each object [m]; NaN where none."""
     of = np.concatenate([np.zeros(0, np.int64), *average.member[: len(sweeps)]])
     boxes = concatenate([each.boxes for each in sweeps])
@@ -82,7 +82,7 @@ def _average_feet(sweeps: Sequence[Sweep], average: RoadAverage) -> Array:
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 
-def gather_returns(box: Array, velocity: Array, sweeps: Sequence[Sweep], at_s: float) -> tuple[Array, Array]:
+def gather_returns(box: Array, velocity: Array, sweeps: Sequence[VehicleSweep], at_s: float) -> tuple[Array, Array]:
     """Return the returns (N, 3) around an object in all sweeps, and the nearest place (3,) that it was seen from.
 
     Both are x, y from the object's centre and height above its underside [m], along the axes of the world. box: (7,) at

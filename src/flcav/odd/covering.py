@@ -14,8 +14,8 @@ from flcav.odd.domain import Domain
 from flcav.odd.measure import measure
 from flcav.perception.agents import choose_frames
 from flcav.perception.networks import resolve_network
+from flcav.perception.objects.evaluate import join_outcomes
 from flcav.perception.objects.model import Second
-from flcav.perception.objects.outcomes import join_outcomes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes
 from flcav.storage.files import write_json

@@ -13,9 +13,9 @@ import numpy as np
 from flcav.odd.cells import PATH_AHEAD_M, PATH_ASIDE_M, locate_failure
 from flcav.odd.measure import AROUND_M, PARKED
 from flcav.odd.sampling import Sample
-from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.task import find_errors
 from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.storage.records import Record

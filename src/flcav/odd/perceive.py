@@ -17,13 +17,13 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.odd.domain import Domain
 from flcav.odd.measure import AROUND_M, Measurements, describe_weather, measure
 from flcav.odd.scenery import Column
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in, look_around
 from flcav.perception.objects.truth import choose_lidar
-from flcav.perception.tracking.tracker import Tracked, Tracker
+from flcav.perception.tracking import Tracked, Tracker
+from flcav.perception.weather.evaluate import predict_probabilities
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.predict import predict_probabilities
 from flcav.perception.weather.samples import reduce_picture
 from flcav.world.weather import WEATHER_CLASSES, Weather
 

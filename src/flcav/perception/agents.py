@@ -1,13 +1,21 @@
-"""Selection of a dataset's frames by agent: all, vehicles, poles (roadside units), or agents by name."""
+"""Frames of a dataset by agent, and as a network sees them.
+
+Frames are selected by agent: all, vehicles, poles (roadside units), or agents by name. Of a roadside LiDAR some
+networks see only the returns in front of the static background, which is learned from the pole's own sweeps of the same
+dataset.
+"""
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 from flcav.config import InputError, Json
 from flcav.dataset.ground import POLE
 from flcav.dataset.store import Dataset
 from flcav.perception.task import ConfigT, KnownLidar, KnowsRig, NetworkT, RigBound, SampleT, Task
+from flcav.sensors.frame import Frame
+from flcav.sensors.lidar.background import Background, learn_background
 
 
 @dataclass(frozen=True)
@@ -76,3 +84,35 @@ def _agents(data: Dataset, wanted: str) -> set[str]:
 def _frames(counts: Mapping[str, int]) -> str:
     noun = "frame" if sum(counts.values()) == 1 else "frames"
     return f"{' and '.join(f'{count} {kind}' for kind, count in counts.items())} {noun}"
+
+
+MOST_SWEEPS = 100  # of each pole, evenly spread over the dataset, that its background is learned from
+
+
+def frame_reader(data: Dataset, foreground: bool) -> Callable[[int], Frame]:
+    """Return the function that reads a frame by its number as a network sees it.
+
+    For a network of foregrounds (`foreground`), the sweeps of poles lack their background; other agents' are whole.
+    """
+    if not foreground:
+        return data.frame
+
+    def read(number: int) -> Frame:
+        frame = data.frame(number)
+        if kind_of(frame.agent) != POLE:
+            return frame
+        behind = pole_backgrounds(data, frame.agent)
+        return replace(
+            frame, lidar={name: points[behind[name].in_front(points)] for name, points in frame.lidar.items()}
+        )
+
+    return read
+
+
+@lru_cache(maxsize=64)
+def pole_backgrounds(data: Dataset, pole: str) -> dict[str, Background]:
+    """Return the background of each LiDAR of a pole, by the LiDAR's name, learned from its sweeps in `data`."""
+    numbers = data.select(agents={pole})
+    sweeps = [data.frame(number).lidar for number in numbers[:: -(-len(numbers) // MOST_SWEEPS)]]
+    names = sorted({name for sweep in sweeps for name in sweep})
+    return {name: learn_background(sweep[name] for sweep in sweeps if name in sweep) for name in names}

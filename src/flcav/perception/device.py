@@ -1,9 +1,11 @@
-"""Choice of the compute device, and bfloat16 autocast where the hardware supports it."""
+"""Compute device of a network, bfloat16 autocast where the hardware supports it, and inference mode."""
 
 import platform
-from contextlib import AbstractContextManager, nullcontext
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 import torch
+from torch import nn
 
 from flcav.config import InputError
 
@@ -52,3 +54,13 @@ def multiplies_bfloat16(device: torch.device) -> bool:
     if device.type == "cuda":
         return torch.cuda.is_bf16_supported(including_emulation=False)
     return device.type == "cpu" and torch.cpu._is_avx512_bf16_supported()
+
+
+@contextmanager
+def inference(network: nn.Module) -> Iterator[None]:
+    """Compute without gradients, with `network` in evaluation mode; its training mode is restored at the end."""
+    training = network.training
+    network.eval()
+    with torch.inference_mode():
+        yield
+    network.train(training)

@@ -1,7 +1,7 @@
 """The error registry: a network's mistakes with their positions in a town, each registered once.
 
-Sensors are placed by it. The `errors.py` of each task defines what a mistake is; this module holds the records, removes
-duplicates, and reads and writes files.
+Sensors are placed by it. Each task's `register_errors` defines what a mistake is; this module holds the records,
+removes duplicates, and reads and writes files.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -14,6 +14,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Words
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
@@ -78,17 +79,17 @@ class Registry:
         return iter(self.errors)
 
     @property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Array:
         """Return the positions of the mistakes, (N, 3) x, y, z in the world [m]."""
         return np.array([(error.x, error.y, error.z) for error in self.errors]).reshape(-1, 3)
 
     @property
-    def weights(self) -> NDArray[np.float64]:
+    def weights(self) -> Array:
         """Return the gain of covering each mistake, (N,)."""
         return np.array([error.weight for error in self.errors], np.float64)
 
     @property
-    def kinds(self) -> NDArray[np.str_]:
+    def kinds(self) -> Words:
         """Return the kind of each mistake, (N,): miss, false_positive or final_error."""
         return np.array([error.kind for error in self.errors], np.str_)
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageEnhance, UnidentifiedImageError
 
+from flcav.arrays import Array, Bytes, Mask
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, read_calibration
 from flcav.dataset.layout import MANIFEST
@@ -24,9 +25,7 @@ from flcav.network.ledger import from_names, to_names
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import project_points
 
-Picture = NDArray[np.uint8]  # (H, W, 3) sRGB
-Array = NDArray[np.float64]
-
+Picture = Bytes  # (H, W, 3) sRGB
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 SMALLEST_PX, LARGEST_PX = 32, 8192  # bounds of an image's width and height
 LEAST_AHEAD = 0.5  # least cosine of the angle between the camera's optical axis and the LiDAR's x axis
@@ -68,14 +67,14 @@ def read_recorded(data: Dataset, frames: Sequence[int] | None = None) -> Iterato
         raise InputError(f"{data.folder}: no camera pictures in its frames; record it with cameras")
 
 
-def pack_pictures(data: Dataset, number: int) -> dict[str, NDArray[np.uint8]]:
+def pack_pictures(data: Dataset, number: int) -> dict[str, Bytes]:
     """Return the image files of a frame, as recorded, and the names of its cameras as arrays of a message."""
     files = {f"picture.{camera}": data.plane_path(number, camera, "rgb") for camera in data.cameras(number)}
     arrays = {name: np.frombuffer(path.read_bytes(), dtype=np.uint8) for name, path in files.items()}
     return {"cameras": from_names(data.cameras(number)), **arrays}
 
 
-def unpack_pictures(arrays: Mapping[str, NDArray[np.uint8]]) -> dict[str, Picture]:
+def unpack_pictures(arrays: Mapping[str, Bytes]) -> dict[str, Picture]:
     """Return the images in the arrays of a message by camera: the inverse of `pack_pictures`."""
     cameras = to_names(arrays["cameras"]).tolist()
     files = {each: open_image(io.BytesIO(arrays[f"picture.{each}"].tobytes())) for each in cameras}
@@ -97,7 +96,7 @@ def read_picture(path: Path) -> Picture:
     return check_picture(pixels, path)
 
 
-def check_picture(pixels: NDArray[np.uint8], origin: str | Path) -> Picture:
+def check_picture(pixels: Bytes, origin: str | Path) -> Picture:
     """Return the image as it is; raises `InputError` unless it is (H, W, 3) with sides of 32 to 8192 pixels."""
     if pixels.ndim != 3 or pixels.shape[2] != 3:
         raise InputError(f"{origin}: a picture of shape {pixels.shape}; (H, W, 3) red, green, blue is wanted")
@@ -140,7 +139,7 @@ class CameraView:
         near = np.all((straight > -BESIDE * size) & (straight < (1 + BESIDE) * size), axis=1)
         return project_points(self.intrinsics, self.distortion, np.where(near[:, None], seen, np.nan))
 
-    def shows(self, points: NDArray) -> NDArray[np.bool_]:
+    def shows(self, points: NDArray) -> Mask:
         """Return (N,) whether each point (N, 3) [m] projects into the image; occlusion is not considered."""
         pixels = self.project(points) + 0.5
         return np.all((pixels >= 0) & (pixels < self.picture.shape[1::-1]), axis=1)

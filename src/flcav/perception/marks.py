@@ -6,12 +6,8 @@ They are drawn on an image (H, W, 3), a point cloud (N, 4) or a bird's-eye map, 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import numpy as np
-from numpy.typing import NDArray
-
+from flcav.arrays import Array, Words
 from flcav.geometry import Boxes
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -32,7 +28,7 @@ class PictureBoxes:
     """Axis-aligned 2D boxes on an image."""
 
     box: Array  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner of the image
-    label: NDArray[np.str_]  # (N,) class names
+    label: Words  # (N,) class names
     score: Array  # (N,) in [0, 1]
 
     @property

@@ -18,7 +18,6 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, print_progress
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card, join_lidars, read_lidar
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti
@@ -29,9 +28,9 @@ from flcav.perception.objects.truth import narrow_range
 from flcav.perception.outcomes import NetworkComparison, as_measurable, compare_outcomes
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.tracking.evaluate import evaluate_tracks, group_sequences
-from flcav.perception.training.run import WEIGHTS, Request, train_network
-from flcav.perception.weights import find_shipped, load_network, read_card
+from flcav.perception.tracking import evaluate_tracks, group_sequences
+from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
+from flcav.perception.weights import Card, find_recorded_lidar, find_shipped, join_lidars, load_network, read_card
 
 Named = str | Task
 Data = Dataset | Path | str
@@ -116,7 +115,9 @@ def train(
     folders = data if isinstance(data, Sequence) and not isinstance(data, str) else [data]
     held = None if validation is None else open_data(validation)
     place = select_device(device)
-    request = Request([open_data(each) for each in folders], held, network, epochs, patience, seed, place, agents)
+    request = TrainingRequest(
+        [open_data(each) for each in folders], held, network, epochs, patience, seed, place, agents
+    )
     learned, weights = resolve_task(task), Path(out) / WEIGHTS
     card = train_network(learned, request, Path(out), progress)
     return TrainedNetwork(load_network(learned, weights).to(place), card, weights)
@@ -356,15 +357,10 @@ def _check_around(task: Task, around: bool) -> None:
 
 def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
     """Return the LiDARs that a network was trained with, by its card, as far as that says."""
-    if isinstance(network, nn.Module):
+    card = None if isinstance(network, nn.Module) else _find_card(Path(network or find_shipped(task)))
+    if card is None:
         return KnownLidar()
-    try:
-        card = read_card(Path(network or find_shipped(task)))
-    except DamagedFile:
-        raise
-    except InputError:
-        return KnownLidar()
-    return join_lidars([read_lidar(entry.recipe, entry.agents) for entry in card.data])
+    return join_lidars([find_recorded_lidar(entry.recipe, entry.agents) for entry in card.data])
 
 
 def threshold_of(task: Task, threshold: float | None) -> float:
@@ -392,10 +388,15 @@ def origin_of(task: Task, weights: Path | None) -> Origin:
     Raises `InputError` for None if the task has no weights in the package.
     """
     path = weights or find_shipped(task)
+    card = _find_card(path)
+    return Origin(None, None, str(path)) if card is None else Origin(card.network, card.seed, str(path))
+
+
+def _find_card(path: Path) -> Card | None:
+    """Return the card in a file of weights; None without one. Raises `DamagedFile` for a damaged file or card."""
     try:
-        card = read_card(path)
+        return read_card(path)
     except DamagedFile:
         raise
     except InputError:
-        return Origin(None, None, str(path))
-    return Origin(card.network, card.seed, str(path))
+        return None

@@ -1,7 +1,7 @@
 """Outcomes of a test, from which the task's measure and its bootstrap over scenes follow without the network.
 
 The bootstrap gives 95 % percentile intervals of the measure and of paired differences between two networks, see
-`flcav.statistics`. The `outcomes.py` of each task defines what is kept per unit (a frame, an image or a road user) and
+`flcav.statistics`. The `evaluate.py` of each task defines what is kept per unit (a frame, an image or a road user) and
 how the measure is computed from it.
 """
 
@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from torch import nn
 
+from flcav.arrays import Array, Ints, Words
 from flcav.config import InputError, check_is_file
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
@@ -30,15 +31,15 @@ from flcav.storage.files import atomic_path
 from flcav.storage.records import Record
 
 SCENE = "scene"
-Times = NDArray[np.int64]  # (n, N) how often each of N units is drawn in each of n bootstrap samples
-Values = NDArray[np.float64]  # (n,) measure of each bootstrap sample; NaN where it is undefined
+Times = Ints  # (n, N) how often each of N units is drawn in each of n bootstrap samples
+Values = Array  # (n,) measure of each bootstrap sample; NaN where it is undefined
 
 
 @dataclass(frozen=True)
 class Outcomes:
     """Outcomes of a network on N units: frames, images or road users, by task."""
 
-    scene: NDArray[np.str_]  # (N,) scene of each unit
+    scene: Words  # (N,) scene of each unit
     arrays: Mapping[str, NDArray]  # arrays by name, as the task defines them
 
     def save(self, path: Path) -> None:
@@ -262,7 +263,7 @@ def share_test_scenes(
     return share_scenes(measures, scenes, own.redraws, rng=stream(seed, "bootstrap"))
 
 
-def weighted_mean(values: NDArray[np.float64], times: Times) -> Values:
+def weighted_mean(values: Array, times: Times) -> Values:
     """Return (n,) means of values (N,) weighted by `times` (n, N); NaN where all weights are 0."""
     with np.errstate(invalid="ignore"):
         return times @ values / times.sum(axis=1)

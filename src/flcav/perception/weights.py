@@ -1,10 +1,15 @@
-"""Weights of networks as safetensors files, with configuration and model card as metadata, and as NumPy arrays."""
+"""Weights of networks as safetensors files, with configuration and model card as metadata, and as NumPy arrays.
+
+A model card says how a network was trained and evaluated (Mitchell et al., "Model Cards for Model Reporting", 2019).
+"""
 
 import json
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
@@ -14,10 +19,197 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import nn
 
-from flcav.config import DamagedFile, InputError, check_is_file
-from flcav.perception.card import CARD_KEY, Card
-from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
-from flcav.storage.files import write_bytes
+from flcav.config import Config, DamagedFile, InputError, Json, check_is_file
+from flcav.dataset.ground import POLE
+from flcav.dataset.layout import MANIFEST
+from flcav.dataset.store import Dataset
+from flcav.interface.wording import plural
+from flcav.perception.agents import FrameSelection, kind_of
+from flcav.perception.task import ConfigT, KnownLidar, NetworkT, SampleT, Task
+from flcav.sensors.rig import RIGS
+from flcav.sources.randomisation import DRAWN_BEAMS
+from flcav.storage.files import sha256, write_bytes
+from flcav.storage.markdown import format_bullets, format_table
+from flcav.storage.records import LEFT_OUT, Record
+
+CARD_KEY = "flcav.card"  # key of the card in the metadata of a safetensors file
+LICENCE = "Apache-2.0"
+RECIPE_FIELDS = (
+    "town",
+    "seed",
+    "split",
+    "scenes",
+    "warmup_s",
+    "spins_per_scene",
+    "every_s",
+    "cavs",
+    "poles",
+    "weather",
+    "randomise",
+    "beams",
+)
+FACTS = ("parameters", "seed", "samples", "licence", "flcav", "torch", "threads", "processor")
+RIG_FIELDS = ("vehicle_rig", "pole_rig")
+
+
+@dataclass(frozen=True)
+class TrainingProgress(Record):
+    """Steps, final loss and validation scores of a training."""
+
+    steps: int
+    loss: float  # mean over the last epoch
+    scores: tuple[float, ...] = ()  # on the validation data, after each epoch; empty without validation
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataEntry:
+    """Provenance of one dataset: name, frames and agents used, hash of the manifest, recipe."""
+
+    name: str  # the last two parts of the folder's path
+    frames: int  # number of frames used
+    agents: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose frames; None in older cards
+    manifest: str  # SHA-256 of the manifest
+    recipe: Mapping[str, Json]  # `RECIPE_FIELDS` of the recording's recipe, and the rigs that have a name
+
+
+class Card(Config):
+    """Model card of a file of weights, stored as JSON in the file's metadata and as Markdown beside the file."""
+
+    task: str
+    network: str  # name of the configuration
+    parameters: int
+    seed: int
+    samples: int
+    training: Mapping[str, Json]  # settings such as epochs and batch, and the fields of `TrainingProgress`
+    data: tuple[DataEntry, ...]  # training data, one entry per dataset
+    validation: DataEntry | None = None  # validation data; None without
+    metrics: Mapping[str, Json]  # evaluation on the validation data; empty without
+    licence: str = LICENCE
+    flcav: str = version("flcav")
+    torch: str | None = None  # version of torch; this and the next two are None in older cards
+    threads: int | None = None  # CPU threads of the training process
+    processor: str | None = None  # kind of processor, see `flcav.perception.device.processor_of`
+
+    @property
+    def learning(self) -> TrainingProgress:
+        """Return the record of the training; raises `InputError` if `training` lacks its fields."""
+        return TrainingProgress.from_json(self.training, f"card of {self.task}, {self.network}")
+
+    def markdown(self) -> str:
+        """Return the card as Markdown, numbers rounded to 4 decimals; the metadata keeps all digits."""
+        facts = {name: value for name in FACTS if (value := getattr(self, name)) is not None}
+        held = [] if self.validation is None else [format_bullets([_entry(self.validation)])]
+        blocks = [
+            f"# {self.task}: {self.network}",
+            f"A network for `flcav infer {self.task}`, trained on frames of simulated streets.",
+            *_blocks(facts),
+            "## Training",
+            *_blocks(self.training),
+            "## Data",
+            format_bullets(_entry(entry) for entry in self.data),
+            "## Validation",
+            *held,
+            *(_blocks(self.metrics) or ["- none"]),
+        ]
+        return "\n\n".join(blocks) + "\n"
+
+
+def data_entry(data: Dataset, chosen: FrameSelection) -> DataEntry:
+    """Return the card's entry of a dataset and the frames selected from it."""
+    recipe = data.manifest.recipe
+    rigs = {name: _rig_name(recipe[name]) for name in RIG_FIELDS if name in recipe}
+    return DataEntry(
+        name="/".join(data.folder.resolve().parts[-2:]),
+        frames=len(chosen.frames),
+        agents=tuple(chosen.agents),
+        manifest=sha256(data.folder / MANIFEST),
+        recipe={name: recipe[name] for name in RECIPE_FIELDS if name in recipe}
+        | {name: rig for name, rig in rigs.items() if rig is not None},
+    )
+
+
+def write_card(card: Card, path: Path) -> None:
+    """Write the card as Markdown, atomically."""
+    write_bytes(path, card.markdown().encode())
+
+
+def find_recorded_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None = None) -> KnownLidar:
+    """Return beams and range of the agents' first LiDAR by the recipe of a recording, or as an import knows them.
+
+    recipe: of a manifest, or of a card's entry, which names the rig. agents: whose LiDAR; that of the poles where all
+    are poles, else that of the vehicles. None where it does not say.
+    """
+    kinds = {kind_of(agent) for agent in agents or ()}
+    rig: Any = recipe.get("pole_rig" if kinds == {POLE} else "vehicle_rig")
+    known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
+    try:
+        settings = next(iter(known["lidars"].values()))["settings"]
+        beams, range_m = settings["channels"], settings.get("range_m")
+    except (TypeError, KeyError, AttributeError, StopIteration):
+        beams, range_m = recipe.get("beams"), recipe.get("range_m")
+    span = (beams, beams) if isinstance(beams, int) else None
+    if recipe.get("randomise") is not None and kinds != {POLE}:
+        span = DRAWN_BEAMS
+    return KnownLidar(span, float(range_m) if isinstance(range_m, int | float) else None)
+
+
+def join_lidars(known: Sequence[KnownLidar]) -> KnownLidar:
+    """Return what is known of several recordings' LiDARs: the fewest and most beams, and the range if all have one."""
+    spans = [lidar.beams for lidar in known if lidar.beams is not None]
+    beams = (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None
+    ranges = {lidar.range_m for lidar in known}
+    return KnownLidar(beams if len(spans) == len(known) else None, ranges.pop() if len(ranges) == 1 else None)
+
+
+def _rig_name(rig: Any) -> str | None:
+    return next((name for name, known in RIGS.items() if known.model_dump(mode="json") == rig), None)
+
+
+def _entry(entry: DataEntry) -> str:
+    recipe = {name: value for name, value in entry.recipe.items() if value not in ([], {}, None)}
+    frames = plural(entry.frames, "frame") + (f" of {', '.join(entry.agents)}" if entry.agents is not None else "")
+    return f"{entry.name}: {frames}; {_text(recipe)}; SHA-256 of its manifest {entry.manifest}"
+
+
+def _blocks(values: Mapping[str, Json]) -> list[str]:
+    """Return Markdown blocks: one list of the values that fit on a line, then a titled table of each other value."""
+    tables = {name: _table(value, values.get("classes")) for name, value in values.items()}
+    plain = [f"{name}: {_text(value)}" for name, value in values.items() if tables[name] is None]
+    named = [f"### {name}\n\n{text}" for name, text in tables.items() if text is not None]
+    return ([format_bullets(plain)] if plain else []) + named
+
+
+def _table(value: Any, classes: Any) -> str | None:
+    """Return a Markdown table of a list or mapping of records, or of a confusion matrix; None for any other value."""
+    rows = value
+    if isinstance(value, Mapping):
+        rows = [{"": name} | dict(row) for name, row in value.items() if isinstance(row, Mapping)]
+    if not isinstance(rows, list) or not rows:
+        return None
+    if isinstance(rows[0], list) and isinstance(classes, list) and len(classes) == len(rows):
+        rows = [{"": name} | dict(zip(classes, row, strict=True)) for name, row in zip(classes, rows, strict=True)]
+    if not all(isinstance(row, Mapping) for row in rows):
+        return None
+    header = list(dict.fromkeys(name for row in rows for name in row))
+    return format_table(header, [[_text(row.get(name)) for name in header] for row in rows])
+
+
+def _text(value: Any) -> str:
+    """Return a value on one line: nested values in brackets, empty ones left out."""
+    if isinstance(value, float):
+        return f"{round(value, 4):g}"
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {_nested(part)}" for name, part in value.items() if part not in ([], {}, None))
+    if isinstance(value, list | tuple):
+        return ", ".join(map(_nested, value)) or "none"
+    return "none" if value is None else str(value)
+
+
+def _nested(value: Any) -> str:
+    if isinstance(value, list | tuple) and len(value) == 1:
+        return _nested(value[0])
+    return f"({_text(value)})" if isinstance(value, Mapping | list | tuple) else _text(value)
+
 
 PREFIX = "flcav."
 LARGEST = 1e9  # largest absolute value of a weight; larger ones overflow in a few layers

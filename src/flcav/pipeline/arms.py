@@ -14,7 +14,7 @@ from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
 from flcav.fusion.pose_graph import check_gtsam
-from flcav.perception.distillation import Imitates
+from flcav.perception.client import Imitates
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named

@@ -13,8 +13,8 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.links.ros_names import ROS_NAMESPACE
 from flcav.federation.rules import Rules
+from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
 from flcav.pipeline.lifelong import Lifelong

@@ -7,9 +7,9 @@ from flcav.config import Json
 from flcav.dataset.layout import read_manifest
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
+from flcav.perception.weights import find_recorded_lidar, join_lidars
 from flcav.pipeline.engine import Notify
 from flcav.pipeline.frames import make_recording_recipe
 from flcav.pipeline.recipe import SPLITS_OF
@@ -44,7 +44,7 @@ def compare_rigs(outline: Outline) -> tuple[str, ...]:
 def _compare(outline: Outline, folder: Path, name: str) -> str:
     """Return how the vehicles' rig in a dataset differs from the one that a task's network is trained with."""
     task = task_named(name)
-    known = join_lidars([read_lidar(recipe) for recipe in _list_pools(outline, name)])
+    known = join_lidars([find_recorded_lidar(recipe) for recipe in _list_pools(outline, name)])
     config = find_configuration(task, outline.recipe.tasks[name].network)
     return choose_frames(task, config, Dataset.open(folder), "vehicles", trained=known).rig
 

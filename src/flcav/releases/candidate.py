@@ -35,7 +35,7 @@ FILES = (CANDIDATE, WEIGHTS, CARD, RECIPE, LEDGER, VERIFICATION, REPORT)
 SIGNATURE = re.compile(rf"{ACKNOWLEDGEMENTS}/[0-9a-f]+\.sig")
 LARGEST = 1_000_000_000  # bytes of weights
 FORMAT = "flcav-candidate-1"
-CARD_KEY = "flcav.card"  # as in `flcav.perception.card`, which needs torch
+CARD_KEY = "flcav.card"  # as in `flcav.perception.weights`, which needs torch
 MOST_HEADER_BYTES = 10_000_000
 MOST_TEXT_BYTES = 10_000_000  # of a description, a card, a verification
 

@@ -11,10 +11,9 @@ from flcav.config import InputError, check_is_file, parse_config
 from flcav.dataset.store import Dataset
 from flcav.network.ledger import Ledger
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.task import Task
 from flcav.perception.tasks import task_named
-from flcav.perception.weights import load_network, read_card, save_network
+from flcav.perception.weights import Card, DataEntry, data_entry, load_network, read_card, save_network, write_card
 from flcav.releases.candidate import (
     CANDIDATE,
     CARD,

@@ -6,8 +6,9 @@ Efron and Tibshirani, "An Introduction to the Bootstrap", 1993, ch. 13: percenti
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from flcav.arrays import Array, Ints
 from flcav.statistics.estimates import TAILS
 from flcav.statistics.seeds import OWN_SCENES, SharedScenes
 
@@ -15,7 +16,7 @@ REDRAWS = 1000
 
 
 def bootstrap_over_scenes(
-    measure: Callable[[NDArray[np.int64]], NDArray[np.float64]],
+    measure: Callable[[Ints], Array],
     scene_of_frame: ArrayLike,
     n: int = REDRAWS,
     *,
@@ -39,7 +40,7 @@ def bootstrap_over_scenes(
 
 
 def share_scenes(
-    measures: Sequence[Callable[[NDArray[np.int64]], NDArray[np.float64]]],
+    measures: Sequence[Callable[[Ints], Array]],
     scenes_of_frames: Sequence[ArrayLike],
     n: int = REDRAWS,
     *,

@@ -1,9 +1,10 @@
-"""Power of t tests, and sample size determination: how many trainings and test scenes together tell an effect.
+"""Power of t tests, and sample size determination: how many trainings and test scenes together detect an effect.
 
 The variance of a mean over trainings that share their test scenes is sd² / trainings + s² / scenes: more of the one
-leaves the other. So there are effects that no number of trainings tells on the scenes at hand, and others that no
-number of scenes tells of the trainings at hand. Numbers of both are sought for the tests of `seeds`, at a power of 0.8:
-Student's t of several trainings or seeds, and for one training of known spread the test of `OneTraining`.
+does not reduce the other part. So there are effects that no number of trainings detects on the scenes at hand, and
+others that no number of scenes detects with the trainings at hand. Numbers of both are sought for the tests of `seeds`,
+at a power of 0.8: Student's t of several trainings or seeds, and for one training of known spread the test of
+`OneTraining`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,7 +17,7 @@ from scipy.special import chdtri, nctdtr, ndtr, ndtri, stdtrit
 from flcav.interface.wording import plural
 from flcav.statistics.seeds import LEVEL, OWN_SCENES, MeanOverSeeds, OneTraining, SharedScenes, standard_error
 
-POWER = 0.8  # chance to tell an effect that a number of seeds is planned for
+POWER = 0.8  # chance to detect an effect that a number of seeds is planned for
 MOST_SEEDS = 1000  # that a plan of seeds is sought up to
 MOST_SCENES = 10_000  # test scenes that are sought up to
 QUANTILES = (np.arange(99) + 0.5) / 99  # of an estimated variance
@@ -40,7 +41,7 @@ def power_of_seeds(
 def plan_seeds(
     effect: float, sd: float, level: float = LEVEL, shared: SharedScenes = OWN_SCENES, power: float = POWER
 ) -> int | None:
-    """Return the least number of seeds that tell `effect` with the given power; None for more than `MOST_SEEDS`.
+    """Return the least number of seeds that detect `effect` with the given power; None for more than `MOST_SEEDS`.
 
     `sd` is the standard deviation over seeds of the effect: of differences, that of the paired differences.
     """
@@ -63,10 +64,10 @@ def seeds_to_tell(mean: MeanOverSeeds, hypothesis: float = 0.0, level: float = L
 
 
 def plan_scenes(effect: float, error: float, scenes: int, level: float = LEVEL / 2, power: float = POWER) -> int | None:
-    """Return the number of scenes that tell an `effect` above 0 in a one-sided z test at `level`, with the given power.
+    """Return the number of scenes that detect an `effect` above 0 in a one-sided z test, with the given power.
 
-    `error` is the standard error over `scenes`, which falls with their square root. At least `scenes`; None for an
-    effect of 0 or less, which no number of scenes tells.
+    `level` is that of the test. `error` is the standard error over `scenes`, which falls with their square root. At
+    least `scenes`; None for an effect of 0 or less, which no number of scenes detects.
     """
     if effect <= 0:
         return None
@@ -75,13 +76,13 @@ def plan_scenes(effect: float, error: float, scenes: int, level: float = LEVEL /
 
 @dataclass(frozen=True)
 class SampleSize:
-    """Numbers of trainings and of test scenes that tell an effect together, and whether either alone can."""
+    """Numbers of trainings and of test scenes that detect an effect together, and whether either alone can."""
 
     trainings: int | None  # by the fewest tests of a scene; None: more than `MOST_SEEDS` on `MOST_SCENES` scenes
     scenes: int | None
     now: tuple[int, int]  # trainings and scenes at hand
-    by_trainings: bool  # some number of trainings tells it on the scenes at hand
-    by_scenes: bool  # some number of scenes tells it of the trainings at hand
+    by_trainings: bool  # some number of trainings detects it on the scenes at hand
+    by_scenes: bool  # some number of scenes detects it with the trainings at hand
 
     def describe(self, word: str) -> str:
         """Return the numbers as text, and which of them alone cannot do; `word`: the plural of a training."""
@@ -98,7 +99,7 @@ class SampleSize:
 
 
 def plan_sample(mean: MeanOverSeeds, hypothesis: float, level: float) -> SampleSize | None:
-    """Return the numbers that tell an effect as large as the distance of `mean` from `hypothesis`, at `level`.
+    """Return the numbers that detect an effect as large as the distance of `mean` from `hypothesis`, at `level`.
 
     Both are at least those at hand. None where trainings do not share test scenes, or their spread is not known.
     """
@@ -108,41 +109,42 @@ def plan_sample(mean: MeanOverSeeds, hypothesis: float, level: float) -> SampleS
     of_trainings = [*_steps(mean.seeds, MOST_SEEDS, 1.04)]
     of_scenes = [*_steps(own.scenes, MOST_SCENES, 1.1)]
 
-    def tells(trainings: int, scenes: int) -> bool:
+    def detects(trainings: int, scenes: int) -> bool:
         shared = SharedScenes(own.sd * float(np.sqrt(own.scenes / scenes)), scenes)
         return _power(mean, effect, level, trainings, shared) >= POWER
 
     endless_trainings = power_of_seeds(effect, 0.0, MOST_SEEDS, level, own) >= POWER
     endless_scenes = _power(mean, effect, level, mean.seeds, SharedScenes(0.0, MOST_SCENES)) >= POWER
     return SampleSize(
-        *(_search(tells, of_trainings, of_scenes) or (None, None)),
+        *(_search(detects, of_trainings, of_scenes) or (None, None)),
         (mean.seeds, own.scenes),
-        endless_trainings or any(tells(each, own.scenes) for each in of_trainings),
-        endless_scenes or any(tells(mean.seeds, each) for each in of_scenes),
+        endless_trainings or any(detects(each, own.scenes) for each in of_trainings),
+        endless_scenes or any(detects(mean.seeds, each) for each in of_scenes),
     )
 
 
 def _search(
-    tells: Callable[[int, int], bool], of_trainings: Sequence[int], of_scenes: Sequence[int]
+    detects: Callable[[int, int], bool], of_trainings: Sequence[int], of_scenes: Sequence[int]
 ) -> tuple[int, int] | None:
-    """Return the trainings and scenes with the fewest tests of a scene, trainings times scenes, that tell the effect.
+    """Return the trainings and scenes with the fewest tests of a scene, trainings times scenes, that detect the effect.
 
-    The numbers to try rise; from the best pair of them both are lowered, one by one, as far as it still tells.
+    The numbers to try rise; from the best pair of them both are lowered, one by one, while the effect is still
+    detected.
     """
     best, least = None, float("inf")
     for trainings in of_trainings:
         for scenes in of_scenes:
             if trainings * scenes >= least:
                 break
-            if tells(trainings, scenes):
+            if detects(trainings, scenes):
                 best, least = (trainings, scenes), trainings * scenes
                 break
     if best is None:
         return None
     trainings, scenes = best
-    while scenes > of_scenes[0] and tells(trainings, scenes - 1):
+    while scenes > of_scenes[0] and detects(trainings, scenes - 1):
         scenes -= 1
-    while trainings > of_trainings[0] and tells(trainings - 1, scenes):
+    while trainings > of_trainings[0] and detects(trainings - 1, scenes):
         trainings -= 1
     return trainings, scenes
 

@@ -20,9 +20,7 @@ from flcav.statistics.estimates import CONFIDENCE, EDGE, TAILS, Estimate, Spread
 
 LEVEL = 1 - CONFIDENCE  # of a test, two-sided
 LEAST_P = 1e-12  # p-values below are 0
-LARGEST_SPREAD = (
-    0.1  # assumed where it is not known: above the standard deviation of any retrainings in `reproductions`
-)
+LARGEST_SPREAD = 0.1  # assumed where it is not known: above the deviation of any retrainings in `reproductions`
 FEWEST_SCENES = 6  # by which signs alone can decide at `LEVEL`: 2^(1 - 6) = 0.03
 
 

@@ -6,7 +6,9 @@ them, in row i after task i. Source: Lopez-Paz and Ranzato, "Gradient Episodic M
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from flcav.arrays import Array
 
 
 def compute_final_mean(scores: ArrayLike) -> float:
@@ -28,7 +30,7 @@ def compute_forward_transfer(scores: ArrayLike) -> float:
     return float((before - table[0])[1:].mean())
 
 
-def _check(scores: ArrayLike) -> NDArray[np.float64]:
+def _check(scores: ArrayLike) -> Array:
     """Return the table; raises ValueError where it is not (T + 1, T) of two tasks or more."""
     table = np.asarray(scores, np.float64)
     if table.ndim != 2 or table.shape[1] < 2 or table.shape[0] != table.shape[1] + 1:

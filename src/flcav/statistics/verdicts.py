@@ -176,8 +176,8 @@ def tell_loss(over_scenes: Estimate, scenes: int, family: int, spread: float = L
     if p is None or p * family > LEVEL:
         return None
     corrected = f", corrected for {family} claims" if family > 1 else ""
-    told = f"p {format_p(p * family)}{corrected}"
-    return f"a spread of {spread:.2g}, above any measured, would not explain such a loss ({told})"
+    corrected_p = f"p {format_p(p * family)}{corrected}"
+    return f"a spread of {spread:.2g}, above any measured, would not explain such a loss ({corrected_p})"
 
 
 def describe_aims(aims: Mapping[str, Claim]) -> list[str]:

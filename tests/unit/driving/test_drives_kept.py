@@ -28,7 +28,7 @@ from flcav.geometry import Boxes, left_vectors
 from flcav.network.ledger import unpack_arrays
 from flcav.optimization.problem import Problem
 from flcav.perception.networks import resolve_network
-from flcav.perception.tracking.tracker import Tracker
+from flcav.perception.tracking import Tracker
 from flcav.perception.trajectory.config import FUTURE
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.statistics.estimates import Estimate

@@ -4,9 +4,9 @@ import numpy as np
 
 from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
 from flcav.geometry import Boxes
-from flcav.perception.card import Card
 from flcav.perception.images import CameraView
 from flcav.perception.objects.evaluate import ObjectsEvaluation
+from flcav.perception.weights import Card
 from flcav.pipeline.provenance import provenance
 from flcav.report.pictures.clouds import real_frame
 from flcav.reproductions.sim_to_real import run as sim_to_real_tables

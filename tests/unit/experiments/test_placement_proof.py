@@ -13,8 +13,7 @@ from scipy.stats import spearmanr, t
 from shapely.geometry import Point
 
 from flcav.experiments.experiment import import_map
-from flcav.fusion.detector import TRAINED_IN
-from flcav.fusion.road import RoadView
+from flcav.fusion.road import TRAINED_IN, RoadView
 from flcav.geometry import Boxes, pose
 from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError

@@ -6,7 +6,7 @@ import pytest
 
 from flcav.cli.planning.place_inputs import read_given
 from flcav.config import parse_config
-from flcav.fusion.sightings import Navigation, Sighting
+from flcav.fusion.average import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
 from flcav.pipeline.provenance import provenance
 from flcav.reproductions.fig3b.run import ZONE_M, TownCover, _count_zones, cover_town, list_kinds

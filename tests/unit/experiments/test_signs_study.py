@@ -5,8 +5,8 @@ import pytest
 from flcav.config import parse_config
 from flcav.dataset.rectangles import SIGNS
 from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
-from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
+from flcav.perception.weights import Card
 from flcav.pipeline.provenance import provenance
 from flcav.reproductions.task_signs.run import STUDY, tables
 from flcav.sources.embedded import EmbeddedSource

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
-from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
+from flcav.perception.weights import Card
 from flcav.pipeline.provenance import provenance
 from flcav.reproductions.task_trajectory.run import CAMERAS, STUDY, tables
 from flcav.statistics.seeds import mean_over_seeds

@@ -30,7 +30,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.federation.wire import ARRAYS, ASK, CONFIG, LOST, VECTOR, read_arrays, to_array_record
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.perception.distillation import SentOutputs
+from flcav.perception.client import SentOutputs
 from flcav.statistics.streams import derive_seed
 
 START = {"w": np.zeros(50, np.float32)}

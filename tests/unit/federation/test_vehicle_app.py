@@ -39,7 +39,7 @@ from flcav.federation.wire import (
 from flcav.fleet.authority import SERVER, SERVER_KEY, found_authority
 from flcav.fleet.keys import AUTHORITY, load_key, request_certificate, take_certificate
 from flcav.fleet.vehicle import VehicleSettings
-from flcav.perception.distillation import SentOutputs
+from flcav.perception.client import SentOutputs
 
 TRAINED: list[int] = []
 

@@ -17,7 +17,7 @@ from flcav.fusion.association import (
     correct_extrinsics,
     fit_extrinsics,
     measure_error,
-    outline,
+    outline_cars,
     pair,
     spread_of_calibration,
 )
@@ -38,7 +38,7 @@ OFF = np.array((*np.radians((0.6, 0.7, -0.4)), 0.15, -0.1, 0.1))  # 1 degree abo
 def pinhole(cars: Boxes, camera_from_lidar: np.ndarray) -> np.ndarray:
     """Return the boxes (N, 4) of cars, point by point: u = f x / z + cx, and half a pixel to the picture's corner."""
     rows = []
-    for points in outline(cars):
+    for points in outline_cars(cars):
         uv = []
         for point in points:
             x, y, z = camera_from_lidar[:3, :3] @ point + camera_from_lidar[:3, 3]
@@ -79,9 +79,9 @@ def share_right(found, truth) -> tuple[float, float]:
 
 def test_cars_are_projected_as_by_a_pinhole():
     cars = street(3)
-    np.testing.assert_allclose(_sides(outline(cars), TRUE), pinhole(cars, EXACT), atol=1e-9)
+    np.testing.assert_allclose(_sides(outline_cars(cars), TRUE), pinhole(cars, EXACT), atol=1e-9)
     behind = replace(cars, center=cars.center * (-1, 1, 1))
-    assert np.isnan(_sides(outline(behind), TRUE)).all()
+    assert np.isnan(_sides(outline_cars(behind), TRUE)).all()
 
 
 def test_an_error_turns_and_shifts_the_extrinsics():

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from flcav.fusion.clocks import LEAST_SPEED_MPS, ObjectPath, set_clocks, trace_objects
-from flcav.fusion.sightings import Navigation, Sighting
+from flcav.fusion.average import Navigation, Sighting
+from flcav.fusion.pose_graph import LEAST_SPEED_MPS, ObjectPath, set_clocks, trace_objects
 from flcav.geometry import Boxes, inverse, pose
 
 TIMES = (0.0, 0.5, 1.0, 1.5)

@@ -6,7 +6,7 @@ import shapely
 
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.fusion.detector import (
+from flcav.fusion.road import (
     OFF_ROAD_M,
     ROAD,
     TRAINED_IN,
@@ -16,11 +16,10 @@ from flcav.fusion.detector import (
     road_detector,
 )
 from flcav.geometry import Boxes, inverse, pose, transform_points
-from flcav.perception.card import LICENCE
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
 from flcav.perception.objects.samples import select_fitting_frames
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.weights import find_shipped, read_card
+from flcav.perception.weights import LICENCE, find_shipped, read_card
 from flcav.reproductions.road_detector.run import detect_frames, score_town
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

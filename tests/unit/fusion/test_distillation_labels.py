@@ -9,21 +9,19 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError, parse_config
-from flcav.fusion.average import YAW
+from flcav.fusion.average import YAW, Navigation, NavigationErrors, Sighting
 from flcav.fusion.distillation import (
     Distillation,
     Guidance,
     average_spin,
+    build_context,
     distil_sample,
     pack_sighting,
     place_in,
     share_of_free_ground,
     unpack_sighting,
 )
-from flcav.fusion.map_context import build_context
-from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
-from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.perception.objects.model import second_tiny

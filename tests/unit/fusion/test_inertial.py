@@ -8,7 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError
-from flcav.fusion.inertial import ACROSS_MPS, HEIGHT_M, UP_MPS, Estimate, Mounts, estimate_drive
+from flcav.fusion.inertial import ACROSS_MPS, HEIGHT_M, UP_MPS, MotionEstimate, Mounts, estimate_drive
 from flcav.geometry import inverse, pose, rotations, wrap_angle
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.navigation_log import NavigationLog, log_drive
@@ -93,11 +93,11 @@ def log_of(trace: Trace, rig: Rig, seed: int = 0) -> NavigationLog:
     return log
 
 
-def estimate(trace: Trace, rig: Rig, seed: int = 0, at_s: np.ndarray = AT_S, slope: float = 0.0) -> Estimate:
+def estimate(trace: Trace, rig: Rig, seed: int = 0, at_s: np.ndarray = AT_S, slope: float = 0.0) -> MotionEstimate:
     return estimate_drive(log_of(trace, rig, seed), mounts_of(rig), GEO, lambda x, y: slope * x, at_s)
 
 
-def errors(found: Estimate, true: np.ndarray) -> np.ndarray:
+def errors(found: MotionEstimate, true: np.ndarray) -> np.ndarray:
     """Return the errors (T, 6) of position, world frame [m], and attitude, vehicle's axes [rad]."""
     between = np.swapaxes(found.world_from_agent[:, :3, :3], 1, 2) @ true[:, :3, :3]
     turned = Rotation.from_matrix(between).as_rotvec()

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from flcav.fusion.map_context import LANE_RAD, build_context, snap_to_map
+from flcav.fusion.distillation import LANE_RAD, build_context, snap_to_map
 from flcav.geometry import Boxes
 from flcav.world.map.layers import Crossing, MapLane, MapLayers
 

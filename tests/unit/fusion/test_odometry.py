@@ -9,7 +9,7 @@ from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.kitti import KittiFolder
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
-from flcav.fusion.odometry import DrivenSource, Odometry, move_frame
+from flcav.fusion.registration import DrivenSource, Odometry, move_frame
 from flcav.geometry import inverse, pose, transform_points
 from flcav.sensors.frame import Frame
 from flcav.sensors.rig import RIGS

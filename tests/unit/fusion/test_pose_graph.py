@@ -3,10 +3,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.fusion.average import average_boxes
-from flcav.fusion.pose_graph import correct_poses, match_posts
-from flcav.fusion.posts import find_posts
-from flcav.fusion.sightings import Navigation, Sighting, tell
+from flcav.fusion.average import Navigation, Sighting, average_boxes, report_boxes
+from flcav.fusion.pose_graph import correct_poses, match_posts, segment_posts
 from flcav.geometry import Boxes, inverse, pose, transform_points
 
 pytest.importorskip("gtsam")
@@ -75,13 +73,13 @@ def test_a_clock_is_set_by_objects_that_move() -> None:
 
 def test_what_is_told_carries_the_uncertainty_of_the_pose() -> None:
     sighting = look("cav0", pose(0, 0), 0.0, STATED)
-    variance, plain = tell(sighting).boxes.variance, sighting.boxes.variance
+    variance, plain = report_boxes(sighting).boxes.variance, sighting.boxes.variance
     assert variance is not None
     assert plain is not None
     arm = sighting.boxes.center[:, [1, 0]] * STATED.heading_rad
     np.testing.assert_allclose(variance[:, :2] - plain[:, :2], STATED.position_m**2 + arm**2)
     np.testing.assert_allclose(variance[:, 6] - plain[:, 6], STATED.heading_rad**2)
-    surveyed = tell(replace(sighting, navigation=None)).boxes.variance
+    surveyed = report_boxes(replace(sighting, navigation=None)).boxes.variance
     assert surveyed is not None
     np.testing.assert_allclose(surveyed, plain)
 
@@ -92,8 +90,8 @@ def test_labels_of_misplaced_vehicles_come_together() -> None:
         misplace(look(f"cav{n}", TRUE, 0.0, STATED, POSTS), *off)
         for n, off in enumerate(((0.9, 0.9, 0.05), (-0.9, 0.8, -0.04)))
     ]
-    naive = average_boxes([tell(replace(each, navigation=None)) for each in sightings], 0.0)
-    fixed = average_boxes([tell(each) for each in correct_poses(sightings, POSTS, 0.0)], 0.0)
+    naive = average_boxes([report_boxes(replace(each, navigation=None)) for each in sightings], 0.0)
+    fixed = average_boxes([report_boxes(each) for each in correct_poses(sightings, POSTS, 0.0)], 0.0)
     assert len(naive.boxes) > 6
     assert len(fixed.boxes) == 6
 
@@ -112,4 +110,4 @@ def test_posts_are_segmented_from_columns_and_walls_are_not() -> None:
     wall = np.column_stack((rng.uniform(-5, 5, 400), np.full(400, 8.0), rng.uniform(0, 3, 400)))
     stone = np.column_stack((np.full(8, -6.0), np.full(8, -6.0), np.linspace(0, 0.8, 8)))
     sweep = np.vstack((post, wall, stone)) - (0, 0, 1.7)
-    np.testing.assert_allclose(find_posts(sweep.astype(np.float32), 1.7), [(6.0, -4.0)], atol=0.06)
+    np.testing.assert_allclose(segment_posts(sweep.astype(np.float32), 1.7), [(6.0, -4.0)], atol=0.06)

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from flcav.fusion.registration import measure_offset, register
+from flcav.fusion.registration import measure_offset, register_clouds
 from flcav.geometry import inverse, pose, transform_points
 
 pytest.importorskip("small_gicp")
@@ -21,7 +21,7 @@ def test_a_miscalibrated_suite_is_registered_to_the_other() -> None:
     clouds = [transform_points(inverse(at), street(rng)) + rng.normal(0, 0.01, (6000, 3)) for at in (first, second)]
     exact = inverse(first) @ second
     guess = exact @ pose(0.5, -0.4, 0.1, 0.04, 0.01)
-    found = register(clouds[0], clouds[1], guess)
+    found = register_clouds(clouds[0], clouds[1], guess)
     before, after = measure_offset(exact, guess), measure_offset(exact, found)
     assert before.position_cm > 60
     assert after.position_cm < 3

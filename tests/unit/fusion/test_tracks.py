@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.fusion.average import BoxReport
-from flcav.fusion.tracks import Sweep, fit_vehicle, track_objects
+from flcav.fusion.tracks import VehicleSweep, fit_vehicle, track_objects
 from flcav.geometry import Boxes, heading_vectors
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 
 LIDAR_M = 1.8
 
@@ -114,7 +114,7 @@ def drive(true, speed=0.0, every=5, missed=(), ghosts=()):
         rows = [row - (0, 0, (true[5] - 1.46) / 2, true[3] - 4.0, true[4] - 1.75, true[5] - 1.46, 0) for row in rows]
         rows += [np.array((30.0, -8.0, 0.73, 4, 1.75, 1.46, 0))] if number in ghosts else []
         boxes = Boxes.from_array(np.array(rows).reshape(-1, 7), "Car", np.full(len(rows), 0.8))
-        sweeps.append(Sweep(time_s, boxes, scan(place, origin, rng=rng), origin))
+        sweeps.append(VehicleSweep(time_s, boxes, scan(place, origin, rng=rng), origin))
     return sweeps
 
 

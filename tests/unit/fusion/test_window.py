@@ -7,10 +7,9 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
+from flcav.fusion.average import Navigation, NavigationErrors, Sighting
 from flcav.fusion.distillation import Distillation, Guidance, average_spin
-from flcav.fusion.navigation import NavigationErrors
 from flcav.fusion.road import RoadView
-from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
@@ -178,7 +177,7 @@ def test_a_clock_is_off_by_as_much_in_all_spins_of_a_scene_and_posts_are_told_wi
 ) -> None:
     split = split_of((0.0, 0.5, 1.0), middle=(0, 1, 2), scenes=tuple(f"s{n}" for n in range(100)))
     monkeypatch.setattr(sightings, "detect_in", lambda network, frames, **how: [car(*PLACE, z=-1.0)])
-    monkeypatch.setattr(sightings, "find_posts", lambda points, height_m: np.array([(3.0, 4.0)]))
+    monkeypatch.setattr(sightings, "segment_posts", lambda points, height_m: np.array([(3.0, 4.0)]))
 
     def off_s(how: Distillation, errors: NavigationErrors) -> np.ndarray:
         told = [sightings.make_sighting(cast(Any, None), split.data, i, how, errors)[0] for i in split.vehicles]

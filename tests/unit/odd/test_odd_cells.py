@@ -45,7 +45,7 @@ def test_a_cell_is_measured_on_its_frames_with_an_interval_over_its_scenes():
 def test_tests_are_joined_as_if_they_were_one():
     from flcav.geometry import Boxes
     from flcav.perception.metrics import match
-    from flcav.perception.objects.outcomes import CLASSES, HIDDEN, KEPT, join_outcomes
+    from flcav.perception.objects.evaluate import CLASSES, HIDDEN, KEPT, join_outcomes
     from flcav.perception.objects.task import OBJECTS
 
     rng = np.random.default_rng(2)

@@ -7,7 +7,7 @@ import pytest
 import torch
 from torch import nn
 
-from flcav.perception.training.adamw import BETAS, EPSILON, WEIGHT_DECAY, AdamW
+from flcav.perception.training.checkpoint import BETAS, EPSILON, WEIGHT_DECAY, AdamW
 
 RATES = (1e-3, 4e-3, 2e-3, 5e-4)
 
@@ -71,7 +71,7 @@ def test_training_does_without_the_compiler() -> None:
     code = """
 import sys
 import torch
-from flcav.perception.training.adamw import AdamW
+from flcav.perception.training.checkpoint import AdamW
 own = torch.nn.Linear(2, 1)
 own(torch.ones(1, 2)).sum().backward()
 torch.nn.utils.clip_grad_norm_(own.parameters(), 1.0)

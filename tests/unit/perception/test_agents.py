@@ -12,10 +12,9 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.fusion.detector import ROAD
+from flcav.fusion.road import ROAD
 from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import join_lidars, read_lidar
 from flcav.perception.networks import find_trained_lidar
 from flcav.perception.objects import predict as prediction
 from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
@@ -25,7 +24,7 @@ from flcav.perception.task import KnownLidar
 from flcav.perception.trajectory.config import CONFIGURATIONS as TRAJECTORIES
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import find_shipped, read_card, save_network
+from flcav.perception.weights import find_recorded_lidar, find_shipped, join_lidars, read_card, save_network
 from flcav.sensors.frame import Calibration, Frame
 from flcav.sensors.rig import RIGS
 from flcav.sources.randomisation import DRAWN_BEAMS
@@ -173,16 +172,16 @@ def test_the_lidar_of_a_training_is_that_of_its_rig():
     settings = RIGS["kitti_lidar"].lidars["velodyne"].settings
     known = KnownLidar((settings.channels, settings.channels), settings.range_m)
     assert known == KnownLidar((64, 64), 120)
-    assert read_lidar({"vehicle_rig": "kitti_lidar"}) == known
-    assert read_lidar({"vehicle_rig": RIGS["kitti_lidar"].model_dump(mode="json")}) == known
-    assert read_lidar({"vehicle_rig": "kitti_lidar", "randomise": "streets"}) == KnownLidar(DRAWN_BEAMS, 120)
+    assert find_recorded_lidar({"vehicle_rig": "kitti_lidar"}) == known
+    assert find_recorded_lidar({"vehicle_rig": RIGS["kitti_lidar"].model_dump(mode="json")}) == known
+    assert find_recorded_lidar({"vehicle_rig": "kitti_lidar", "randomise": "streets"}) == KnownLidar(DRAWN_BEAMS, 120)
     assert find_trained_lidar(OBJECTS, None) == KnownLidar(DRAWN_BEAMS, 120)  # the package's knows many, drawn ones
 
 
 def test_the_lidar_of_a_road_detector_s_training_is_the_poles():
     both = {"vehicle_rig": "lidar32", "pole_rig": "lidar_pole"}
-    assert read_lidar(both, ("pole1", "pole2")).beams == (64, 64)
-    assert read_lidar(both, ("cav0", "pole2")).beams == read_lidar(both).beams == (32, 32)
+    assert find_recorded_lidar(both, ("pole1", "pole2")).beams == (64, 64)
+    assert find_recorded_lidar(both, ("cav0", "pole2")).beams == find_recorded_lidar(both).beams == (32, 32)
     assert find_trained_lidar(OBJECTS, find_shipped(OBJECTS, ROAD)).beams == (64, 64)
 
 

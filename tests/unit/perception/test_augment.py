@@ -19,8 +19,7 @@ from flcav.perception.objects.augment import (
     select_free,
     tilt_sample,
 )
-from flcav.perception.objects.config import Augmentation
-from flcav.perception.objects.model import small_config
+from flcav.perception.objects.model import Augmentation, small_config
 from flcav.perception.objects.samples import Sample, crop_to_range
 from flcav.perception.objects.truth import MIN_RETURNS
 

@@ -11,9 +11,8 @@ from flcav.config import DamagedFile
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.agents import choose_frames
-from flcav.perception.card import Card, data_entry
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import read_card, save_network
+from flcav.perception.weights import Card, data_entry, read_card, save_network
 from flcav.sensors.rig import RIGS
 
 from .frames import frame

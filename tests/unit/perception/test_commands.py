@@ -18,7 +18,7 @@ from flcav.cli.main import run
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.client import TaskClient
-from flcav.perception.objects import calibrate
+from flcav.perception.objects import predict
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import load_network, read_card, save_network, to_arrays
@@ -91,7 +91,7 @@ def test_train_writes_weights_that_evaluate_and_infer_take(data, tmp_path, capsy
 
 
 def test_scores_are_calibrated_on_the_validation_data(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(calibrate, "fit_logistic", lambda scores, hits: (2.0, -0.25))
+    monkeypatch.setattr(predict, "fit_logistic", lambda scores, hits: (2.0, -0.25))
     options = ("train", "objects", "--data", data, "--epochs", 1, "--seed", 3)
     assert called(*options, "--out", tmp_path / "without") == 0
     assert called(*options, "--out", tmp_path / "with", "--validation", data) == 0

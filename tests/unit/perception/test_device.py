@@ -12,8 +12,8 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.perception.device import CPU, select_device
 from flcav.perception.objects import Sample
-from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import Second, second, tiny_config
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.ops import norm, rulebook
 from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, encode_cells
 from flcav.perception.ops.sparse import sparse_convolution
@@ -36,7 +36,7 @@ def network(device: torch.device, bfloat16: bool = False) -> Second:
 
 
 def loss_and_gradient(network: Second, sample: Sample) -> tuple[float, torch.Tensor]:
-    loss = batch_loss(network, [sample])
+    loss = OBJECTS.loss(network, [sample])
     parts = torch.autograd.grad(loss, list(network.parameters()))
     return float(loss.detach()), torch.cat([part.flatten().cpu() for part in parts])
 

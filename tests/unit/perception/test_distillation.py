@@ -16,15 +16,14 @@ from flcav.federation.state import FederationState
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Trainable, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.perception.client import TaskClient
-from flcav.perception.distillation import PROBABILITIES, OutputClient, SharedSamples
-from flcav.perception.signs.config import SignsConfig
-from flcav.perception.signs.predict import predict
+from flcav.perception.client import PROBABILITIES, OutputClient, SharedSamples, TaskClient
+from flcav.perception.signs.loss import assign_levels
+from flcav.perception.signs.model import SignsConfig
+from flcav.perception.signs.predict import predict_levels
 from flcav.perception.signs.samples import Sample as SignSample
-from flcav.perception.signs.targets import assign_anchors
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network
-from flcav.perception.weather.config import LeNetConfig
+from flcav.perception.weather.model import LeNetConfig
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
@@ -157,10 +156,10 @@ def test_a_sign_has_the_mean_probability_of_its_anchors_and_its_label_is_a_speci
     said = SIGNS.class_probabilities(network, samples)
     assert [rows.shape for rows in said] == [(2, 3), (0, 3), (3, 3)]
     with torch.no_grad():
-        raw = predict(network, [samples[0].picture])
+        raw = predict_levels(network, [samples[0].picture])
     first = [
         raw[level][0, a, r, c, 5:].sigmoid().numpy()
-        for level, t in enumerate(assign_anchors([samples[0]], SIGNS_CONFIG))
+        for level, t in enumerate(assign_levels([samples[0]], SIGNS_CONFIG))
         for a, r, c, box in zip(t.anchor, t.row, t.column, t.box.numpy(), strict=True)
         if np.allclose(box, samples[0].boxes[0])
     ]

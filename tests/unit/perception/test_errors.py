@@ -23,11 +23,10 @@ from flcav.perception.errors import (
     unpack_errors,
 )
 from flcav.perception.signs import errors as sign_errors
-from flcav.perception.signs.config import CONFIGURATIONS, SignsConfig
-from flcav.perception.signs.model import SignDetector
+from flcav.perception.signs.model import CONFIGURATIONS, SignDetector, SignsConfig
 from flcav.perception.signs.predict import SignDetections
-from flcav.perception.signs.samples import sample_from_frame
-from flcav.perception.trajectory import errors as path_errors
+from flcav.perception.signs.samples import label_picture
+from flcav.perception.trajectory import evaluate as path_errors
 from flcav.perception.trajectory.config import CONFIGURATIONS as PATHS
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.samples import samples_of
@@ -57,15 +56,15 @@ def seen(data: Dataset, config: SignsConfig) -> list[SignDetections]:
     out = []
     for number in range(len(data)):
         frame = data.frame(number)
-        sample = sample_from_frame(frame, "front", data.plane(number, "front", "rgb"), config)
+        sample = label_picture(frame, "front", data.plane(number, "front", "rgb"), config)
         out.append(SignDetections(sample.boxes, sample.label, np.ones(len(sample.label))))
     return out
 
 
 def registered(data: Dataset, network: SignDetector, found: list[SignDetections], monkeypatch: pytest.MonkeyPatch):
     answers = iter(found)
-    monkeypatch.setattr(sign_errors, "detect", lambda *_, **__: next(answers))
-    return sign_errors.register_errors(network, data, range(len(data)), 0.3)
+    monkeypatch.setattr(sign_errors, "detect_in_picture", lambda *_, **__: next(answers))
+    return sign_errors.register_sign_errors(network, data, range(len(data)), 0.3)
 
 
 def test_a_perfect_sign_detector_makes_no_mistakes(drive, network, monkeypatch):
@@ -117,8 +116,8 @@ def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypa
     paths[0, :, -1] += (2.5, 0.0)
     paths[1, :, -1] += (0.0, 1.5)
     chances = np.full(paths.shape[:2], 1 / config.modes)
-    monkeypatch.setattr(path_errors, "predict", lambda *_: (paths, chances))
-    result = path_errors.register_errors(TrajectoryNetwork(config), drive, samples)
+    monkeypatch.setattr(path_errors, "predict_paths", lambda *_: (paths, chances))
+    result = path_errors.register_path_errors(TrajectoryNetwork(config), drive, samples)
     (error,) = result.errors
     assert error.kind == FINAL_ERROR
     assert (error.x, error.y) == pytest.approx(tuple(samples.columns.pose[0, :2]))
@@ -128,7 +127,7 @@ def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypa
     assert error.z == 0
     hills = load_town("hilly_grid")
     monkeypatch.setattr(Dataset, "town", lambda _: hills)
-    (raised,) = path_errors.register_errors(TrajectoryNetwork(config), drive, samples).errors
+    (raised,) = path_errors.register_path_errors(TrajectoryNetwork(config), drive, samples).errors
     assert (raised.x, raised.y, raised.z) == (error.x, error.y, hills.ground(error.x, error.y))
     assert abs(raised.z) > 0.1
 

@@ -10,9 +10,9 @@ from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.errors import keep_first, load_errors, save_errors
 from flcav.perception.objects import sample_from_frame, second_paper, second_tiny
-from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.evaluate import ObjectsEvaluation, Score, score_detections
 from flcav.perception.objects.samples import validate_points
+from flcav.perception.objects.task import find_errors
 from flcav.perception.objects.truth import asked_of, ground_truth
 
 from .frames import cloud_in, detections, frame

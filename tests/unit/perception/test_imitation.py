@@ -13,7 +13,7 @@ from torch import Tensor
 from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
-from flcav.perception.objects.distillation.imitation import SEEN, ImitatingObjects, imitation_loss
+from flcav.perception.objects.distillation import SEEN, ImitatingObjects, imitation_loss
 from flcav.perception.objects.loss import BOX_WEIGHT, DIRECTION_WEIGHT, SMOOTH_L1_BETA
 from flcav.perception.objects.model import CONFIGURATIONS, HeadOutput, Second
 from flcav.perception.objects.predict import predict

@@ -15,18 +15,20 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration
 from flcav.geometry import Boxes
 from flcav.perception import networks
-from flcav.perception.kitti_benchmark import BenchmarkEvaluation, compare_kitti_rig, project_boxes
-from flcav.perception.metrics.kitti import (
+from flcav.perception.kitti_benchmark import (
     COUNTS,
     IGNORED,
     LEVELS,
     OTHER,
+    BenchmarkEvaluation,
     ClassFrame,
     average_precision_r40,
+    compare_kitti_rig,
     count_matches,
     detection_states,
     find_thresholds,
     label_states,
+    project_boxes,
 )
 from flcav.perception.networks import evaluate
 from flcav.perception.objects.model import second_tiny

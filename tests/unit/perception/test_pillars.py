@@ -9,13 +9,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import Boxes
-from flcav.perception.objects.loss import batch_loss
+from flcav.perception.objects.loss import anchor_boxes
 from flcav.perception.objects.model import head_shape, pillars_config, second
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import anchor_boxes
 from flcav.perception.objects.task import OBJECTS
-from flcav.perception.ops.pillars import BINS_M, STATISTICS, pillar_statistics
+from flcav.perception.ops.grids import BINS_M, STATISTICS, pillar_statistics
 from flcav.perception.training import train_steps
 
 RANGE_M, PILLAR_M, GROUND_M = (0, -4, -3, 8, 4, 1), (0.5, 0.4, 4), -1.8
@@ -99,9 +98,9 @@ def test_it_learns_to_find_a_box():
     sample = Sample(np.c_[points, np.full(len(points), 0.3)].astype(np.float32), boxes)
     torch.manual_seed(0)
     network = second(pillars_config())
-    first = float(batch_loss(network, [sample]).detach())
+    first = float(OBJECTS.loss(network, [sample]).detach())
     train_steps(OBJECTS, network, [sample], steps=160, batch=1, learning_rate=2e-3, seed=0)
-    assert float(batch_loss(network, [sample]).detach()) < first / 3
+    assert float(OBJECTS.loss(network, [sample]).detach()) < first / 3
     found = detect(network, sample.points, score_threshold=0.3)
     away = np.linalg.norm(found.center[:, None, :2] - boxes.center[None, :, :2], axis=2)
     assert len(found) == 2

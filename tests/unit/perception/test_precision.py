@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from flcav.perception.device import multiplies_bfloat16
-from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.model import second, tiny_config
 from flcav.perception.objects.predict import predict
+from flcav.perception.objects.task import OBJECTS
 
 CPU = torch.device("cpu")
 
@@ -24,7 +24,7 @@ def networks():
 def test_bfloat16_changes_the_loss_and_its_gradient_a_little(sample):
     losses, gradients = [], []
     for network in networks():
-        loss = batch_loss(network.train(), [sample])
+        loss = OBJECTS.loss(network.train(), [sample])
         losses.append(float(loss.detach()))
         gradients.append(torch.cat([each.flatten() for each in torch.autograd.grad(loss, list(network.parameters()))]))
         assert loss.dtype == torch.float32

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from shapely import box
 
-from flcav.perception.ops.rectangles import complete_iou, iou, nms
+from flcav.perception.ops.boxes import complete_iou, rectangle_iou, rectangle_nms
 
 sides = st.floats(0.5, 40)
 places = st.floats(-30, 30)
@@ -20,7 +20,7 @@ rectangle = st.tuples(places, places, sides, sides).map(lambda r: (r[0], r[1], r
 @given(rectangle, rectangle)
 def test_iou_is_shapelys(one, other):
     a, b = box(*one), box(*other)
-    found = iou(torch.tensor([one], dtype=torch.float64), torch.tensor([other], dtype=torch.float64))
+    found = rectangle_iou(torch.tensor([one], dtype=torch.float64), torch.tensor([other], dtype=torch.float64))
     assert float(found) == pytest.approx(a.intersection(b).area / a.union(b).area, abs=1e-6)
 
 
@@ -56,6 +56,6 @@ def test_nms_keeps_what_no_better_kept_box_overlaps():
         own = box(*boxes[i].tolist())
         if all(own.intersection(s).area / own.union(s).area <= 0.4 for s in shapes):
             kept.append(i)
-    assert nms(boxes, scores, 0.4).tolist() == kept
+    assert rectangle_nms(boxes, scores, 0.4).tolist() == kept
     assert 5 < len(kept) < 60
-    assert nms(boxes[:0], scores[:0], 0.4).tolist() == []
+    assert rectangle_nms(boxes[:0], scores[:0], 0.4).tolist() == []

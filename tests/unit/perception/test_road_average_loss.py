@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from flcav.geometry import Boxes
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.distillation.road_average import (
+from flcav.perception.objects.distillation import (
     DistillationTerms,
     contrastive_loss,
     distillation_loss,
@@ -17,11 +16,17 @@ from flcav.perception.objects.distillation.road_average import (
     pool_boxes,
     regression_loss,
 )
-from flcav.perception.objects.loss import SMOOTH_L1_BETA
-from flcav.perception.objects.model import HeadOutput, head_shape, second, tiny_config
+from flcav.perception.objects.loss import (
+    SMOOTH_L1_BETA,
+    Targets,
+    assign_anchors,
+    cell_size,
+    decode_variance,
+    encode_variance,
+)
+from flcav.perception.objects.model import HeadOutput, SecondConfig, head_shape, second, tiny_config
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import Targets, assign_anchors, cell_size, decode_variance, encode_variance
 
 CONFIG: SecondConfig = tiny_config()
 NARROW = replace(  # quick to train

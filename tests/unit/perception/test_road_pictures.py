@@ -10,14 +10,17 @@ import pytest
 from flcav.config import InputError
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.perception.signs import infer
-from flcav.perception.signs.augment import draw
-from flcav.perception.signs.background import compare_with_background, learn_picture_background, picture_reader
-from flcav.perception.signs.config import CONFIGURATIONS
-from flcav.perception.signs.infer import detect_signs
-from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import SignDetections
-from flcav.perception.signs.samples import RecordedPictures, sample_from_frame
+from flcav.perception.signs import predict
+from flcav.perception.signs.model import CONFIGURATIONS, SignDetector
+from flcav.perception.signs.predict import SignDetections, detect_signs
+from flcav.perception.signs.samples import (
+    RecordedPictures,
+    compare_with_background,
+    draw_mosaic,
+    label_picture,
+    learn_picture_background,
+    picture_reader,
+)
 from flcav.perception.signs.task import SIGNS
 from flcav.sensors.frame import Annotations, Frame, Views
 from perception.frames import frame
@@ -107,7 +110,7 @@ def seen_by_camera(box: tuple[float, float, float, float], kind: str) -> Annotat
 )
 def test_cars_are_labelled_whole_or_not(kind, box, wanted, ignored) -> None:
     shown = replace(frame([]), annotations=seen_by_camera(box, kind))
-    sample = sample_from_frame(shown, "left", np.zeros((64, 96, 3), np.uint8), ROAD)
+    sample = label_picture(shown, "left", np.zeros((64, 96, 3), np.uint8), ROAD)
     assert (len(sample.boxes), len(sample.ignore)) == (wanted, ignored)
     if wanted:
         assert ROAD.classes[sample.label[0]] == kind
@@ -118,8 +121,8 @@ def test_channels_are_not_mixed_by_augmentation() -> None:
     picture = np.zeros((192, 320, 3), np.uint8)
     picture[...] = (40, 80, 0)
     shown = replace(frame([]), annotations=seen_by_camera((100.0, 60.0, 140.0, 90.0), "car"))
-    sample = sample_from_frame(shown, "left", picture, ROAD)
-    drawn = draw([sample], 0, ROAD, np.random.default_rng(0)).picture
+    sample = label_picture(shown, "left", picture, ROAD)
+    drawn = draw_mosaic([sample], 0, ROAD, np.random.default_rng(0)).picture
     assert {tuple(pixel) for pixel in drawn.reshape(-1, 3).tolist()} == {(40, 80, 0)}
 
 
@@ -127,7 +130,9 @@ def test_findings_in_a_dataset_are_of_pictures_beside_their_background(monkeypat
     (tmp_path / MANIFEST).touch()
     monkeypatch.setattr(Dataset, "open", lambda path: STREET)
     shown = []
-    monkeypatch.setattr(infer, "detect", lambda network, picture, threshold: shown.append(picture) or NOTHING)
+    monkeypatch.setattr(
+        predict, "detect_in_picture", lambda network, picture, threshold: shown.append(picture) or NOTHING
+    )
     findings = list(detect_signs(SignDetector(ROAD), tmp_path, 0.5, [1, 3]))
     for number, finding, seen in zip((1, 3), findings, shown, strict=True):
         assert (finding.seen == Street().plane(number, "left", "rgb")).all()

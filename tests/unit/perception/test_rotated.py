@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from shapely import affinity
 from shapely.geometry import box as rectangle
 
-from flcav.perception.ops.rotated import intersection_area, iou, nms
+from flcav.perception.ops.boxes import intersection_area, iou, nms
 
 
 def footprint(row):

@@ -7,15 +7,12 @@ import numpy as np
 import pytest
 import torch
 
-from flcav.perception.ops.rectangles import complete_iou
-from flcav.perception.signs.augment import GREY, crop_sample, draw, draw_window, join_mosaic
-from flcav.perception.signs.config import CONFIGURATIONS, STRIDES, SignsConfig
+from flcav.perception.ops.boxes import complete_iou
 from flcav.perception.signs.evaluate import ClassPrecision, SignTruth, mean_average_precision
-from flcav.perception.signs.loss import BOX, CLASS, LEVELS, OBJECT, detection_loss
-from flcav.perception.signs.model import SignDetector, decode, decode_boxes
-from flcav.perception.signs.predict import SignDetections, detect
-from flcav.perception.signs.samples import Sample
-from flcav.perception.signs.targets import MOST_TIMES, assign_anchors
+from flcav.perception.signs.loss import BOX, CLASS, LEVELS, MOST_TIMES, OBJECT, assign_levels, detection_loss
+from flcav.perception.signs.model import CONFIGURATIONS, STRIDES, SignDetector, SignsConfig, decode_boxes, decode_level
+from flcav.perception.signs.predict import SignDetections, detect_in_picture
+from flcav.perception.signs.samples import GREY, Sample, crop_sample, draw_mosaic, draw_window, join_mosaic
 from flcav.perception.signs.task import SIGNS, SignsTask
 from flcav.perception.task import build_network
 from flcav.perception.training import train
@@ -68,7 +65,7 @@ def test_boxes_are_decoded_about_cell_and_anchor():
     raw[0, 1, 1, 2, :4] = torch.tensor([math.log(3), 0, math.log(3), 0])  # shares 0.75, 0.5, 0.75, 0.5
     width, height = TINY.anchors_px[0][1]
     x, y, w, h = (2 + 1.0) * 8, (1 + 0.5) * 8, width * 1.5**2, height
-    found = decode(raw, 0, TINY)[0, 1, 1, 2]
+    found = decode_level(raw, 0, TINY)[0, 1, 1, 2]
     assert found.tolist() == pytest.approx([x - w / 2, y - h / 2, x + w / 2, y + h / 2], rel=1e-5)
 
 
@@ -97,13 +94,13 @@ def found_places(one):
 
 def test_targets_are_those_of_the_definition():
     samples = [painted(seed) for seed in range(4)]
-    for level, one in enumerate(assign_anchors(samples, TINY)):
+    for level, one in enumerate(assign_levels(samples, TINY)):
         assert sorted(found_places(one)) == sorted(expected_places(samples, TINY, level))
-    assert sum(len(one.image) for one in assign_anchors(samples, TINY)) > 20
+    assert sum(len(one.image) for one in assign_levels(samples, TINY)) > 20
 
 
 def test_every_target_can_be_reached_by_its_anchor():
-    for level, one in enumerate(assign_anchors([painted(seed) for seed in range(4)], TINY)):
+    for level, one in enumerate(assign_levels([painted(seed) for seed in range(4)], TINY)):
         cell = torch.stack((one.column, one.row), 1)
         center = (one.box[:, :2] + one.box[:, 2:]) / 2 / STRIDES[level] - cell
         assert bool(((center >= -0.5) & (center <= 1.5)).all())
@@ -113,7 +110,7 @@ def test_the_loss_is_the_sum_of_its_parts():
     samples = [painted(0), replace(painted(1), ignore=np.array([[0.0, 0, 30, 30]]))]
     generator = torch.Generator().manual_seed(0)
     raw = [torch.randn(2, 3, 64 // s, 96 // s, 8, generator=generator) for s in STRIDES]
-    targets = assign_anchors(samples, TINY)
+    targets = assign_levels(samples, TINY)
     expected = 0.0
     for level, (maps, one) in enumerate(zip(raw, targets, strict=True)):
         wanted, counted = torch.zeros(maps.shape[:4]), one.counted[:, None].repeat(1, 3, 1, 1)
@@ -143,7 +140,7 @@ def test_half_precision_hardly_changes_the_loss():
     samples = [painted(seed) for seed in range(4)]
     network = build_network(SIGNS, TINY, 0)
     pictures = torch.from_numpy(np.stack([sample.picture for sample in samples])).permute(0, 3, 1, 2).float() / 255
-    whole = detection_loss(network(pictures), assign_anchors(samples, TINY), TINY)
+    whole = detection_loss(network(pictures), assign_levels(samples, TINY), TINY)
     loss = SIGNS.loss(network, samples)
     assert loss.dtype == torch.float32
     assert loss.item() == pytest.approx(whole.item(), rel=0.02)
@@ -187,7 +184,7 @@ def test_a_cut_ignores_what_it_leaves_too_little_of():
 
 def test_training_sees_windows_of_one_size_the_same_for_a_seed():
     samples = [painted(seed, 140, 100) for seed in range(5)]
-    one, other = ([draw(samples, i, TINY, np.random.default_rng(i)) for i in range(5)] for _ in range(2))
+    one, other = ([draw_mosaic(samples, i, TINY, np.random.default_rng(i)) for i in range(5)] for _ in range(2))
     assert all(sample.picture.shape == (64, 96, 3) for sample in one)
     assert all(np.array_equal(a.picture, b.picture) for a, b in zip(one, other, strict=True))
 
@@ -196,7 +193,7 @@ def test_mosaics_look_for_rare_classes():
     common, rare = painted(0, 140, 100), painted(1, 140, 100)
     samples = [replace(common, label=np.zeros_like(common.label))] * 9 + [replace(rare, label=np.full(2, 2))]
     random = np.random.default_rng(0)
-    seen = np.concatenate([draw(samples, 0, TINY, random).label for _ in range(200)])
+    seen = np.concatenate([draw_mosaic(samples, 0, TINY, random).label for _ in range(200)])
     assert (seen == 2).sum() > 0.15 * (seen == 0).sum()  # though it is in a tenth of the pictures
 
 
@@ -250,7 +247,7 @@ def test_nothing_found_and_nothing_to_find():
 def test_any_size_of_picture_is_looked_at():
     network = build_network(SIGNS, SignsConfig(width=0.25, depth=0.33), 0)
     for shape in ((64, 96, 3), (37, 131, 3)):
-        seen = detect(network, np.zeros(shape, np.uint8), threshold=0.0)
+        seen = detect_in_picture(network, np.zeros(shape, np.uint8), threshold=0.0)
         assert len(seen)
         assert (seen.box >= 0).all()
         assert (seen.box <= [shape[1], shape[0]] * 2).all()
@@ -260,7 +257,7 @@ def test_any_size_of_picture_is_looked_at():
 
 @pytest.mark.slow
 class WithoutAugmentation(SignsTask):
-    def draw(self, samples, index, config, rng):
+    def draw_mosaic(self, samples, index, config, rng):
         return samples[index]
 
 
@@ -270,7 +267,7 @@ def test_it_learns_eight_pictures():
     network = build_network(SIGNS, TINY, 0)
 
     def map50() -> float:
-        seen = [detect(network, sample.picture, threshold=0.01) for sample in samples]
+        seen = [detect_in_picture(network, sample.picture, threshold=0.01) for sample in samples]
         truths = [SignTruth(s.boxes, s.label, s.ignore) for s in samples]
         return mean_average_precision(seen, truths, TINY.classes, 6).score
 

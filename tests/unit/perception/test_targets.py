@@ -9,11 +9,17 @@ import torch
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
 from flcav.perception.objects.augment import augment, transform_sample
-from flcav.perception.objects.config import Augmentation
-from flcav.perception.objects.loss import second_loss
-from flcav.perception.objects.model import head_shape
+from flcav.perception.objects.loss import (
+    anchor_boxes,
+    assign_anchors,
+    decode_residuals,
+    direction_of,
+    encode_residuals,
+    mark_free_cells,
+    second_loss,
+)
+from flcav.perception.objects.model import Augmentation, head_shape
 from flcav.perception.objects.samples import crop_to_range
-from flcav.perception.objects.targets import anchor_boxes, assign_anchors, decode, direction_of, encode, mark_free_cells
 
 CONFIG = second_tiny().config
 NO_POINTS = np.zeros((0, 4), dtype=np.float32)
@@ -35,7 +41,7 @@ def test_decode_inverts_encode():
     anchors = anchor_boxes(CONFIG)[rng.integers(0, 7200, 50)]
     boxes = anchors + rng.normal(0, 0.3, anchors.shape)
     boxes[:, 6] = rng.uniform(-np.pi, np.pi, 50)
-    back = decode(encode(boxes, anchors), direction_of(boxes[:, 6]), anchors)
+    back = decode_residuals(encode_residuals(boxes, anchors), direction_of(boxes[:, 6]), anchors)
     assert np.allclose(back[:, :6], boxes[:, :6])
     assert np.allclose(np.exp(1j * back[:, 6]), np.exp(1j * boxes[:, 6]))
 
@@ -45,7 +51,7 @@ def test_every_object_in_range_gets_an_anchor_that_says_it(yaw):
     sample = Sample(NO_POINTS, cars((10.3, 5.1, yaw), (30.7, -12.2, yaw)))
     targets = assign_anchors(sample, CONFIG)
     anchors = anchor_boxes(CONFIG)[targets.positive.numpy()]
-    said = decode(targets.residual.double().numpy(), targets.direction.numpy(), anchors)
+    said = decode_residuals(targets.residual.double().numpy(), targets.direction.numpy(), anchors)
     truth = sample.boxes.array()
     near = np.linalg.norm(said[:, None, :3] - truth[None, :, :3], axis=2)
     assert set(near.argmin(1)) == {0, 1}

@@ -11,11 +11,10 @@ from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes
+from flcav.perception import tracking as tracking_evaluation
 from flcav.perception.metrics.tracks import TrackingFrame, amota, count_clear_mot
 from flcav.perception.objects import second_tiny
-from flcav.perception.tracking import Tracker, evaluate_tracks
-from flcav.perception.tracking import evaluate as tracking_evaluation
-from flcav.perception.tracking.tracker import TrackState, predict_state, start_state, update_state
+from flcav.perception.tracking import Tracker, TrackState, evaluate_tracks, predict_state, start_state, update_state
 
 from .frames import detections, frame
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from flcav.perception.tracking.tracker import LEAST_VARIANCE, TrackState, assign_detections, innovation
+from flcav.perception.tracking import LEAST_VARIANCE, TrackState, associate_detections, innovation
 
 WIDE = 1e6  # variance [m^2] with which every place is likely
 
@@ -14,7 +14,7 @@ def state(variance: tuple[float, float]) -> TrackState:
 
 
 def pairs(own: TrackState, place: tuple[float, float], after_s: float, yaw: float = 0.0) -> list[tuple[int, int]]:
-    return assign_detections([own], np.array([[*place, 0, 0, 0, 0, yaw]]), np.zeros((1, 7)), after_s)
+    return associate_detections([own], np.array([[*place, 0, 0, 0, 0, yaw]]), np.zeros((1, 7)), after_s)
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.7, np.pi / 2, -2.0])
@@ -43,9 +43,9 @@ def test_of_detections_in_the_gate_the_likeliest_pairs_are_taken_and_others_are_
     second.mean[0] = 3.0
     boxes = np.zeros((3, 7))
     boxes[:, 0] = (2.9, 0.3, 50.0)
-    assert sorted(assign_detections([first, second], boxes, np.zeros((3, 7)), 2.0)) == [(0, 1), (1, 0)]
+    assert sorted(associate_detections([first, second], boxes, np.zeros((3, 7)), 2.0)) == [(0, 1), (1, 0)]
     vague = state((900.0, 900.0))  # as near, and less likely: its spread is larger
-    assert assign_detections([vague, state((1.0, 1.0))], boxes[1:2], np.zeros((1, 7)), 2.0) == [(1, 0)]
+    assert associate_detections([vague, state((1.0, 1.0))], boxes[1:2], np.zeros((1, 7)), 2.0) == [(1, 0)]
 
 
 @pytest.mark.parametrize(("yaw", "turn"), [(np.pi / 2 - 0.01, np.pi / 2 - 0.01), (np.pi / 2 + 0.01, 0.01 - np.pi / 2)])

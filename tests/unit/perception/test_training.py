@@ -9,7 +9,6 @@ from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects import detect_all
 from flcav.perception.objects.evaluate import score_detections
-from flcav.perception.objects.loss import batch_loss
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.task import build_network, find_configuration
@@ -142,7 +141,7 @@ def test_one_cycle_rises_then_falls():
 
 def test_scenes_without_objects_train(samples):
     empty = type(samples[0])(samples[0].points, Boxes.empty())
-    loss = batch_loss(tiny(), [empty, samples[1]])
+    loss = OBJECTS.loss(tiny(), [empty, samples[1]])
     loss.backward()
     assert torch.isfinite(loss)
 

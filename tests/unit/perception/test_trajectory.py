@@ -15,25 +15,23 @@ from flcav.dataset.layout import FrameKey
 from flcav.geometry import inverse, pose
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.cross_view import (
+from flcav.perception.trajectory.evaluate import compute_errors, evaluate_paths, is_turning
+from flcav.perception.trajectory.model import (
     FAR_M,
     LEARNED,
     SCALE_M,
     CrossAttention,
     CrossViewEncoder,
-    Inputs,
+    ForecastInputs,
+    ForecastTensors,
     cast_rays,
     intersect_ground,
     pixel_grid,
     place_grid,
 )
-from flcav.perception.trajectory.evaluate import compute_errors, evaluate_paths, is_turning
-from flcav.perception.trajectory.loss import forecast_loss, map_loss
-from flcav.perception.trajectory.model import ForecastTensors
-from flcav.perception.trajectory.rasters import LAYERS, STATIC, cell_of, centres
-from flcav.perception.trajectory.roads import BEFORE_M, road_map
+from flcav.perception.trajectory.rasters import BEFORE_M, LAYERS, STATIC, cell_of, centres, road_map
 from flcav.perception.trajectory.samples import extract_columns, rescaled
-from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.trajectory.task import TRAJECTORY, forecast_loss, map_loss
 from flcav.perception.trajectory.tracks import (
     check_instants,
     constant_velocity,
@@ -266,7 +264,7 @@ def test_paths_begin_as_constant_velocity_and_look_where_they_are():
     network = build_network(TRAJECTORY, find_configuration(TRAJECTORY, None), 1).eval()
     past = torch.zeros(2, PAST + 1, 4)
     past[:, :, 3] = torch.tensor([6.0, 0.0])[:, None]
-    forecast = network(Inputs(past, raster=torch.zeros(2, len(LAYERS), 64, 64)))
+    forecast = network(ForecastInputs(past, raster=torch.zeros(2, len(LAYERS), 64, 64)))
     plain = torch.from_numpy(constant_velocity(past.numpy())).float()
     assert forecast.paths.shape == (2, 6, FUTURE, 2)
     assert (forecast.paths - plain[:, None]).abs().max() < 2.0
@@ -328,7 +326,7 @@ def test_cameras_are_learned_through_end_to_end():
     pictures = torch.rand(2, 6, 3, 64, 128, generator=random)
     intrinsics = torch.tensor([[60.0, 0, 63.5], [0, 60.0, 31.5], [0, 0, 1]]).expand(2, 6, 3, 3)
     views = torch.eye(4).expand(2, 6, 4, 4)
-    forecast = network(Inputs(torch.zeros(2, PAST + 1, 4), None, pictures, intrinsics, views))
+    forecast = network(ForecastInputs(torch.zeros(2, PAST + 1, 4), None, pictures, intrinsics, views))
     assert forecast.map_logits is not None
     assert forecast.map_logits.shape == (2, len(LEARNED), 32, 32)
     forecast_loss(forecast, torch.ones(2, FUTURE, 2)).backward()

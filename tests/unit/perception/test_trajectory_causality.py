@@ -14,10 +14,10 @@ from scipy.integrate import solve_ivp
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.geometry import heading_vectors, wrap_angle
-from flcav.perception.trajectory import messages, samples, tracks
+from flcav.perception.trajectory import samples, tracks
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.roads import RoadMap, road_map
-from flcav.perception.trajectory.samples import extract_columns, find_near, find_pictured, surround
+from flcav.perception.trajectory.rasters import RoadMap, road_map
+from flcav.perception.trajectory.samples import extract_columns, find_near, find_pictured, surround_vehicle
 from flcav.perception.trajectory.tracks import OFFSETS_S, extrapolate, tracks_around, tracks_at
 from flcav.world.map.town import load_town
 from flcav.world.scenarios.stage import STEP_S
@@ -241,7 +241,7 @@ def test_the_network_with_cameras_sees_earlier_pictures(monkeypatch):
         return np.zeros((1, 48, 96, 3), np.uint8), np.eye(3)[None], np.eye(4)[None]
 
     monkeypatch.setattr(samples, "_kept", lambda _: read)
-    surround(spins(60.0, 60.5, 61.0), 4, np.zeros(3), CrossView())
+    surround_vehicle(spins(60.0, 60.5, 61.0), 4, np.zeros(3), CrossView())
     assert asked == [2]
 
 
@@ -262,10 +262,10 @@ def test_pictures_cross_a_link_once_a_frame_with_the_views_of_all_its_road_users
         frame=frame,
     )
     asked = samples.Samples(data, columns, settings.cameras)
-    monkeypatch.setattr(messages, "samples_of", lambda data, config, frames: asked)
-    sent = list(messages.pack_frames(data, settings, [4, 5]))
+    monkeypatch.setattr(samples, "samples_of", lambda data, config, frames: asked)
+    sent = list(samples.pack_frames(data, settings, [4, 5]))
     assert abs(len(sent[1]) - len(sent[0])) < 1500  # a road user more, and the same pictures
-    received = messages.unpack_frames(sent)
+    received = samples.unpack_frames(sent)
     assert len(received) == count
     for one, other in zip(received, asked, strict=True):
         assert all(np.array_equal(getattr(one, name), getattr(other, name)) for name in samples.Columns._fields)

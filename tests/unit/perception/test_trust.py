@@ -6,8 +6,8 @@ from scipy.special import expit, logit
 
 from flcav.geometry import Boxes
 from flcav.perception.metrics import calibration_error, fit_logistic
-from flcav.perception.objects.calibrate import measure_reliability
 from flcav.perception.objects.evaluate import break_down, format_breakdown, score_detections
+from flcav.perception.objects.predict import measure_reliability
 from flcav.perception.objects.truth import FrameTruth
 
 

@@ -7,12 +7,9 @@ from pydantic import TypeAdapter
 
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.training import train
-from flcav.perception.weather.augment import augment
-from flcav.perception.weather.config import LeNetConfig
-from flcav.perception.weather.evaluate import evaluate_classes
-from flcav.perception.weather.model import SEEN_MAPS, LeNet, PartlyConnected, Subsampling
-from flcav.perception.weather.predict import predict_probabilities
-from flcav.perception.weather.samples import Sample, reduce_picture
+from flcav.perception.weather.evaluate import evaluate_classes, predict_probabilities
+from flcav.perception.weather.model import SEEN_MAPS, LeNet, LeNetConfig, PartlyConnected, Subsampling
+from flcav.perception.weather.samples import Sample, augment_picture, reduce_picture
 from flcav.perception.weather.task import WEATHER
 from flcav.world.weather import WEATHER_CLASSES
 
@@ -100,7 +97,7 @@ def test_it_learns_colours(name):
 
 def test_augmentation_keeps_size_label_and_light():
     picture = np.random.default_rng(0).integers(0, 256, (32, 32, 3), dtype=np.uint8)
-    seen = [augment(Sample(picture, 3, "s"), np.random.default_rng(seed)) for seed in range(40)]
+    seen = [augment_picture(Sample(picture, 3, "s"), np.random.default_rng(seed)) for seed in range(40)]
     assert all(one.picture.shape == (32, 32, 3) and (one.label, one.scene) == (3, "s") for one in seen)
     assert all(abs(one.picture.mean() / picture.mean() - 1) < 0.2 for one in seen)
     assert len({one.picture.tobytes() for one in seen}) == 40

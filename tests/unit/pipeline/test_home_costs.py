@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from flcav.perception.metrics import Matches
-from flcav.perception.objects.outcomes import CLASSES, HIDDEN, KEPT
+from flcav.perception.objects.evaluate import CLASSES, HIDDEN, KEPT
 from flcav.perception.outcomes import Outcomes, as_measurable, count_once, difference, further_measures
 from flcav.perception.tasks import TASKS, task_named
 from flcav.pipeline.analysis.costs import list_home_costs, tell_gain

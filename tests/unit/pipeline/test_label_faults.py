@@ -5,11 +5,10 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.objects.loss import classification_loss
+from flcav.perception.objects.loss import assign_anchors, classification_loss
 from flcav.perception.objects.model import CONFIGURATIONS
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import assign_anchors
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network
 from flcav.pipeline.arms import Names, check_federations, resolve_settings

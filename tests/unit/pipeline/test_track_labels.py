@@ -12,7 +12,7 @@ import pyarrow.parquet as pq
 import pytest
 
 from flcav.config import InputError
-from flcav.fusion.navigation import NavigationErrors
+from flcav.fusion.average import NavigationErrors
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
 from flcav.interface.progress import ignore_progress

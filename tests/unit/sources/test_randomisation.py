@@ -7,8 +7,8 @@ from shapely.geometry import Polygon
 
 from flcav.config import InputError
 from flcav.geometry import inverse
-from flcav.perception.card import read_lidar
 from flcav.perception.task import KnownLidar
+from flcav.perception.weights import find_recorded_lidar
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (
@@ -103,7 +103,7 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
     assert 2.05 < heights.max() <= 2.13
     assert {lidar.settings.range_m for lidar in drawn} == {120.0}
     assert len({lidar.settings.channels for lidar in drawn}) > 8  # even patterns differ in it
-    assert read_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS, 120)
+    assert find_recorded_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS, 120)
     beams = [lidar.settings.channels for lidar in drawn]
     assert min(beams) >= DRAWN_BEAMS[0]
     assert max(beams) == DRAWN_BEAMS[1]

@@ -39,7 +39,7 @@ def import_dataset(
         folder: folder of that format, as it is distributed.
         out: new or empty folder for the dataset.
         split: split whose scenes are taken; None: all.
-        posed: what gives the frames other poses, such as `flcav.fusion.odometry.DrivenSource`.
+        posed: what gives the frames other poses, such as `flcav.fusion.registration.DrivenSource`.
         progress: callback for the frames recorded so far and in total.
     """
     chosen = import_format(name)

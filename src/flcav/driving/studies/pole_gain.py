@@ -17,8 +17,7 @@ from flcav.driving.studies.importance import paired_difference
 from flcav.driving.visibility import FIELD_M
 from flcav.geometry import Boxes, rotate
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.metrics.average_precision import weighted_precision
-from flcav.perception.metrics.matching import match
+from flcav.perception.metrics.detection import match, weighted_precision
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.streams import stream

@@ -1,17 +1,19 @@
 """Metrics of detection: matching, average precision, orientation similarity, calibration error; and of tracking."""
 
-from flcav.perception.metrics.average_precision import (
+from flcav.perception.metrics.detection import (
+    Matches,
     average_precision,
     bootstrap_interval,
+    calibration_error,
+    fit_logistic,
     interval_words,
+    match,
     orientation_similarity,
     right_headings,
     round_or_none,
     weighted_precision,
 )
-from flcav.perception.metrics.calibration import calibration_error, fit_logistic
-from flcav.perception.metrics.found_cars import FoundCars, count_found_cars
-from flcav.perception.metrics.matching import Matches, match
+from flcav.perception.metrics.operating_point import FoundCars, count_found_cars
 
 __all__ = [
     "FoundCars",

@@ -1,4 +1,4 @@
-"""Objects that a detector finds and invents at one score, by distance: the count of an operating point.
+"""Objects that a detector finds and invents at one score: the count of an operating point, near by and by distance.
 
 Intervals are bootstrap ones over scenes or, where all frames are of one scene, over frames; these are too narrow where
 frames follow one another.
@@ -10,9 +10,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from flcav.arrays import Array, Ints, Mask
 from flcav.geometry import Boxes
-from flcav.perception.metrics.found_cars import SCORE
-from flcav.perception.metrics.matching import assign_targets, on_neutral
+from flcav.perception.metrics.detection import assign_targets, on_neutral
+from flcav.perception.ops.boxes import Kind
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.storage.records import Class
 
@@ -72,12 +73,12 @@ def describe_counts(counts: Sequence[FoundAtDistance]) -> list[str]:
     return [f"at a score of {SCORE:g} and 3D IoU {OVERLAP:g}, by distance:", *(row.describe() for row in counts)]
 
 
-def _count_frame(seen: Boxes, wanted: Boxes, others: Boxes) -> tuple[NDArray, NDArray, NDArray]:
+def _count_frame(seen: Boxes, wanted: Boxes, others: Boxes, kind: Kind = "3d") -> tuple[NDArray, NDArray, NDArray]:
     """Return the distances [m] of a frame's targets, of those found, and of false detections."""
     if seen.score is None and len(seen):
         raise ValueError("detections without scores cannot be counted")
     kept = seen if seen.score is None else seen[seen.score >= SCORE]
-    matched = assign_targets(kept, wanted, OVERLAP)
+    matched = assign_targets(kept, wanted, OVERLAP, kind)
     away, far = (np.hypot(boxes.center[:, 0], boxes.center[:, 1]) for boxes in (wanted, kept))
     return away, away[matched[matched >= 0]], far[(matched < 0) & ~on_neutral(kept, others)]
 
@@ -89,9 +90,52 @@ def _within(distance: NDArray, span: tuple[int, int]) -> int:
 def _interval(part: NDArray, whole: NDArray, unit: ArrayLike, rng: np.random.Generator) -> tuple[float, float] | None:
     """Return the 95 % interval of the ratio of two sums over frames; None where no resample has any of the `whole`."""
 
-    def ratio(times: NDArray[np.int64]) -> NDArray[np.float64]:
+    def ratio(times: Ints) -> Array:
         below = times @ whole
         return np.where(below > 0, (times @ part) / np.maximum(below, 1), np.nan)
 
     low, high = bootstrap_over_scenes(ratio, unit, rng=rng)
     return None if np.isnan(low) else (round(low, 6), round(high, 6))
+
+
+WITHIN_M = 40.0  # in the plane from the LiDAR to the centre of a box
+SCORE = 0.3  # lowest of a detection that counts
+
+
+@dataclass(frozen=True)
+class FoundCars:
+    """The targets of class Car near the LiDAR, summed over frames, those found of them, and false detections."""
+
+    cars: int  # within `within_m`, each once a frame
+    found: int  # of these
+    false_per_quarter_turn: float  # false cars within `within_m`, by frame and look; around there are four looks
+    within_m: float = WITHIN_M
+    score: float = SCORE
+    overlap: float = OVERLAP
+
+    def __str__(self) -> str:
+        return (
+            f"cars within {self.within_m:g} m, at a score of {self.score:g} and bird's-eye IoU {self.overlap:g}: found "
+            f"{self.found} of {self.cars}, and {self.false_per_quarter_turn:.2f} false ones a quarter turn"
+        )
+
+
+def count_found_cars(
+    detections: Sequence[Boxes], targets: Sequence[Boxes], neutral: Sequence[Boxes], *, looks: int = 1
+) -> FoundCars:
+    """Return how many cars were found and invented over F frames, of which the three sequences are; all boxes are cars.
+
+    In each frame a detection, in order of score, finds the target that it overlaps most, as in `match`; one on a
+    neutral object is neither true nor false. looks: quarter turns that the network looked at in each frame, 1 or 4.
+    Boxes are in the LiDAR's frame. Raises ValueError where there are no frames, or detections without scores.
+    """
+    if not detections:
+        raise ValueError("cars of 0 frames cannot be counted")
+    frames = [_count_frame(*frame, "bev") for frame in zip(detections, targets, neutral, strict=True)]
+    cars, found, false = (sum(int((away < WITHIN_M).sum()) for away in part) for part in zip(*frames))
+    return FoundCars(cars, found, round(false / (len(detections) * looks), 6))
+
+
+def is_near(boxes: Boxes) -> Mask:
+    """Return (N,) whether the centre of each box is within `WITHIN_M` of the LiDAR, in whose frame the boxes are."""
+    return np.hypot(boxes.center[:, 0], boxes.center[:, 1]) < WITHIN_M

@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
+from flcav.arrays import Array, Ints, Mask, Words
 from flcav.interface.wording import plural
 from flcav.perception.task import Result
 from flcav.storage.records import Class
-
-Array = NDArray[np.float64]
 
 RECALLS = np.arange(1, 41) / 40
 APART_M = 2.0  # largest distance in the plane between the centres of an object and its track, as in nuScenes
@@ -27,12 +25,12 @@ APART_M = 2.0  # largest distance in the plane between the centres of an object 
 class TrackingFrame:
     """Ground truth and tracks of one class in one frame of a sequence; positions in one coordinate frame [m]."""
 
-    objects: NDArray[np.str_]  # (M,) identity of each object to be tracked
+    objects: Words  # (M,) identity of each object to be tracked
     places: Array  # (M, 2) position x, y of each object
-    tracks: NDArray[np.int64]  # (N,) identity of each track
+    tracks: Ints  # (N,) identity of each track
     found: Array  # (N, 2) position x, y of each track
     score: Array  # (N,) of the whole track
-    neutral: NDArray[np.bool_]  # (N,) whether the track lies on a neutral object: no false positive
+    neutral: Mask  # (N,) whether the track lies on a neutral object: no false positive
 
 
 @dataclass(frozen=True)
@@ -152,7 +150,7 @@ def _scaled_mota(counts: ClearMot, recall: float) -> float:
 
 
 def _pairs(
-    moment: TrackingFrame, kept: NDArray[np.int64], apart: Array, last: dict[str, int], apart_m: float
+    moment: TrackingFrame, kept: Ints, apart: Array, last: dict[str, int], apart_m: float
 ) -> list[tuple[int, int]]:
     """Return the pairs (index of an object, index into `kept`) of one frame; apart (M, K): their distances [m]."""
     place = {int(track): t for t, track in enumerate(moment.tracks[kept])}

@@ -15,13 +15,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
-from flcav.perception.objects.config import Augmentation, SecondConfig
-from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.model import Augmentation, SecondConfig
+from flcav.perception.objects.samples import Sample, map_sample
 from flcav.perception.objects.truth import MIN_RETURNS, in_range
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 
 VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, down and up: KITTI's left colour camera
 
@@ -74,11 +74,10 @@ def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: floa
         return replace(boxes, center=center, size=boxes.size * scale, yaw=yaw, variance=variance)
 
     free = None if sample.free is None else (sample.free @ plane).astype(np.float32)
-    own = None if sample.own is None else moved(sample.own)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact, own)
+    return map_sample(sample, points, moved, free)
 
 
-def resize_objects(sample: Sample, factor: NDArray[np.float64]) -> Sample:
+def resize_objects(sample: Sample, factor: Array) -> Sample:
     """Return the sample with length, width and height of box n and the returns inside it scaled by factor[n] (N, 3).
 
     The centre of an object's bottom face stays in place.
@@ -101,21 +100,15 @@ def add_margin(boxes: Boxes, name: str, margin_m: Sequence[float]) -> Boxes:
     return replace(boxes, center=boxes.center + more * (0, 0, 0.5), size=boxes.size + more)
 
 
-def shift_sample(sample: Sample, by_m: NDArray[np.float64]) -> Sample:
+def shift_sample(sample: Sample, by_m: Array) -> Sample:
     """Return the sample shifted in x, y by `by_m` (2,) [m]: the distance of parked cars from the lane varies."""
     points = sample.points.copy()
     points[:, :2] += by_m.astype(np.float32)
-    step = np.append(by_m, 0)
-
-    def moved(boxes: Boxes) -> Boxes:
-        return replace(boxes, center=boxes.center + step)
-
     free = None if sample.free is None else sample.free + by_m.astype(np.float32)
-    own = None if sample.own is None else moved(sample.own)
-    return Sample(points, moved(sample.boxes), moved(sample.ignore), free, sample.exact, own)
+    return map_sample(sample, points, lambda boxes: replace(boxes, center=boxes.center + np.append(by_m, 0)), free)
 
 
-def tilt_sample(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sample:
+def tilt_sample(sample: Sample, slope: Array, lift_m: float) -> Sample:
     """Return the sample with z raised by lift_m + slope . (x, y), slope (2,): a small tilt, with boxes kept upright."""
     points = sample.points.copy()
     points[:, 2] += (points[:, :2] @ slope + lift_m).astype(np.float32)
@@ -124,18 +117,17 @@ def tilt_sample(sample: Sample, slope: NDArray[np.float64], lift_m: float) -> Sa
         rise = boxes.center[:, :2] @ slope + lift_m
         return replace(boxes, center=boxes.center + rise[:, None] * (0, 0, 1))
 
-    own = None if sample.own is None else moved(sample.own)
-    return replace(sample, points=points, boxes=moved(sample.boxes), ignore=moved(sample.ignore), own=own)
+    return map_sample(sample, points, moved, sample.free)
 
 
-def in_view(points: NDArray[np.float32]) -> NDArray[np.bool_]:
+def in_view(points: Array32) -> Mask:
     """Return (N,) whether points (N, >= 3), LiDAR frame, lie in the field of view of a forward camera at the sensor."""
     side, down, up = VIEW
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
 
 
-def keep_returns(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
+def keep_returns(sample: Sample, kept: Mask) -> Sample:
     """Return the sample with the returns of the mask `kept` (N,) alone.
 
     Objects left with fewer than `MIN_RETURNS` returns are ignored; those left with none are removed.
@@ -150,7 +142,7 @@ def keep_returns(sample: Sample, kept: NDArray[np.bool_]) -> Sample:
     return replace(sample, points=points, boxes=sample.boxes[enough], ignore=ignore, exact=exact)
 
 
-def _count_returns(points: NDArray[np.float32], boxes: Boxes) -> NDArray[np.int64]:
+def _count_returns(points: Array32, boxes: Boxes) -> Ints:
     return points_in_boxes(points, boxes).sum(1)
 
 
@@ -159,7 +151,7 @@ class Cutouts:
     """Ground-truth database: objects with the returns inside their boxes, LiDAR frame."""
 
     boxes: Boxes  # label = detection class
-    points: tuple[NDArray[np.float32], ...]  # of each box (N, 4) x, y, z [m], intensity [0, 1]
+    points: tuple[Array32, ...]  # of each box (N, 4) x, y, z [m], intensity [0, 1]
 
 
 def cut_out_objects(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
@@ -194,7 +186,7 @@ def paste_objects(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Ge
     return replace(sample, points=cloud, boxes=concatenate([sample.boxes, added]), exact=exact)
 
 
-def select_free(candidates: Boxes, there: Boxes) -> NDArray[np.int64]:
+def select_free(candidates: Boxes, there: Boxes) -> Ints:
     """Return the indices of candidates, chosen greedily in order, that overlap no other box in bird's-eye view.
 
     Neither those `there` nor one another.

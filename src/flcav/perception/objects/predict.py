@@ -1,26 +1,52 @@
-"""Inference of SECOND: decoding of anchors, score calibration, non-maximum suppression; detections as JSON records."""
+"""Inference of SECOND: decoding of anchors, non-maximum suppression, score calibration, and findings of point clouds.
+
+Scores are calibrated by Platt scaling, and their reliability is measured per class: expected calibration error (ECE)
+and the ratio of squared errors to predicted variances. Point clouds are those of files, folders and datasets.
+"""
 
 import copy
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from flcav.arrays import Array, Array32
+from flcav.config import InputError
+from flcav.dataset.formats.sweeps import list_sweeps, read_sweep
+from flcav.dataset.layout import MANIFEST
+from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second
-from flcav.perception.objects.samples import move_points
-from flcav.perception.objects.targets import anchor_boxes, anchor_classes, decode, decode_variance
-from flcav.perception.objects.truth import QUARTERS, FrameTruth, asked_of, choose_lidar, in_range, network_from_lidar
-from flcav.perception.ops.rotated import nms
+from flcav.perception.agents import frame_reader
+from flcav.perception.device import inference
+from flcav.perception.images import CameraView, recorded_view, view_beside
+from flcav.perception.marks import CloudBoxes
+from flcav.perception.metrics import calibration_error, fit_logistic, match, round_or_none
+from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.objects.loss import anchor_boxes, anchor_classes, decode_residuals, decode_variance
+from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second, SecondConfig
+from flcav.perception.objects.samples import move_points, validate_points
+from flcav.perception.objects.truth import (
+    QUARTERS,
+    FrameTruth,
+    asked_of,
+    choose_lidar,
+    in_range,
+    network_from_lidar,
+    select_class,
+    select_sides,
+)
+from flcav.perception.ops.boxes import nms
 from flcav.perception.ops.sparse import SparseTensor
-from flcav.perception.task import Result
+from flcav.perception.task import Finding, Result
 from flcav.sensors.frame import Frame
 from flcav.storage.records import Class
 
@@ -59,7 +85,7 @@ class ObjectsFound(Result):
         return lines
 
 
-def detect(network: Second, points: NDArray[np.float32], *, score_threshold: float = 0.1) -> Boxes:
+def detect(network: Second, points: Array32, *, score_threshold: float = 0.1) -> Boxes:
     """Return the boxes detected in a point cloud (N, 4) x, y, z [m], intensity [0, 1], LiDAR frame.
 
     They have class labels and scores of at least `score_threshold`, class by class, highest score first, and variances
@@ -81,8 +107,8 @@ def detect_in(network: Second, frames: Sequence[Frame], *, score_threshold: floa
 
 def detect_moved(
     network: Second,
-    clouds: Sequence[NDArray[np.float32]],
-    moves: Sequence[NDArray[np.float64] | None],
+    clouds: Sequence[Array32],
+    moves: Sequence[Array | None],
     *,
     score_threshold: float = 0.1,
 ) -> list[Boxes]:
@@ -96,7 +122,7 @@ def detect_moved(
 
 
 def detect_all(
-    network: Second, clouds: Sequence[NDArray[np.float32]], *, score_threshold: float = 0.1, batch: int = 4
+    network: Second, clouds: Sequence[Array32], *, score_threshold: float = 0.1, batch: int = 4
 ) -> list[Boxes]:
     """Return the boxes detected in each point cloud as `detect` does, `batch` clouds at a time.
 
@@ -122,7 +148,7 @@ def look_around(network: Second) -> Second:
     return turning
 
 
-def _turn(points: NDArray[np.float32], quarters: int) -> NDArray[np.float32]:
+def _turn(points: Array32, quarters: int) -> Array32:
     """Return the points turned by so many quarters to the left about the sensor, exactly."""
     x, y = points[:, 0], points[:, 1]
     for _ in range(quarters % QUARTERS):
@@ -141,13 +167,9 @@ def _suppress(boxes: Boxes, classes: Sequence[str]) -> Boxes:
     return boxes[np.concatenate(kept)]
 
 
-def _detect_ahead(
-    network: Second, clouds: Sequence[NDArray[np.float32]], score_threshold: float, batch: int
-) -> list[Boxes]:
-    training = network.training
-    network.eval()
+def _detect_ahead(network: Second, clouds: Sequence[Array32], score_threshold: float, batch: int) -> list[Boxes]:
     found: list[Boxes] = []
-    with torch.inference_mode():
+    with inference(network):
         for first in range(0, len(clouds), batch):
             output = predict(network, clouds[first : first + batch])
             score = calibrate_logits(output.score, network.config).sigmoid().cpu().numpy()
@@ -158,7 +180,6 @@ def _detect_ahead(
                 spread = output.log_variance.double().clamp(*LOG_VARIANCES).exp().cpu().numpy()
             parts = zip(score, box, direction, spread, strict=True)
             found += [_decode_boxes(network, *one, score_threshold) for one in parts]
-    network.train(training)
     return found
 
 
@@ -186,12 +207,12 @@ def detect_frames(
     return detections, truths
 
 
-def predict(network: Second, clouds: Sequence[NDArray[np.float32]]) -> HeadOutput:
+def predict(network: Second, clouds: Sequence[Array32]) -> HeadOutput:
     """Return the raw predictions of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
     return network(voxels_of(network, clouds))
 
 
-def voxels_of(network: Second, clouds: Sequence[NDArray[np.float32]]) -> SparseTensor | Tensor:
+def voxels_of(network: Second, clouds: Sequence[Array32]) -> SparseTensor | Tensor:
     """Return the input of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
     device = network.head.weight.device
     points = torch.from_numpy(np.concatenate(clouds)).to(device)
@@ -233,10 +254,124 @@ def _decode_boxes(
         likely = likely[scores[likely] >= threshold]
         own, scores = own[likely], scores[likely]
         anchors = anchor_boxes(config)[own]
-        rows = decode(box[own], direction[own], anchors)
+        rows = decode_residuals(box[own], direction[own], anchors)
         kept = nms(torch.from_numpy(rows), torch.from_numpy(scores)).numpy()
         found = Boxes.from_array(rows[kept], name, scores[kept])
         if spread is not None:
             found = replace(found, variance=decode_variance(spread[own][kept], rows[kept], anchors[kept]))
         parts.append(found)
     return concatenate(parts)
+
+
+class InputCloud(NamedTuple):
+    """A point cloud to detect objects in, LiDAR frame."""
+
+    path: Path  # of the file; of a dataset, folder / key of the frame
+    points: Array32  # (N, 4) x, y, z [m], intensity [0, 1]
+    move: Array | None  # (4, 4) brings it to the frame that the network was trained in; None: it is there
+    view: Callable[[], CameraView | None]  # reads the view of a camera with the same direction, None without one
+
+
+def detect_objects(
+    network: Second, path: Path, threshold: float, frames: Sequence[int] | None = None
+) -> Iterator[Finding]:
+    """Yield the objects of score `threshold` or more in each point cloud of `path`.
+
+    path: a file of a point cloud, see `read_sweep`, a folder of them, or a dataset folder, of which `frames` (None:
+    all). Raises `InputError` as `read_point_clouds` does.
+    """
+    for cloud in read_point_clouds(path, frames, network.config):
+        (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)
+        yield Finding(cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view)
+
+
+def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
+    """Yield the point clouds of a file, of a folder of them, or of `frames` (None: all) of a dataset folder.
+
+    Those of a dataset are as a network of `config` sees them. Raises `InputError` where `path` is none of these, a
+    frame has no LiDAR, or a cloud is empty, truncated, of an unknown layout or not of numbers in range.
+    """
+    if (path / MANIFEST).is_file():
+        clouds = _recorded(path, frames, config)
+    elif path.is_dir():
+        files = list_sweeps(path)
+        if not files:
+            raise InputError(f"{path}: neither a dataset nor a folder with .bin or .pcd files")
+        clouds = map(_of_file, files)
+    elif path.is_file():
+        clouds = map(_of_file, [path])
+    else:
+        raise InputError(f"{path}: no such file or folder")
+    return clouds
+
+
+def _of_file(path: Path) -> InputCloud:
+    return InputCloud(path, validate_points(read_sweep(path), path), None, partial(view_beside, path))
+
+
+def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
+    dataset = Dataset.open(folder)
+    read = frame_reader(dataset, config.foreground)
+    for i in dataset.numbers(frames):
+        frame = read(i)
+        lidar, origin = choose_lidar(frame), folder / frame.key
+        points = frame.lidar[lidar]
+        if not config.foreground:  # a street may be empty before its background
+            validate_points(points, origin)
+        yield InputCloud(origin, points, network_from_lidar(frame, config), partial(recorded_view, dataset, i, lidar))
+
+
+OVERLAP = 0.5  # 3D IoU from which a detection is a true positive
+
+
+def calibrate(network: Second, frames: Iterable[Frame]) -> None:
+    """Set the Platt scaling in the configuration of `network`, fitted per class on frames it was not trained on.
+
+    See `flcav.perception.metrics.detection.fit_logistic`.
+    """
+    network.config = replace(network.config, calibration=None)
+    detections, truths = detect_frames(network, frames)
+    fitted = []
+    for name in network.config.classes:
+        matches = match(*select_sides(detections, truths, name), OVERLAP)
+        fitted.append(fit_logistic(matches.score, matches.hit))
+    network.config = replace(network.config, calibration=tuple(fitted))
+
+
+@dataclass(frozen=True)
+class Reliability:
+    """Reliability of one class's scores and predicted variances; None without detections or variances."""
+
+    label: Class
+    detections: int  # true and false positives
+    ece: float | None  # expected calibration error of the scores, in [0, 1]
+    variance_ratio: float | None  # mean squared error of x and y of true positives / mean predicted variance
+
+
+def measure_reliability(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str]
+) -> tuple[Reliability, ...]:
+    """Return calibration error and variance ratio per class; detections and truths run over the same frames.
+
+    A variance ratio of 1 is calibrated, above 1 overconfident, below 1 underconfident.
+    """
+    rows = []
+    for name in classes:
+        matches = match(*select_sides(detections, truths, name), OVERLAP)
+        ece, ratio = calibration_error(matches.score, matches.hit), _variance_ratio(detections, truths, name)
+        rows.append(Reliability(name, len(matches.score), round_or_none(ece), round_or_none(ratio)))
+    return tuple(rows)
+
+
+def _variance_ratio(detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str) -> float:
+    error, variance = [0.0], [0.0]
+    for boxes, truth in zip(detections, truths, strict=True):
+        found, targets = select_class(boxes, name), select_class(truth.targets, name)
+        if found.variance is None or not len(found):
+            continue
+        target = assign_targets(found, targets, OVERLAP)
+        hit = target >= 0
+        error += ((found.center[hit] - targets.center[target[hit]])[:, :2] ** 2).sum(1).tolist()
+        variance += found.variance[hit, :2].sum(1).tolist()
+    total = float(np.sum(variance))
+    return float(np.sum(error)) / total if total else float("nan")

@@ -1,23 +1,25 @@
-"""Training samples of the detector: LiDAR sweeps with labels, from recorded frames."""
+"""Training samples of the detector: LiDAR sweeps with labels, from recorded frames or from messages.
+
+In a message the sweep is whole and uncompressed, 16 bytes a point, with the boxes to learn from.
+"""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Mask
 from flcav.config import InputError
 from flcav.dataset.ground import Ground
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.interface.wording import plural
-from flcav.perception.agents import POLE, kind_of
-from flcav.perception.card import read_lidar
-from flcav.perception.foreground import frame_reader
-from flcav.perception.objects.config import SecondConfig
+from flcav.network.ledger import Arrays, from_names, pack_arrays, to_names, unpack_arrays
+from flcav.perception.agents import POLE, frame_reader, kind_of
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.truth import (
     LEVEL_M,
     LEVEL_RAD,
@@ -28,6 +30,7 @@ from flcav.perception.objects.truth import (
     turn_of,
 )
 from flcav.perception.task import KnownLidar
+from flcav.perception.weights import find_recorded_lidar
 from flcav.sensors.frame import Frame
 
 RANGE_SLACK = 0.2  # difference of a LiDAR's range from the one of the training that is not worth a word
@@ -38,11 +41,11 @@ HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one 
 class Sample:
     """A labelled LiDAR sweep, LiDAR frame."""
 
-    points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity [0, 1]
+    points: Array32  # (N, 4) x, y, z [m], intensity [0, 1]
     boxes: Boxes  # (B,) objects to detect; label = detection class
     ignore: Boxes = field(default_factory=Boxes.empty)  # objects left out of the loss, neither positive nor negative
-    free: NDArray[np.float32] | None = None  # (K, 2) positions x, y [m] without objects; None: wherever no box is
-    exact: NDArray[np.bool_] | None = None  # (B,) whether size and pose of the box are learned too; None: all
+    free: Array32 | None = None  # (K, 2) positions x, y [m] without objects; None: wherever no box is
+    exact: Mask | None = None  # (B,) whether size and pose of the box are learned too; None: all
     own: Boxes | None = None  # the vehicle's own detections, for a contrastive loss; None: there is none
 
 
@@ -69,24 +72,24 @@ def label_sweep(frame: Frame, config: SecondConfig, lidar: str | None = None) ->
     return move_sample(whole, network_from_lidar(frame, config, lidar))
 
 
-def move_sample(sample: Sample, move: NDArray[np.float64] | None) -> Sample:
+def move_sample(sample: Sample, move: Array | None) -> Sample:
     """Return the sample in the target frame of the rigid (4, 4) transform `move`; None: as it is."""
     if move is None:
         return sample
     free = sample.free
     if free is not None:
         free = transform_points(move, np.pad(free, ((0, 0), (0, 1))))[:, :2].astype(np.float32)
-    return replace(
-        sample,
-        points=move_points(sample.points, move),
-        boxes=sample.boxes.transform(move),
-        ignore=sample.ignore.transform(move),
-        free=free,
-        own=None if sample.own is None else sample.own.transform(move),
-    )
+    return map_sample(sample, move_points(sample.points, move), lambda boxes: boxes.transform(move), free)
 
 
-def move_points(points: NDArray[np.float32], move: NDArray[np.float64] | None) -> NDArray[np.float32]:
+def map_sample(sample: Sample, points: Array32, moved: Callable[[Boxes], Boxes], free: Array32 | None) -> Sample:
+    """Return the sample with other points (N, 4) and free positions (K, 2), and all its boxes `moved`, LiDAR frame."""
+    own = None if sample.own is None else moved(sample.own)
+    boxes, ignore = moved(sample.boxes), moved(sample.ignore)
+    return replace(sample, points=points, boxes=boxes, ignore=ignore, free=free, own=own)
+
+
+def move_points(points: Array32, move: Array | None) -> Array32:
     """Return the points (N, 4) x, y, z [m], intensity in the target frame of the rigid (4, 4) `move`; None: as is."""
     return (
         points
@@ -151,13 +154,11 @@ def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trai
         for agent, lidar in agents.items()
         if kind_of(agent) != POLE
     ]
-    here = read_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
+    here = find_recorded_lidar(data.manifest.recipe, agents) if agents else KnownLidar()
     return describe_rig(mounts, here, config, trained)
 
 
-def describe_rig(
-    mounts: Sequence[NDArray[np.float64]], here: KnownLidar, config: SecondConfig, trained: KnownLidar
-) -> str:
+def describe_rig(mounts: Sequence[Array], here: KnownLidar, config: SecondConfig, trained: KnownLidar) -> str:
     """Return how a LiDAR `here` differs from the one of the network's training, in words.
 
     That is by its number of beams, its range as far as the network looks, its height above the ground and its
@@ -189,7 +190,7 @@ def _span(beams: tuple[int, int]) -> str:
     return str(beams[0]) if beams[0] == beams[1] else f"{beams[0]} to {beams[1]}"
 
 
-def crop_to_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[np.float32]:
+def crop_to_range(points: Array32, config: SecondConfig) -> Array32:
     """Return the points (N', 4) of a sweep (N, 4) that global augmentation may move into the range of `config`.
 
     Global augmentation is mirroring, turning, scaling, shifting, tilting and lifting; the bounds are approximate.
@@ -208,7 +209,7 @@ def crop_to_range(points: NDArray[np.float32], config: SecondConfig) -> NDArray[
     return points[kept]
 
 
-def validate_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[np.float32]:
+def validate_points(points: Array32, origin: str | Path) -> Array32:
     """Return the points unchanged; raises `InputError` unless they are (N, 4), N >= 1, with finite numbers in range.
 
     origin: their file or frame, named in the message.
@@ -223,3 +224,28 @@ def validate_points(points: NDArray[np.float32], origin: str | Path) -> NDArray[
     if bad := int(((points[:, 3] < 0) | (points[:, 3] > 1)).sum()):
         raise InputError(f"{origin}: {bad} of {plural(len(points), 'point')} have an intensity outside 0 to 1")
     return points
+
+
+def pack_sample(frame: Frame, config: SecondConfig) -> bytes:
+    """Return the message of a frame's sweep with its ground truth; raises `InputError` where it has no LiDAR."""
+    sample = label_sweep(frame, config)
+    return pack_arrays(
+        {"points": sample.points, **pack_boxes(sample.boxes, "boxes"), **pack_boxes(sample.ignore, "ignore")}
+    )
+
+
+def unpack_sample(message: bytes, config: SecondConfig) -> Sample:
+    """Return the training sample in a message: that of `sample_from_frame`."""
+    arrays = unpack_arrays(message)
+    points = crop_to_range(arrays["points"], config)
+    return Sample(points, unpack_boxes(arrays, "boxes"), unpack_boxes(arrays, "ignore"))
+
+
+def pack_boxes(boxes: Boxes, name: str) -> Arrays:
+    """Return boxes without scores as two arrays of a message."""
+    return {name: boxes.array(), f"{name}.label": from_names(boxes.label.tolist())}
+
+
+def unpack_boxes(arrays: Arrays, name: str) -> Boxes:
+    """Return the boxes in a message: the inverse of `pack_boxes`."""
+    return Boxes.from_array(arrays[name], to_names(arrays[f"{name}.label"]))

@@ -1,6 +1,10 @@
-"""3D object detection as a perception task: samples, loss, evaluation, inference and error registry of SECOND."""
+"""3D object detection by SECOND as a `Task`, its error registry, and its study recipes.
 
-from collections.abc import Iterator, Mapping, Sequence
+A miss is a target or faint object (see `flcav.perception.objects.truth`) without a detection. A false positive is a
+detection on no annotated object with at least one LiDAR return in its box. Both lie within the range of the network.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -8,25 +12,118 @@ from torch import Tensor
 
 from flcav.config import Json
 from flcav.dataset.store import Dataset
-from flcav.geometry import Boxes
+from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.errors import THRESHOLD, Registry
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import frame_reader
+from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, Registry
+from flcav.perception.metrics.detection import assign_targets, on_neutral
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
-from flcav.perception.objects.calibrate import calibrate, measure_reliability
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.errors import find_errors
-from flcav.perception.objects.evaluate import ObjectsEvaluation, break_down, count_cars, count_objects, score_detections
-from flcav.perception.objects.infer import detect_objects
-from flcav.perception.objects.loss import batch_loss
-from flcav.perception.objects.messages import pack_sweep, unpack_sweep
-from flcav.perception.objects.model import CONFIGURATIONS, Second, second
-from flcav.perception.objects.outcomes import ObjectsOutcomes
-from flcav.perception.objects.predict import detect_frames, detect_in
-from flcav.perception.objects.samples import RecordedSweeps, Sample, compare_rig, select_fitting_frames
-from flcav.perception.objects.truth import target_criteria
-from flcav.perception.study import StudyRecipe
+from flcav.perception.objects.evaluate import (
+    ObjectsEvaluation,
+    ObjectsOutcomes,
+    break_down,
+    count_cars,
+    count_objects,
+    score_detections,
+)
+from flcav.perception.objects.loss import assign_anchors, second_loss
+from flcav.perception.objects.model import CONFIGURATIONS, Second, SecondConfig, second
+from flcav.perception.objects.predict import (
+    calibrate,
+    detect_frames,
+    detect_in,
+    detect_objects,
+    measure_reliability,
+    predict,
+)
+from flcav.perception.objects.samples import (
+    RecordedSweeps,
+    Sample,
+    compare_rig,
+    pack_sample,
+    select_fitting_frames,
+    unpack_sample,
+)
+from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range, target_criteria
+from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, KnownLidar, Practice
+from flcav.sensors.frame import Frame
+
+TOWNS = ("suburb", "ring", "grid")  # of the study
+TRACKS = "tracks"  # test of tracking
+
+
+OVERLAP = 0.5  # 3D IoU from which an object is detected
+
+
+def find_errors(
+    frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
+) -> Iterator[list[PerceptionError]]:
+    """Yield the misses and false positives of each frame, of detections of score `threshold` or more.
+
+    They are at world coordinates; those that repeat over frames are among them, see `flcav.perception.errors`.
+    detections: one `Boxes` per frame, LiDAR frame. Raises ValueError where these and `frames` differ in length.
+    """
+    for frame, found in zip(frames, detections, strict=True):
+        found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
+        matched = np.zeros(len(found), dtype=bool)
+        missed = _misses(frame, found, matched, config)
+        yield [*missed, *_false_positives(frame, found[~matched], config)]
+
+
+def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
+    """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    label, asked = truth.boxes.label, truth.target | truth.faint
+    missed = asked.copy()
+    for name in config.classes:
+        own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
+        target = assign_targets(found[own], truth.boxes[objects], OVERLAP)
+        matched[own[target >= 0]] = True
+        missed[objects[target[target >= 0]]] = False
+    matched |= on_neutral(found, truth.boxes)
+    rows = zip(annotations.boxes.center, label, truth.returns, annotations.occlusion, annotations.track, missed)
+    return [
+        PerceptionError(*at.tolist(), 1.0, MISS, str(name), int(returns), float(hidden), frame.scene, str(track))
+        for at, name, returns, hidden, track, lost in rows
+        if lost
+    ]
+
+
+def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[PerceptionError]:
+    name = choose_lidar(frame)
+    found = found[in_range(found, config)]
+    returns = points_in_boxes(frame.lidar[name], found).sum(1)
+    world = transform_points(frame.world_from_sensor(name), found.center)
+    return [
+        PerceptionError(*at.tolist(), 1.0, FALSE_POSITIVE, str(label), int(count), float("nan"), frame.scene, "")
+        for at, label, count in zip(world, found.label, returns, strict=True)
+        if count >= 1
+    ]
+
+
+def streets_study() -> StudyRecipe:
+    """Return the study recipe of drawn streets: five of each town, and a third of the sweeps of `ObjectsTask.study`.
+
+    Cars in those sweeps have flat ends.
+    """
+    recipe, drawn = read_recipe("objects"), read_recipe("streets")
+    tested, drawn_test = {"split": "test", "scenes": 10, "spins_per_scene": 4}, {"split": "test", "scenes": 10}
+    return StudyRecipe(
+        network="small",
+        train=(
+            *({**recipe, "town": town, "scenes": 5} for town in TOWNS),
+            *({**drawn, "town": town, "seed": seed} for town in TOWNS for seed in (23, 25, 27, 29, 31)),
+        ),
+        validation={**drawn, "town": "suburb", "seed": 123, "split": "validation", "scenes": 2},
+        tests={
+            **{town: {**recipe, **tested, "town": town, "seed": 451} for town in TOWNS},
+            "streets": {**drawn, **drawn_test, "town": "suburb", "seed": 453},
+            "streets-arterial": {**drawn, **drawn_test, "town": "arterial", "seed": 455},
+        },
+        epochs=8,
+        patience=8,
+    )
 
 
 class ObjectsTask(ObjectsOutcomes):
@@ -44,10 +141,23 @@ class ObjectsTask(ObjectsOutcomes):
         self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # the latest ground-truth database and its samples
 
     def study(self) -> StudyRecipe:
-        """Return the study recipe of the task, see `flcav.perception.objects.study`."""
-        from flcav.perception.objects.study import STUDY
-
-        return STUDY
+        """Return the study recipe: training in three towns, tests on other scenes of each, in weather, of tracking."""
+        recipe = read_recipe("objects")
+        tested = {**recipe, "split": "test", "scenes": 10, "spins_per_scene": 4}
+        weather = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
+        sequences = {**tested, "spins_per_scene": 20, "every_s": 0.5, "cavs": 1}
+        return StudyRecipe(
+            network="small",
+            train=tuple({**recipe, "town": town} for town in TOWNS),
+            validation={**recipe, "town": "suburb", "seed": 121, "split": "validation", "scenes": 2},
+            tests={
+                **{town: {**tested, "town": town, "seed": 441} for town in TOWNS},
+                "weathers": {**tested, "town": "suburb", "seed": 541, "weather": weather},
+                TRACKS: {**sequences, "town": "suburb", "seed": 641},
+            },
+            epochs=8,
+            patience=8,
+        )
 
     def build(self, config: SecondConfig) -> Second:
         """Return a new SECOND network; torch's global generator draws its weights."""
@@ -92,7 +202,8 @@ class ObjectsTask(ObjectsOutcomes):
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of SECOND on a batch, differentiable in the network's parameters."""
-        return batch_loss(network, samples)
+        targets = [assign_anchors(sample, network.config) for sample in samples]
+        return second_loss(predict(network, [sample.points for sample in samples]), targets, network.config)
 
     def evaluate(
         self,
@@ -137,16 +248,16 @@ class ObjectsTask(ObjectsOutcomes):
         """Yield the message of each frame: its whole sweep and its boxes."""
         RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
         read = frame_reader(data, config.foreground)
-        return (pack_sweep(read(i), config) for i in frames)
+        return (pack_sample(read(i), config) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: SecondConfig) -> list[Sample]:
         """Return the samples in messages of `pack_samples`."""
-        return [unpack_sweep(message, config) for message in messages]
+        return [unpack_sample(message, config) for message in messages]
 
     def infer(
         self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.infer`."""
+        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.predict`."""
         yield from detect_objects(network, path, threshold, frames)
 
     def register_errors(
@@ -159,7 +270,7 @@ class ObjectsTask(ObjectsOutcomes):
     ) -> Registry:
         """Return the registry of the network's misses and false positives on frames (None: all).
 
-        threshold: lowest score of a detection. See `flcav.perception.objects.errors`.
+        threshold: lowest score of a detection. See `find_errors`.
         """
         data.check_labelled("objects")
         numbers, read = data.numbers(frames), frame_reader(data, network.config.foreground)

@@ -6,17 +6,18 @@ definition; how each treats the kinds is in docs/tasks.md.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import InputError
 from flcav.geometry import Boxes, inverse
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.sensors.frame import Frame
 from flcav.statistics.estimates import CONFIDENCE
 from flcav.storage.records import LEFT_OUT
@@ -36,8 +37,6 @@ QUARTERS = 4  # quarter turns of a whole spin
 LEVEL_M = 0.15  # difference of a mount's height from the one of the training that needs no correction
 LEVEL_RAD = 0.05  # the same of its direction
 
-Mask = NDArray[np.bool_]
-
 
 @dataclass(frozen=True)
 class GroundTruth:
@@ -48,7 +47,7 @@ class GroundTruth:
     """
 
     boxes: Boxes  # (M,) LiDAR frame; label = detection class, of a lookalike the one it resembles, else ""
-    returns: NDArray[np.int64]  # (M,) of all LiDARs
+    returns: Ints  # (M,) of all LiDARs
     inside: Mask  # (M,) centre within the range in bird's-eye view
     lookalike: Mask  # (M,) trucks and buses, for a network that knows cars
 
@@ -105,7 +104,7 @@ def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
     return inside
 
 
-def network_from_lidar(frame: Frame, config: SecondConfig, lidar: str | None = None) -> NDArray[np.float64] | None:
+def network_from_lidar(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Array | None:
     """Return the (4, 4) transform from a LiDAR's frame to the one that a network of `config` was trained in.
 
     That one is level, its x axis points ahead of the vehicle, and the ground is at `config.ground_z_m`. The mount is
@@ -116,25 +115,25 @@ def network_from_lidar(frame: Frame, config: SecondConfig, lidar: str | None = N
     return None if kind_of(frame.agent) == POLE else level_mount(mount, config)
 
 
-def level_mount(mount: NDArray[np.float64], config: SecondConfig) -> NDArray[np.float64] | None:
+def level_mount(mount: Array, config: SecondConfig) -> Array | None:
     """Return the (4, 4) transform of `network_from_lidar` for a vehicle's LiDAR with this (4, 4) mount, or None."""
     levelled = np.eye(4)
     levelled[:3, :3], levelled[2, 3] = mount[:3, :3], mount[2, 3] + config.ground_z_m
     return None if turn_of(mount) <= LEVEL_RAD and abs(levelled[2, 3]) <= LEVEL_M else levelled
 
 
-def turn_of(mount: NDArray[np.float64]) -> float:
+def turn_of(mount: Array) -> float:
     """Return the angle of the rotation in a rigid (4, 4) transform [rad], in [0, pi]."""
     return math.acos(min(1.0, max(-1.0, (float(np.trace(mount[:3, :3])) - 1) / 2)))
 
 
-def detection_labels(category: NDArray[np.str_], classes: tuple[str, ...]) -> NDArray[np.str_]:
+def detection_labels(category: Words, classes: tuple[str, ...]) -> Words:
     """Return the detection class (N,) of each actor category (N,), "" where it is none of `classes`."""
     mapped = [DETECTION_CLASS.get(str(name), "") for name in category]
     return np.array([name if name in classes else "" for name in mapped], dtype=np.str_)
 
 
-def is_lookalike(category: NDArray[np.str_], classes: tuple[str, ...]) -> Mask:
+def is_lookalike(category: Words, classes: tuple[str, ...]) -> Mask:
     """Return (N,) whether an actor category (N,) resembles one of `classes` so that a detection is no error.
 
     Trucks and buses resemble cars.
@@ -160,9 +159,9 @@ class FrameTruth:
     targets: Boxes  # (T,) objects to be found
     neutral: Boxes  # a detection on them is neither true nor false; label = the class they are neutral for
     hidden: Boxes  # in range without a return: counted, and neutral too
-    occlusion: NDArray[np.float64] | None = None  # (targets,) occluded share in [0, 1]; None: not known
+    occlusion: Array | None = None  # (targets,) occluded share in [0, 1]; None: not known
     weather: str | None = None  # weather class of the frame; None between the classes, and where it is not known
-    returns: NDArray[np.int64] | None = None  # (targets,) LiDAR returns; None: not known
+    returns: Ints | None = None  # (targets,) LiDAR returns; None: not known
 
 
 def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
@@ -184,6 +183,15 @@ def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
 def select_class(boxes: Boxes, name: str) -> Boxes:
     """Return the boxes with the label `name`."""
     return boxes[boxes.label == name]
+
+
+def select_sides(
+    detections: Sequence[Boxes], truths: Sequence[FrameTruth], name: str
+) -> tuple[list[Boxes], list[Boxes], list[Boxes]]:
+    """Return the detections, the targets and the neutral objects of the class `name` in each frame."""
+    sides = (detections, [truth.targets for truth in truths], [truth.neutral for truth in truths])
+    found, targets, neutral = ([select_class(boxes, name) for boxes in side] for side in sides)
+    return found, targets, neutral
 
 
 def narrow_range(config: SecondConfig, text: str) -> SecondConfig:

@@ -15,18 +15,16 @@ from itertools import product
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
+from flcav.arrays import Ints, Ints32
 from flcav.machine.compiled import compiled
 
-Int32s = NDArray[np.int32]
-Int64s = NDArray[np.int64]
 Triple = tuple[int, int, int]
 
 
 @compiled
-def find_submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s, Int64s]:
+def find_submanifold_pairs(keys: Ints, steps: Ints) -> tuple[Ints32, Ints32, Ints]:
     """Return the pairs of a 3x3x3 submanifold convolution: source (P,), target (P,), number of pairs per offset (27,).
 
     keys (N,) ascending; steps (13,) key differences of the offsets after the centre, z-major. Pairs are grouped by
@@ -69,8 +67,8 @@ def find_submanifold_pairs(keys: Int64s, steps: Int64s) -> tuple[Int32s, Int32s,
 
 @compiled
 def find_strided_pairs(
-    keys: Int64s, samples: int, shape: Int64s, kernel: Int64s, stride: Int64s, padding: Int64s, out_shape: Int64s
-) -> tuple[Int32s, Int32s, Int64s, Int64s]:
+    keys: Ints, samples: int, shape: Ints, kernel: Ints, stride: Ints, padding: Ints, out_shape: Ints
+) -> tuple[Ints32, Ints32, Ints, Ints]:
     """Return the pairs of a strided convolution: source (P,), target (P,), number per offset (K,), output keys (M,).
 
     keys (N,) and output keys ascend. shape, kernel, stride, padding, out_shape: (3,) along z, y, x. Pairs are grouped

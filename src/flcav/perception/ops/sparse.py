@@ -1,9 +1,10 @@
 """Submanifold and strided sparse 3D convolution: gather, one matrix product per kernel offset, sum by output voxel.
 
-On a CPU compiled kernels do it block by block (`blocks`). Elsewhere the sum by output voxel is an `embedding_bag`,
-which reads each product once, in the order of the outputs. The backward pass is written by hand and keeps the input
-features and the weight alone. Convolutions: Graham et al., "3D Semantic Segmentation with Submanifold Sparse
-Convolutional Networks", CVPR 2018.
+On a CPU compiled kernels work through the pairs of a rulebook in blocks: the products of a block stay in the
+processor's cache; those of all pairs at once would go through main memory. Each product is smaller than those that BLAS
+spreads over threads. Elsewhere the sum by output voxel is an `embedding_bag`, which reads each product once, in the
+order of the outputs. The backward pass is written by hand and keeps the input features and the weight alone.
+Convolutions: Graham et al., "3D Semantic Segmentation with Submanifold Sparse Convolutional Networks", CVPR 2018.
 """
 
 import contextlib
@@ -19,7 +20,8 @@ import torch.nn.functional as F
 from numpy.typing import NDArray
 from torch import Tensor, nn
 
-from flcav.perception.ops import blocks
+from flcav.arrays import Ints, Ints32
+from flcav.machine.compiled import compiled
 from flcav.perception.ops.rulebook import (
     Groups,
     Rulebook,
@@ -28,6 +30,9 @@ from flcav.perception.ops.rulebook import (
     build_submanifold_rulebook,
     decode_keys,
 )
+
+Floats = NDArray[np.floating]
+Pairs = tuple[Ints32, Ints32, Ints]  # source and target (P,), and where each kernel offset's pairs begin (K + 1,)
 
 
 @dataclass(frozen=True)
@@ -99,34 +104,35 @@ class _SparseConvolution(torch.autograd.Function):
             return _grouped(features, weight, rules, rules.by_target)
         out = features.new_zeros(rules.targets, weight.shape[2])
         arrays = (features.detach().contiguous().numpy(), weight.detach().contiguous().numpy())
-        blocks.convolve(*arrays, *_pairs(rules), out.numpy())
+        convolve(*arrays, _pairs(rules), out.numpy())
         return out
 
     @staticmethod
-    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
+    def backward(ctx: Any, *convolution_gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
         features, weight = ctx.saved_tensors
-        gradient = gradients[0].contiguous()
+        gradient = convolution_gradients[0].contiguous()
         wants_features = ctx.needs_input_grad[0]
         if ctx.rules.by_target is not None:
             return *_grouped_gradients(features, weight, gradient, ctx.rules, wants_features), None
         grad_weight = torch.zeros_like(weight, memory_format=torch.contiguous_format)
         arrays = (features.detach().contiguous().numpy(), gradient.numpy())
         if not wants_features:
-            blocks.weight_gradient(*arrays, *_pairs(ctx.rules), grad_weight.numpy())
+            weight_gradient(*arrays, _pairs(ctx.rules), grad_weight.numpy())
             return None, grad_weight, None
         grad_features = torch.zeros_like(features, memory_format=torch.contiguous_format)
         turned = weight.detach().transpose(1, 2).contiguous().numpy()
-        source, target, begins = _pairs(ctx.rules)
+        pairs = _pairs(ctx.rules)
         if _second is None:
-            blocks.gradients(*arrays, turned, source, target, begins, grad_features.numpy(), grad_weight.numpy())
+            convolution_gradients(*arrays, turned, pairs, grad_features.numpy(), grad_weight.numpy())
         else:
-            beside = _second.submit(blocks.weight_gradient, *arrays, source, target, begins, grad_weight.numpy())
-            blocks.convolve(arrays[1], turned, target, source, begins, grad_features.numpy())
+            beside = _second.submit(weight_gradient, *arrays, pairs, grad_weight.numpy())
+            source, target, begins = pairs
+            convolve(arrays[1], turned, (target, source, begins), grad_features.numpy())
             beside.result()
         return grad_features, grad_weight, None
 
 
-def _pairs(rules: Rulebook) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
+def _pairs(rules: Rulebook) -> Pairs:
     """Return source (P,), target (P,), and (K + 1,) where the pairs of each offset begin and the last ones end."""
     return rules.source.numpy(), rules.target.numpy(), np.cumsum((0, *rules.counts), dtype=np.int64)
 
@@ -196,3 +202,90 @@ class StridedConv3d(nn.Module):
 def _initial(offsets: int, in_channels: int, out_channels: int) -> Tensor:
     active = offsets / 3  # He initialisation: about a third of the neighbours of a LiDAR voxel are occupied
     return torch.randn(offsets, in_channels, out_channels) * math.sqrt(2 / (in_channels * active))
+
+
+BLOCK = 1 << 18  # most multiplications in the matrix product of a block
+LONGEST = 1024  # most pairs in a block
+
+
+@compiled
+def convolve(features: Floats, weight: Floats, pairs: Pairs, out: Floats) -> None:
+    """Sparse convolution, forward pass: add features[s] @ weight[k] to out[t] for every pair (s, t) of kernel offset k.
+
+    features (N, C), weight (K, C, C'), out (M, C'), changed in place. pairs: source and target (P,), the rows s
+    and t, and begins (K + 1,): those of offset k are numbers begins[k] to begins[k + 1]. No target occurs twice in an
+    offset.
+    """
+    source, target, begins = pairs
+    block = min(LONGEST, max(1, BLOCK // (weight.shape[1] * weight.shape[2])))
+    sent = np.empty((block, weight.shape[1]), dtype=features.dtype)
+    product = np.empty((block, weight.shape[2]), dtype=features.dtype)
+    for k in range(len(begins) - 1):
+        for first in range(begins[k], begins[k + 1], block):
+            n = min(block, begins[k + 1] - first)
+            _gather(features, source, first, sent[:n])
+            np.dot(sent[:n], weight[k], product[:n])
+            _scatter(product[:n], target, first, out)
+
+
+@compiled
+def weight_gradient(features: Floats, gradient: Floats, pairs: Pairs, out: Floats) -> None:
+    """Gradient of the weights: add features[s]^T gradient[t] to out[k] for every pair (s, t) of kernel offset k.
+
+    features (N, C), gradient of the output (M, C'), out (K, C, C'), changed in place; pairs as in `convolve`.
+    """
+    source, target, begins = pairs
+    block = min(LONGEST, max(1, BLOCK // (out.shape[1] * out.shape[2])))
+    sent = np.empty((block, out.shape[1]), dtype=features.dtype)
+    arrived = np.empty((block, out.shape[2]), dtype=features.dtype)
+    part = np.empty((out.shape[1], out.shape[2]), dtype=features.dtype)
+    for k in range(len(begins) - 1):
+        for first in range(begins[k], begins[k + 1], block):
+            n = min(block, begins[k + 1] - first)
+            _gather(features, source, first, sent[:n])
+            _gather(gradient, target, first, arrived[:n])
+            np.dot(sent[:n].T, arrived[:n], part)
+            out[k] += part
+
+
+@compiled
+def convolution_gradients(
+    features: Floats, gradient: Floats, turned: Floats, pairs: Pairs, to_features: Floats, to_weight: Floats
+) -> None:
+    """Gradients of weights and input features, in one pass over the pairs.
+
+    For every pair (s, t) of kernel offset k, features[s]^T gradient[t] is added to to_weight[k] (K, C, C'), and
+    gradient[t] @ turned[k] to to_features[s] (N, C), both in place. turned (K, C', C): the weight of each offset,
+    transposed. The rest is as in `convolve`.
+    """
+    source, target, begins = pairs
+    block = min(LONGEST, max(1, BLOCK // (turned.shape[1] * turned.shape[2])))
+    sent = np.empty((block, turned.shape[2]), dtype=features.dtype)
+    arrived = np.empty((block, turned.shape[1]), dtype=features.dtype)
+    product = np.empty_like(sent)
+    part = np.empty((turned.shape[2], turned.shape[1]), dtype=features.dtype)
+    for k in range(len(begins) - 1):
+        for first in range(begins[k], begins[k + 1], block):
+            n = min(block, begins[k + 1] - first)
+            _gather(features, source, first, sent[:n])
+            _gather(gradient, target, first, arrived[:n])
+            np.dot(sent[:n].T, arrived[:n], part)
+            to_weight[k] += part
+            np.dot(arrived[:n], turned[k], product[:n])
+            _scatter(product[:n], source, first, to_features)
+
+
+@compiled
+def _gather(rows: Floats, index: Ints32, first: int, out: Floats) -> None:
+    for pair in range(out.shape[0]):
+        row = np.uint64(index[first + pair])
+        for column in range(out.shape[1]):
+            out[pair, column] = rows[row, column]
+
+
+@compiled
+def _scatter(rows: Floats, index: Ints32, first: int, out: Floats) -> None:
+    for pair in range(rows.shape[0]):
+        row = np.uint64(index[first + pair])
+        for column in range(rows.shape[1]):
+            out[row, column] += rows[pair, column]

@@ -4,18 +4,18 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Ints
 from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, HALF_PX, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry
 from flcav.perception.images import check_picture
-from flcav.perception.ops.rectangles import iou
-from flcav.perception.signs.config import SignsConfig
-from flcav.perception.signs.model import SignDetector
-from flcav.perception.signs.predict import SignDetections, detect
+from flcav.perception.metrics.detection import match_greedily
+from flcav.perception.ops.boxes import rectangle_iou
+from flcav.perception.signs.model import SignDetector, SignsConfig
+from flcav.perception.signs.predict import SignDetections, detect_in_picture
 from flcav.perception.signs.samples import find_targets, size_px
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import unproject_pixels
@@ -26,7 +26,7 @@ OVERLAP = 0.5  # least IoU of a true positive
 WITHIN = 0.5  # least share of a detection on a neutral (too small or cut off) box for it to be no mistake
 
 
-def register_errors(
+def register_sign_errors(
     network: SignDetector,
     data: Dataset,
     frames: Sequence[int],
@@ -52,7 +52,7 @@ def register_errors(
     for done, (number, camera) in enumerate(pairs, start=1):
         frame = data.frame(number)
         picture = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
-        found = detect(network, picture, threshold=threshold)
+        found = detect_in_picture(network, picture, threshold=threshold)
         height, width = picture.shape[:2]
         misses, false = _mistakes(frame, camera, found, (width, height), network.config)
         meets = list(_meets(frame, camera, found, false, solid, network.config))
@@ -65,32 +65,31 @@ def register_errors(
 
 def _mistakes(
     frame: Frame, camera: str, found: SignDetections, size: tuple[int, int], config: SignsConfig
-) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+) -> tuple[Ints, Ints]:
     """Return the annotation rows of the missed signs of an image, and the indices of the false positives."""
     shown = select_rectangles(frame, camera, "signs", min_pixels=1)
     names = [CLASSES["signs"][number] for number in shown.label]
     wanted = find_targets(shown.box, size, config) & np.array([name in config.classes for name in names], dtype=bool)
-    overlap = iou(torch.from_numpy(found.box), torch.from_numpy(shown.box)).numpy()
+    overlap = rectangle_iou(torch.from_numpy(found.box), torch.from_numpy(shown.box)).numpy()
     same = np.array([[config.classes[label] == name for name in names] for label in found.label], dtype=bool)
-    overlap = np.where(same.reshape(overlap.shape), overlap, 0.0)
-    free = wanted.copy()
-    false = []
-    for number in range(len(found)):
-        gain = np.where(free, overlap[number], 0.0)
-        if len(gain) and gain.max() >= OVERLAP:
-            free[gain.argmax()] = False
-        elif size_px(found.box[[number]])[0] >= config.smallest_px and not _on(found.box[number], shown.box[~wanted]):
-            false.append(number)
-    return shown.row[free], np.array(false, dtype=np.int64)
+    matched = match_greedily(np.where(same.reshape(overlap.shape) & wanted, overlap, 0.0), OVERLAP)
+    false = [
+        number
+        for number in np.flatnonzero(matched < 0)
+        if size_px(found.box[[number]])[0] >= config.smallest_px and not _on(found.box[number], shown.box[~wanted])
+    ]
+    missed = wanted.copy()
+    missed[matched[matched >= 0]] = False
+    return shown.row[missed], np.array(false, dtype=np.int64)
 
 
-def _on(box: NDArray[np.float64], others: NDArray[np.float64]) -> bool:
+def _on(box: Array, others: Array) -> bool:
     """Return whether at least the share `WITHIN` of a box (4,) lies inside one of the others (K, 4)."""
     low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
     return bool(((high - low).clip(min=0).prod(1) >= WITHIN * (box[2:] - box[:2]).prod()).any())
 
 
-def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: SignsAndSignals) -> Iterator[PerceptionError]:
+def _misses(frame: Frame, camera: str, rows: Ints, things: SignsAndSignals) -> Iterator[PerceptionError]:
     signs, shown = frame.annotations.signs[camera], select_rectangles(frame, camera, "signs", min_pixels=1)
     for row in rows.tolist():
         thing = int(signs.thing[row])
@@ -101,7 +100,7 @@ def _misses(frame: Frame, camera: str, rows: NDArray[np.int64], things: SignsAnd
 
 
 def _meets(
-    frame: Frame, camera: str, found: SignDetections, numbers: NDArray[np.int64], solid: Solid, config: SignsConfig
+    frame: Frame, camera: str, found: SignDetections, numbers: Ints, solid: Solid, config: SignsConfig
 ) -> Iterator[PerceptionError | None]:
     """Yield each false positive at the hit of its ray with the town, None for a ray without a hit."""
     if not len(numbers):

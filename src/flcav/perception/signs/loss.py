@@ -1,35 +1,84 @@
-"""Loss of the sign detector: complete IoU of boxes, and binary cross entropies of objectness and classes."""
+"""Targets and loss of the sign detector: boxes assigned to anchors; complete IoU, objectness and class entropies.
+
+`class_probabilities` are what a network says of the same boxes, from which others learn (see `number_boxes`).
+"""
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn import functional
 
-from flcav.perception.ops.rectangles import complete_iou
-from flcav.perception.signs.config import STRIDES, SignsConfig
-from flcav.perception.signs.model import SignDetector, decode_boxes
-from flcav.perception.signs.predict import predict
+from flcav.arrays import Array32
+from flcav.perception.device import inference
+from flcav.perception.ops.boxes import complete_iou
+from flcav.perception.signs.model import STRIDES, SignDetector, SignsConfig, decode_boxes
+from flcav.perception.signs.predict import predict_levels
 from flcav.perception.signs.samples import Sample
-from flcav.perception.signs.targets import Targets, assign_anchors
+
+MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, either way; `decode_boxes` reaches no more
+
+
+@dataclass(frozen=True)
+class LevelTargets:
+    """Training targets of a batch at one level: P pairs of a box with an anchor of a cell."""
+
+    image: Tensor  # (P,) index in the batch
+    anchor: Tensor  # (P,) index of the anchor
+    row: Tensor  # (P,) of the cell
+    column: Tensor  # (P,) of the cell
+    box: Tensor  # (P, 4) x1 y1 x2 y2 [px]
+    label: Tensor  # (P,) index of the class
+    counted: Tensor  # (B, rows, columns) whether a cell enters the objectness loss
+
+
+def assign_levels(samples: Sequence[Sample], config: SignsConfig) -> list[LevelTargets]:
+    """Return the training targets at each of `STRIDES` for images of one size.
+
+    A box is assigned to every anchor whose width and height are within a factor of four of its own, in the cell of its
+    centre and in the nearer horizontal and the nearer vertical neighbour. Cells within ignored boxes do not count.
+    """
+    height, width = samples[0].picture.shape[:2]
+    image = np.repeat(np.arange(len(samples)), [len(sample.boxes) for sample in samples])
+    box = torch.from_numpy(np.concatenate([sample.boxes for sample in samples])).float()
+    label = torch.from_numpy(np.concatenate([sample.label for sample in samples]))
+    levels = []
+    for level, stride in enumerate(STRIDES):
+        grid = torch.tensor([width // stride, height // stride])
+        number, anchor, cell = _places(box, torch.tensor(config.anchors_px[level]), stride, grid)
+        counted = torch.stack([_counted(sample, stride, grid) for sample in samples])
+        levels.append(
+            LevelTargets(
+                torch.from_numpy(image)[number], anchor, cell[:, 1], cell[:, 0], box[number], label[number], counted
+            )
+        )
+    return levels
+
+
+def _places(box: Tensor, anchors: Tensor, stride: int, grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return box (P,), anchor (P,), and cell (P, 2) as column, row, of every assignment."""
+    ratio = (box[:, 2:] - box[:, :2])[:, None] / anchors  # (N, A, 2)
+    number, anchor = (torch.maximum(ratio, 1 / ratio).amax(2) < MOST_TIMES).nonzero(as_tuple=True)
+    center = ((box[:, :2] + box[:, 2:]) / 2 / stride)[number]
+    own = torch.minimum(center.long(), grid - 1)
+    toward = torch.where(center - own < 0.5, -1, 1)  # the nearer neighbour along each axis
+    steps = torch.stack((torch.zeros_like(toward), toward * torch.tensor([1, 0]), toward * torch.tensor([0, 1])))
+    cell = own + steps  # (3, P, 2)
+    inside = ((cell >= 0) & (cell < grid)).all(2)
+    return number.expand(3, -1)[inside], anchor.expand(3, -1)[inside], cell[inside]
+
+
+def _counted(sample: Sample, stride: int, grid: Tensor) -> Tensor:
+    counted = torch.ones(int(grid[1]), int(grid[0]), dtype=torch.bool)
+    for x1, y1, x2, y2 in sample.ignore / stride:
+        counted[int(y1) : int(np.ceil(y2)), int(x1) : int(np.ceil(x2))] = False
+    return counted
+
 
 BOX, OBJECT, CLASS = 1.0, 10.0, 8.0  # weights of the terms
 LEVELS = (4.0, 1.0, 0.4)  # weights of the levels' objectness: on finer levels a smaller share of cells has an object
-
-
-def batch_loss(network: SignDetector, samples: Sequence[Sample]) -> Tensor:
-    """Return the loss of `network` on images of one size, whose sides are multiples of 32; see `detection_loss`."""
-    raw = predict(network, [sample.picture for sample in samples])
-    return detection_loss(raw, assign_anchors(samples, network.config), network.config)
-
-
-def imitation_loss(network: SignDetector, samples: Sequence[Sample], targets: Sequence[NDArray[np.float32]]) -> Tensor:
-    """Return the loss of a batch whose boxes have class probabilities (boxes, classes) instead of labels."""
-    raw, classes = predict(network, [sample.picture for sample in samples]), torch.from_numpy(np.concatenate(targets))
-    return detection_loss(raw, assign_anchors(number_boxes(samples), network.config), network.config, classes)
 
 
 def number_boxes(samples: Sequence[Sample]) -> list[Sample]:
@@ -42,7 +91,7 @@ def number_boxes(samples: Sequence[Sample]) -> list[Sample]:
 
 
 def detection_loss(
-    raw: Sequence[Tensor], targets: Sequence[Targets], config: SignsConfig, classes: Tensor | None = None
+    raw: Sequence[Tensor], targets: Sequence[LevelTargets], config: SignsConfig, classes: Tensor | None = None
 ) -> Tensor:
     """Return the loss of raw predictions, one tensor per level as `SignDetector.forward`: the weighted sum of terms.
 
@@ -81,5 +130,29 @@ def _largest_at(maps: Tensor, place: tuple[Tensor, ...], values: Tensor) -> Tens
     return maps.flatten().scatter_reduce(0, flat, values, "amax").view_as(maps)
 
 
-def _to_device(targets: Targets, device: torch.device) -> Targets:
-    return Targets(**{name: tensor.to(device) for name, tensor in vars(targets).items()})
+def _to_device(targets: LevelTargets, device: torch.device) -> LevelTargets:
+    return LevelTargets(**{name: tensor.to(device) for name, tensor in vars(targets).items()})
+
+
+def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> list[Array32]:
+    """Return the class probabilities (boxes, classes) of the boxes of each sample; sides are multiples of 32.
+
+    A box has the mean of the anchors that it is assigned to in training, and zeros where there are none. The network's
+    training mode is left as it was.
+    """
+    found = []
+    with inference(network):
+        for sample in samples:
+            total, count = (
+                torch.zeros(len(sample.boxes), len(network.config.classes)),
+                torch.zeros(len(sample.boxes), 1),
+            )
+            numbered = replace(sample, label=np.arange(len(sample.boxes)))
+            for maps, at in zip(
+                predict_levels(network, [sample.picture]), assign_levels([numbered], network.config), strict=True
+            ):
+                shares = maps[at.image, at.anchor, at.row, at.column, 5:].sigmoid().cpu()
+                total.index_add_(0, at.label, shares)
+                count.index_add_(0, at.label, torch.ones(len(at.label), 1))
+            found.append((total / count.clamp(min=1)).numpy())
+    return found

@@ -1,18 +1,72 @@
-"""A YOLOv5-style one-stage detector.
+"""A YOLOv5-style one-stage detector and its configurations: width, depth, classes, anchors, size of training windows.
 
 A backbone of cross-stage partial stages (Wang et al., "CSPNet", CVPRW 2020), spatial pyramid pooling by repeated
 max pooling (He et al., "Spatial Pyramid Pooling in Deep Convolutional Networks", ECCV 2014), a path-aggregation neck
 (Liu et al., "Path Aggregation Network for Instance Segmentation", CVPR 2018), and anchors on three levels. Terven et
 al., "A Comprehensive Review of YOLO Architectures", 2023, describe how the parts are combined, their widths and depths.
-With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters.
+With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters. The same network also
+finds cars, in the pictures of roadside cameras: configuration `road`.
 """
 
 import math
+from typing import Annotated, Literal
 
 import torch
+from pydantic import ConfigDict, Field
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 
-from flcav.perception.signs.config import STRIDES, SignsConfig
+from flcav.dataset.rectangles import SIGNS
+
+STRIDES = (8, 16, 32)  # [px] of the three levels' feature maps
+Side = Annotated[float, Field(gt=0, le=8192)]
+Size = tuple[Side, Side]  # width, height [px]
+Window = Annotated[int, Field(ge=32, le=8192)]
+Level = tuple[Size, Size, Size]
+
+# Signs are about square, signal heads three times as high as wide.
+ANCHORS_PX: tuple[Level, Level, Level] = (
+    ((5.0, 8.0), (9.0, 10.0), (8.0, 20.0)),
+    ((16.0, 17.0), (14.0, 34.0), (26.0, 27.0)),
+    ((26.0, 62.0), (45.0, 47.0), (80.0, 90.0)),
+)
+
+# Cars some 10 to 60 m from a camera of 90 degrees on a pole are wider than high, seen from the front nearly square.
+CAR_ANCHORS_PX: tuple[Level, Level, Level] = (
+    ((14.0, 9.0), (22.0, 13.0), (36.0, 18.0)),
+    ((34.0, 30.0), (56.0, 26.0), (62.0, 44.0)),
+    ((100.0, 48.0), (110.0, 90.0), (210.0, 100.0)),
+)
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid", allow_inf_nan=False))
+class SignsConfig:
+    """Configuration of a sign detector, which takes images of any size; lengths are in pixels of the image."""
+
+    width: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of channels, see `signs.model.CHANNELS`
+    depth: Annotated[float, Field(gt=0, le=4)]  # factor of the numbers of bottlenecks, see `signs.model.DEPTHS`
+    labels: Literal["signs", "actors"] = "signs"  # what is to be found: a key of `flcav.dataset.rectangles.CLASSES`
+    classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # of these labels, in the order of the scores
+    anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # width, height of the anchors at each of STRIDES
+    background: bool = False  # whether its input is a picture beside the static background: see `signs.background`
+    window_px: tuple[Window, Window] = (320, 192)  # width, height of a training sample
+    smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # least size, root of the area, of a target box
+
+
+CONFIGURATIONS = {
+    "n": SignsConfig(width=0.25, depth=0.33),
+    "s": SignsConfig(width=0.5, depth=0.33),
+    "road": SignsConfig(
+        width=0.125,
+        depth=0.33,
+        labels="actors",
+        classes=("car", "van"),
+        anchors_px=CAR_ANCHORS_PX,
+        background=True,
+        smallest_px=10.0,
+    ),
+}
+
 
 CHANNELS = (64, 128, 256, 512, 1024)  # after each downsampling, at width 1
 DEPTHS = (3, 6, 9, 3)  # bottlenecks of the backbone's stages, at depth 1
@@ -126,7 +180,7 @@ class SignDetector(nn.Module):
             bias[:, 5:] = math.log(1 / max(len(self.config.classes) - 1, 1))
 
 
-def decode(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
+def decode_level(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
     """Return the boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of one level's raw predictions.
 
     A centre lies in its cell or up to half a cell outside, a width or height is at most four times the anchor's.

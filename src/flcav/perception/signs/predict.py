@@ -1,21 +1,26 @@
-"""Inference of the sign detector: decoding, score threshold and class-agnostic non-maximum suppression."""
+"""Inference of the sign detector: decoding, score threshold, class-agnostic non-maximum suppression, and findings.
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+Inputs are images of files, folders and datasets.
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
-from flcav.perception.device import autocast_bfloat16
-from flcav.perception.images import Picture
-from flcav.perception.ops.rectangles import nms
-from flcav.perception.signs.augment import GREY
-from flcav.perception.signs.config import STRIDES
-from flcav.perception.signs.model import SignDetector, decode
-from flcav.perception.signs.samples import Sample
-from flcav.perception.signs.targets import assign_anchors
-from flcav.perception.task import Result
+from flcav.arrays import Array, Ints
+from flcav.config import InputError
+from flcav.dataset.layout import MANIFEST
+from flcav.dataset.store import Dataset
+from flcav.perception.device import autocast_bfloat16, inference
+from flcav.perception.images import Picture, read_pictures, read_recorded
+from flcav.perception.marks import PictureBoxes
+from flcav.perception.ops.boxes import rectangle_nms
+from flcav.perception.signs.model import STRIDES, SignDetector, decode_level
+from flcav.perception.signs.samples import GREY, check_stands, compare_with_background, learn_picture_background
+from flcav.perception.task import Finding, Result
 from flcav.storage.records import Class
 
 CANDIDATES = 512  # number of best-scoring anchors before non-maximum suppression
@@ -27,9 +32,9 @@ MOST_FOUND = 100  # largest number of detections of an image
 class SignDetections:
     """Detections in one image as arrays, by falling score."""
 
-    box: NDArray[np.float64]  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner
-    label: NDArray[np.int64]  # (N,) index of the class
-    score: NDArray[np.float64]  # (N,) in [0, 1]
+    box: Array  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner
+    label: Ints  # (N,) index of the class
+    score: Array  # (N,) in [0, 1]
 
     def __len__(self) -> int:
         return len(self.label)
@@ -68,47 +73,18 @@ def boxes_found(found: SignDetections, classes: Sequence[str]) -> BoxesFound:
     return BoxesFound(tuple(BoxFound(classes[label], score, *box) for box, label, score in rows))
 
 
-def detect(network: SignDetector, picture: Picture, *, threshold: float) -> SignDetections:
+def detect_in_picture(network: SignDetector, picture: Picture, *, threshold: float) -> SignDetections:
     """Return the detections in an image of any size with a score of at least `threshold`.
 
     The network's training mode is left as it was.
     """
-    training = network.training
-    network.eval()
-    with torch.inference_mode():
-        raw = predict(network, [pad_to_stride(picture)])
+    with inference(network):
+        raw = predict_levels(network, [pad_to_stride(picture)])
         cells = [
-            torch.cat((decode(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
+            torch.cat((decode_level(maps, level, network.config), maps[..., 4:].sigmoid()), -1)[0].flatten(0, 2)
             for level, maps in enumerate(raw)
         ]
         found = _chosen(torch.cat(cells), threshold, picture)
-    network.train(training)
-    return found
-
-
-def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
-    """Return the class probabilities (boxes, classes) of the boxes of each sample; sides are multiples of 32.
-
-    A box has the mean of the anchors that it is assigned to in training, and zeros where there are none. The network's
-    training mode is left as it was.
-    """
-    training, found = network.training, []
-    network.eval()
-    with torch.inference_mode():
-        for sample in samples:
-            total, count = (
-                torch.zeros(len(sample.boxes), len(network.config.classes)),
-                torch.zeros(len(sample.boxes), 1),
-            )
-            numbered = replace(sample, label=np.arange(len(sample.boxes)))
-            for maps, at in zip(
-                predict(network, [sample.picture]), assign_anchors([numbered], network.config), strict=True
-            ):
-                shares = maps[at.image, at.anchor, at.row, at.column, 5:].sigmoid().cpu()
-                total.index_add_(0, at.label, shares)
-                count.index_add_(0, at.label, torch.ones(len(at.label), 1))
-            found.append((total / count.clamp(min=1)).numpy())
-    network.train(training)
     return found
 
 
@@ -118,7 +94,7 @@ def pad_to_stride(picture: Picture) -> Picture:
     return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
 
 
-def predict(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
+def predict_levels(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
     """Return the network's raw predictions on images of one size, whose sides are multiples of the largest stride.
 
     One tensor per level as `SignDetector.forward`, in float32. Channels are last in memory and convolutions are in
@@ -138,8 +114,37 @@ def _chosen(cells: torch.Tensor, threshold: float, picture: Picture) -> SignDete
     likely = likely[score[likely] >= threshold]
     height, width = picture.shape[:2]
     box = cells[likely, :4].clamp(min=0).minimum(cells.new_tensor([width, height, width, height]))
-    kept = nms(box, score[likely], MOST_OVERLAP)[:MOST_FOUND]
+    kept = rectangle_nms(box, score[likely], MOST_OVERLAP)[:MOST_FOUND]
     chosen = likely[kept]
     return SignDetections(
         box[kept].double().cpu().numpy(), label[chosen].cpu().numpy(), score[chosen].double().cpu().numpy()
     )
+
+
+def detect_signs(
+    network: SignDetector, path: Path, threshold: float, frames: Sequence[int] | None = None
+) -> Iterator[Finding]:
+    """Yield the detections of score `threshold` or more in each image at `path`, by falling score.
+
+    Raises `InputError` as `flcav.perception.images.read_pictures` does. A network of backgrounds finds in pictures of a
+    dataset's poles alone; it raises `InputError` for files, and for frames of vehicles.
+    """
+    for origin, rgb, seen in _read(network, path, frames):
+        found = detect_in_picture(network, seen, threshold=threshold)
+        names = np.array(network.config.classes)[found.label]
+        marks = (PictureBoxes(found.box, names, found.score),)
+        yield Finding(origin, rgb, boxes_found(found, network.config.classes), marks)
+
+
+def _read(network: SignDetector, path: Path, frames: Sequence[int] | None) -> Iterator[tuple[Path, Picture, Picture]]:
+    """Yield path and image, and the image as the network sees it."""
+    if not network.config.background:
+        yield from ((origin, rgb, rgb) for origin, rgb in read_pictures(path, frames))
+        return
+    if not (path / MANIFEST).is_file():
+        raise InputError(f"{path}: this network sees pictures of poles beside their background; a dataset is wanted")
+    data = Dataset.open(path)
+    check_stands(data, data.numbers(frames))
+    for frame, camera, rgb in read_recorded(data, frames):
+        behind = learn_picture_background(data, frame.agent, camera)
+        yield path / f"{frame.key}/{camera}", rgb, compare_with_background(rgb, behind)

@@ -1,18 +1,31 @@
-"""Samples of the sign task: images with target boxes, and ignored boxes that are left out of the loss."""
+"""Samples of the sign task: images with target and ignored boxes, their messages, backgrounds and augmentation.
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+A network of three channels sees the pictures of a camera that stands still beside the static background. That is the
+median of the camera's pictures in the same dataset, as that of a roadside LiDAR is learned from its own sweeps.
+
+Augmentation is by random crops and scales, mosaics, brightness and saturation; there is no mirroring. The mosaic is
+that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of crops ("windows") instead of whole images made smaller: signs
+are few and small, so most windows are drawn around a sign. Small windows around signs show the network many digits at a
+low cost. Each window but the first looks for a sign of a class drawn at random, so that rare classes (amber lasts
+seconds of a minute) are seen as often as others.
+"""
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import product
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.arrays import Array, Bytes, Ints, Mask
 from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.perception.images import Picture
-from flcav.perception.signs.background import check_stands, picture_reader
-from flcav.perception.signs.config import SignsConfig
+from flcav.network.ledger import pack_arrays, unpack_arrays
+from flcav.perception.agents import POLE, kind_of
+from flcav.perception.images import Picture, check_picture, pack_pictures, recoloured, resize_picture, unpack_pictures
+from flcav.perception.signs.model import SignsConfig
 from flcav.sensors.frame import Frame
 
 KEPT_BYTES = 3_000_000_000  # [B] of images cached in memory
@@ -23,9 +36,9 @@ class Sample:
     """One labelled image; boxes are x1 y1 x2 y2 [px] from its upper left corner."""
 
     picture: Picture
-    boxes: NDArray[np.float64]  # (N, 4) targets
-    label: NDArray[np.int64]  # (N,) index of the class
-    ignore: NDArray[np.float64]  # (K, 4) neither targets nor background
+    boxes: Array  # (N, 4) targets
+    label: Ints  # (N,) index of the class
+    ignore: Array  # (K, 4) neither targets nor background
 
 
 class RecordedPictures(Sequence[Sample]):
@@ -55,7 +68,7 @@ class RecordedPictures(Sequence[Sample]):
             return self._kept[index]
         number, camera = self._of[index]
         picture = self._read(number, camera)
-        sample = sample_from_frame(self._data.frame(number), camera, picture, self._config)
+        sample = label_picture(self._data.frame(number), camera, picture, self._config)
         if self._kept_bytes + picture.nbytes <= KEPT_BYTES:
             self._kept[index] = sample
             self._kept_bytes += picture.nbytes
@@ -66,7 +79,7 @@ class RecordedPictures(Sequence[Sample]):
         return self._data.keys[self._of[index][0]].scene
 
 
-def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
+def label_picture(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
     """Return a camera's image with the boxes of its signs and lights, or of its actors, as `config.labels` says.
 
     Boxes smaller than `config.smallest_px` are ignored, and so are signs cut off by the image's edge: a lamp may lie
@@ -82,7 +95,7 @@ def sample_from_frame(frame: Frame, camera: str, picture: Picture, config: Signs
     return Sample(picture, box[wanted], label[wanted], box[~wanted])
 
 
-def find_targets(box: NDArray[np.float64], size: tuple[int, int], config: SignsConfig) -> NDArray[np.bool_]:
+def find_targets(box: Array, size: tuple[int, int], config: SignsConfig) -> Mask:
     """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px].
 
     They are large enough, and those of signs are whole.
@@ -91,6 +104,193 @@ def find_targets(box: NDArray[np.float64], size: tuple[int, int], config: SignsC
     return (whole | (config.labels != "signs")) & (size_px(box) >= config.smallest_px)
 
 
-def size_px(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+def size_px(boxes: Array) -> Array:
     """Return the size (N,) of boxes (N, 4): the square root of the area [px]."""
     return np.sqrt((boxes[:, 2:] - boxes[:, :2]).clip(min=0).prod(1))
+
+
+LEAST_PICTURES = 3  # of a camera: the median of fewer shows what moves, too
+MOST_PICTURES = 40  # of each camera, evenly spread over the dataset, that its background is learned from
+LUMA = np.array((0.299, 0.587, 0.114))  # ITU-R BT.601
+
+
+def picture_reader(data: Dataset, background: bool) -> Callable[[int, str], Picture]:
+    """Return the function that reads the picture of a frame's number and a camera as a network sees it.
+
+    For a network of backgrounds (`background`) that is `compare_with_background`, of poles alone. Raises `InputError`
+    as `check_picture`, `check_stands` and `learn_picture_background` do.
+    """
+
+    def read(number: int, camera: str) -> Picture:
+        rgb = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {data.name(number)}")
+        if not background:
+            return rgb
+        check_stands(data, [number])
+        return compare_with_background(rgb, learn_picture_background(data, data.keys[number].agent, camera))
+
+    return read
+
+
+def check_stands(data: Dataset, numbers: Iterable[int]) -> None:
+    """Raise `InputError` unless the agents of all these frames are poles: the camera of a vehicle has no background."""
+    for agent in dict.fromkeys(data.keys[number].agent for number in numbers):
+        if kind_of(agent) != POLE:
+            raise InputError(
+                f"{data.folder}: {agent} moves, and this network sees pictures of poles beside their background; "
+                "choose them with --agents poles"
+            )
+
+
+def compare_with_background(picture: Picture, background: Picture) -> Picture:
+    """Return (H, W, 3): luma of the picture, luma of the background, and the largest difference of a colour."""
+    apart = np.abs(picture.astype(np.int16) - background).max(axis=2)
+    return np.stack([picture @ LUMA, background @ LUMA, apart], axis=2).round().astype(np.uint8)
+
+
+@lru_cache(maxsize=64)
+def learn_picture_background(data: Dataset, agent: str, camera: str) -> Bytes:
+    """Return the median (H, W, 3) of an agent's pictures by one camera in `data`.
+
+    Raises `InputError` where there are fewer than `LEAST_PICTURES`.
+    """
+    numbers = [number for number in data.select(agents={agent}) if camera in data.cameras(number)]
+    if len(numbers) < LEAST_PICTURES:
+        raise InputError(
+            f"{data.folder}: {agent} has {len(numbers)} picture{'s' * (len(numbers) != 1)} by {camera}, and this "
+            f"network's background is learned from {LEAST_PICTURES} or more; record more scenes or spins"
+        )
+    chosen = numbers[:: -(-len(numbers) // MOST_PICTURES)]
+    return np.median([data.plane(number, camera, "rgb") for number in chosen], axis=0).astype(np.uint8)
+
+
+BOXES = ("boxes", "label", "ignore")  # fields of a sample, and names of arrays after the camera's
+
+
+def pack_signs(data: Dataset, number: int, config: SignsConfig) -> bytes:
+    """Return the message of a frame: its images with their boxes."""
+    frame, arrays = data.frame(number), dict(pack_pictures(data, number))
+    for camera in frame.images:
+        picture = check_picture(data.plane(number, camera, "rgb"), f"{data.folder} {frame.key}")
+        sample = label_picture(frame, camera, picture, config)
+        arrays |= {f"{camera}.{field}": getattr(sample, field) for field in BOXES}
+    return pack_arrays(arrays)
+
+
+def unpack_signs(message: bytes) -> list[Sample]:
+    """Return the samples in a message: those of `label_picture` for each camera."""
+    arrays = unpack_arrays(message)
+    return [
+        Sample(picture, *(arrays[f"{camera}.{field}"] for field in BOXES))
+        for camera, picture in unpack_pictures(arrays).items()
+    ]
+
+
+GREY = 114  # padding value outside an image
+SHARES = (0.15, 0.25, 0.3, 0.3)  # probabilities of a single window and of a mosaic of 2 x 2, 3 x 3, 4 x 4 windows
+PART_PX = 32  # approximate least height of a mosaic's windows
+UNEVEN = 0.3  # largest offset of a border within a mosaic, as a share of a window's side
+AROUND_A_SIGN = 0.8  # probability that a window is placed around a sign, if the image has any
+SCALE = (0.6, 2.0)  # range of the scale of a window
+WHOLE = 0.8  # least share of a box inside the window for a target; otherwise the lamp may be cut off
+LOOKS = 12  # number of images searched for a sign of a class
+GAIN, SATURATION = (0.7, 1.3), (0.6, 1.4)  # ranges of the factors of brightness and of saturation
+
+
+def draw_mosaic(samples: Sequence[Sample], index: int, config: SignsConfig, rng: np.random.Generator) -> Sample:
+    """Return an augmented sample of size `config.window_px`: a window of sample `index`, or a mosaic with others."""
+    width, height = config.window_px
+    across = max(min(int(rng.choice(len(SHARES), p=SHARES)) + 1, height // PART_PX), 1)
+    columns, rows = _borders(width, across, rng), _borders(height, across, rng)
+    parts = []
+    for number, (row, column) in enumerate(product(range(across), repeat=2)):
+        x, y = columns[column], rows[row]
+        size = (columns[column + 1] - x, rows[row + 1] - y)
+        wanted = int(rng.integers(len(config.classes))) if number else None
+        sample = samples[index] if wanted is None else _one_with(wanted, samples, rng)
+        parts.append((draw_window(sample, *size, config, rng, wanted), x, y))
+    joined = join_mosaic(parts, width, height)
+    return joined if config.background else _in_other_colours(joined, rng)
+
+
+def _borders(length: int, parts: int, rng: np.random.Generator) -> list[int]:
+    """Return the borders [px] of `parts` parts of a length with randomly shifted inner borders: parts + 1 values."""
+    inner = (np.arange(1, parts) + rng.uniform(-UNEVEN, UNEVEN, parts - 1)) * length / parts
+    return [0, *inner.astype(int).tolist(), length]
+
+
+def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -> Sample:
+    """Return a random sample, with a sign of class `label` if one is among `LOOKS` samples."""
+    looked = (samples[int(number)] for number in rng.integers(0, len(samples), LOOKS))
+    sample = next(looked)
+    while label not in sample.label and (other := next(looked, None)):
+        sample = other
+    return sample
+
+
+def join_mosaic(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
+    """Return the mosaic of parts at (x, y) [px] of their upper left corners; the rest is grey."""
+    picture = np.full((height, width, 3), GREY, np.uint8)
+    for part, x, y in parts:
+        picture[y : y + part.picture.shape[0], x : x + part.picture.shape[1]] = part.picture
+    moves = [np.array([x, y, x, y]) for _, x, y in parts]
+    boxes = np.concatenate([part.boxes + move for (part, *_), move in zip(parts, moves, strict=True)])
+    ignore = np.concatenate([part.ignore + move for (part, *_), move in zip(parts, moves, strict=True)])
+    return Sample(picture, boxes, np.concatenate([part.label for part, *_ in parts]), ignore)
+
+
+def draw_window(
+    sample: Sample,
+    width: int,
+    height: int,
+    config: SignsConfig,
+    rng: np.random.Generator,
+    wanted: int | None = None,
+) -> Sample:
+    """Return a window of `width` x `height` pixels of the sample at a random scale and place, mostly around a sign.
+
+    The sign is drawn at random, among those of class `wanted` if there are any.
+    """
+    scale = rng.uniform(*SCALE)
+    size = np.array([width, height]) / scale
+    full = np.array(sample.picture.shape[1::-1], dtype=float)
+    if len(sample.boxes) and rng.random() < AROUND_A_SIGN:
+        of_class = np.flatnonzero(sample.label == wanted)
+        box = sample.boxes[rng.choice(of_class if len(of_class) else len(sample.boxes))]
+        corner = (box[:2] + box[2:]) / 2 - rng.uniform(0.15, 0.85, 2) * size
+    else:
+        corner = rng.uniform(0, 1, 2) * (full - size)
+    corner = np.where(size < full, np.clip(corner, 0, full - size), (full - size) / 2)
+    x, y = np.round(corner).astype(int)
+    across, down = np.maximum(np.round(size).astype(int), 1)
+    return crop_sample(sample, (int(x), int(y), int(across), int(down)), (width, height), config)
+
+
+def crop_sample(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
+    """Return the crop `part` (x, y, width, height) [px] of a sample, resized to `size` (width, height) [px].
+
+    Padding outside the image is grey. Boxes of which less than the share `WHOLE` remains, or that become smaller than
+    `config.smallest_px`, become ignored.
+    """
+    x, y, across, down = part
+    canvas = np.full((down, across, 3), GREY, np.uint8)
+    height, width = sample.picture.shape[:2]
+    x0, y0, x1, y1 = max(x, 0), max(y, 0), min(x + across, width), min(y + down, height)
+    canvas[y0 - y : y1 - y, x0 - x : x1 - x] = sample.picture[y0:y1, x0:x1]
+    factor = np.array([size[0] / across, size[1] / down] * 2)
+
+    def moved(boxes: Array) -> Array:
+        clipped = np.clip(boxes - [x, y, x, y], 0, [across, down, across, down])
+        return clipped * factor
+
+    boxes, ignore = moved(sample.boxes), moved(sample.ignore)
+    before = size_px(sample.boxes) ** 2 * factor[:2].prod()
+    left = size_px(boxes) ** 2
+    found = (left >= WHOLE * before) & (size_px(boxes) >= config.smallest_px)
+    ignore = np.concatenate((ignore[size_px(ignore) > 0], boxes[~found & (left > 0)]))
+    return Sample(resize_picture(canvas, *size), boxes[found], sample.label[found], ignore)
+
+
+def _in_other_colours(sample: Sample, rng: np.random.Generator) -> Sample:
+    """Return the sample with random brightness and saturation; hues are kept, since they distinguish lights."""
+    gain, saturation = rng.uniform(*GAIN), rng.uniform(*SATURATION)
+    return replace(sample, picture=recoloured(sample.picture, gain, saturation))

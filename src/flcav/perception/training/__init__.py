@@ -1,6 +1,6 @@
 """Training of any task's networks: mini-batches, learning-rate schedules, checkpoints, early stopping."""
 
-from flcav.perception.training.adamw import AdamW
+from flcav.perception.training.checkpoint import AdamW
 from flcav.perception.training.loop import (
     SCHEDULES,
     Checkpointing,

@@ -13,15 +13,14 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 
+from flcav.arrays import Array, Ints
 from flcav.config import DamagedFile, InputError
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import suggest
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
-from flcav.perception.training.adamw import AdamW
-from flcav.perception.training.checkpoint import RunState, load_checkpoint, save_checkpoint
+from flcav.perception.training.checkpoint import AdamW, RunState, load_checkpoint, save_checkpoint
 from flcav.statistics.streams import stream
 
 CLIP_NORM = 10.0  # largest norm of the gradient
@@ -68,9 +67,7 @@ class Validation:
 
     score: Callable[[nn.Module], float]  # validation score of a network; more is better
     every: int  # steps between validations
-    patience: int | None = (
-        None  # validations without a new best after which training stops, with the best weights; None: it goes on
-    )
+    patience: int | None = None  # validations without a new best after which training stops; None: it goes on
 
     def is_over(self, scores: Sequence[float]) -> bool:
         """Return whether training stops: none of the last `patience` of `scores` is above all scores before them."""
@@ -83,8 +80,8 @@ class Validation:
 class TrainingHistory:
     """Losses and validation scores of a training."""
 
-    losses: NDArray[np.float64]  # (steps,) loss of each batch; fewer steps than asked for after early stopping
-    scores: NDArray[np.float64]  # (validations,)
+    losses: Array  # (steps,) loss of each batch; fewer steps than asked for after early stopping
+    scores: Array  # (validations,)
 
 
 def train(
@@ -110,7 +107,7 @@ def train(
     early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
     from its file and ends with the same weights. `watch` receives loss, learning rate and validation score; `correct`
     changes the gradients before they are clipped. Training goes on with the moments of an `optimizer` of the network,
-    which it changes; None: they begin at zero. A damaged checkpoint is told, and training begins anew. Raises
+    which it changes; None: they begin at zero. A damaged checkpoint is reported, and training begins anew. Raises
     `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
     """
     batch = task.practice.batch if batch is None else batch
@@ -211,7 +208,7 @@ def step(
     return float(loss.detach())
 
 
-def batches(samples: int, batch: int, steps: int, seed: int) -> NDArray[np.int64]:
+def batches(samples: int, batch: int, steps: int, seed: int) -> Ints:
     """Return the sample indices of each batch, (steps, batch): shuffled epochs one after another, cut into batches.
 
     A batch has at most as many samples as there are.

@@ -6,23 +6,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import nn
 from torch.utils.data import ConcatDataset
 
+from flcav.arrays import Array
 from flcav.config import DamagedFile
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import DAMAGED, Report, ignore_progress
 from flcav.machine.locks import only_writer
 from flcav.perception.agents import FrameSelection, choose_frames
-from flcav.perception.card import Card, DataEntry, data_entry, write_card
 from flcav.perception.device import CPU, processor_of
 from flcav.perception.task import Calibrates, Evaluated, Task, build_network, find_configuration
-from flcav.perception.training.checkpoint import Settings, find_finished_card, part_of
+from flcav.perception.training.checkpoint import TrainingSettings, find_finished_card, part_of
 from flcav.perception.training.loop import Checkpointing, Validation, Watch, train
-from flcav.perception.weights import save_network
+from flcav.perception.weights import Card, DataEntry, data_entry, save_network, write_card
 from flcav.storage.files import check_writable
 
 WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoint.pt", "events"
@@ -53,7 +51,7 @@ def event_files(folder: Path) -> Iterator[Watch]:
 
 
 @dataclass(frozen=True)
-class Request:
+class TrainingRequest:
     """Arguments of a training."""
 
     data: Sequence[Dataset]
@@ -80,10 +78,10 @@ class Prepared:
     """A training whose arguments are checked and whose samples are listed."""
 
     task: Task
-    request: Request
+    request: TrainingRequest
     out: Path
     config: Any  # configuration of the network
-    settings: Settings
+    settings: TrainingSettings
     parts: tuple[DatasetPart, ...]  # training data
     held: DatasetPart | None  # validation data
     finished: Card | None  # card of the weights in `out`, if the training was finished before
@@ -103,17 +101,17 @@ class TrainingResult:
     evaluation: Evaluated | None = None  # on the validation data; None without, or if finished before
 
 
-def train_network(task: Task, request: Request, out: Path, progress: Report = ignore_progress) -> Card:
+def train_network(task: Task, request: TrainingRequest, out: Path, progress: Report = ignore_progress) -> Card:
     """Train a network and write weights, card and curves to `out`; resume an interrupted run there. Return the card.
 
     The learning rate follows one schedule over all epochs. With validation data, the network of the best epoch is kept,
     its scores are calibrated if the task is `Calibrates`, and its evaluation goes into the card. If `out` holds weights
-    of the same settings, nothing is trained. Raises as `prepare` does.
+    of the same settings, nothing is trained. Raises as `prepare_training` does.
     """
-    return train_prepared(prepare(task, request, out), progress).card
+    return train_prepared(prepare_training(task, request, out), progress).card
 
 
-def prepare(task: Task, request: Request, out: Path) -> Prepared:
+def prepare_training(task: Task, request: TrainingRequest, out: Path) -> Prepared:
     """Check the arguments of a training and list its samples.
 
     Raises `InputError` for an unknown network, for data or agents that the task cannot use, and if `out` holds weights
@@ -123,7 +121,7 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
     config = find_configuration(task, request.network)
     parts = tuple(_part(task, config, data, request.agents) for data in request.data)
     held = None if request.validation is None else _part(task, config, request.validation, request.agents)
-    settings = Settings(
+    settings = TrainingSettings(
         task=task.name,
         network=request.network or next(iter(task.configurations)),
         seed=request.seed,
@@ -146,7 +144,7 @@ def prepare(task: Task, request: Request, out: Path) -> Prepared:
 
 
 def train_prepared(prepared: Prepared, progress: Report = ignore_progress) -> TrainingResult:
-    """Perform the training that `prepare` returned, see `train_network`; return its card and evaluation."""
+    """Perform the training that `prepare_training` returned, see `train_network`; return its card and evaluation."""
     with only_writer(prepared.out):
         return _train(prepared, progress)
 
@@ -198,7 +196,7 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
     return TrainingResult(card, evaluation)
 
 
-def _find_finished(out: Path, settings: Settings) -> Card | None:
+def _find_finished(out: Path, settings: TrainingSettings) -> Card | None:
     """Return `find_finished_card` of the weights in `out`; None for damaged ones of a training, with a checkpoint."""
     try:
         return find_finished_card(out / WEIGHTS, settings)
@@ -213,7 +211,7 @@ def _part(task: Task, config: Any, data: Dataset, agents: str | None) -> Dataset
     return DatasetPart(data, chosen, data_entry(data, chosen))
 
 
-def _rounded(scores: NDArray[np.float64]) -> list[float]:
+def _rounded(scores: Array) -> list[float]:
     return [round(float(score), 4) for score in scores]
 
 

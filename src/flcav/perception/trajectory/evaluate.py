@@ -1,19 +1,29 @@
-"""Displacement errors of forecasts: ADE, FDE and miss rate of modes, single path and constant velocity, by slice."""
+"""Displacement errors of forecasts: ADE, FDE and miss rate of modes, single path and constant velocity, by slice.
 
-from collections.abc import Mapping
+They are kept of each road user for intervals over scenes, and large final errors of the single path are registered.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Mask, Words
+from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
+from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry
+from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.task import Evaluated
-from flcav.perception.trajectory.predict import find_medoid
+from flcav.perception.trajectory.model import TrajectoryNetwork
+from flcav.perception.trajectory.predict import find_medoid, predict_paths
+from flcav.perception.trajectory.samples import Samples, samples_of
 from flcav.perception.trajectory.tracks import constant_velocity
+from flcav.statistics.bootstrap import REDRAWS
 from flcav.storage.records import LEFT_OUT
-
-Array = NDArray[np.float64]
+from flcav.world.trace import Trace
 
 MISS_M = 2.0  # a larger final error is a miss
 TURN = np.radians(20.0)  # least angle of a turn between the present heading and the last second's displacement
@@ -104,8 +114,8 @@ def evaluate_paths(
     probabilities: Array,
     past: NDArray[np.floating],
     future: NDArray[np.floating],
-    at_junction: NDArray[np.bool_],
-    scene: NDArray[np.str_],
+    at_junction: Mask,
+    scene: Words,
 ) -> TrajectoryEvaluation:
     """Return the displacement errors of all samples, of those at junctions, and of those turning at junctions.
 
@@ -127,7 +137,7 @@ def evaluate_paths(
     )
 
 
-def is_turning(future: Array) -> NDArray[np.bool_]:
+def is_turning(future: Array) -> Mask:
     """Return (N,) whether a future (N, FUTURE, 2) [m] turns.
 
     It turns if the displacement in its last second is above 1 m and more than 20 degrees off the x axis.
@@ -180,3 +190,69 @@ def _means(errors: Mapping[str, Array]) -> PathErrors | None:
         ratio_K=ratio("minFDE_K"),
         ratio_single=ratio("single_FDE"),
     )
+
+
+NUMBERS = {
+    "single path FDE m": "single_FDE",
+    "best mode FDE m": "minFDE_K",
+    "constant velocity FDE m": "constant_velocity_FDE",
+}
+
+
+class TrajectoryOutcomes:
+    """Measure of the trajectory task: 1 / (1 + (minFDE_1 + minFDE_K) / 2), errors in metres."""
+
+    measure_name = "1 / (1 + FDE in m)"
+    redraws = REDRAWS
+
+    def outcomes(
+        self, network: TrajectoryNetwork, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+    ) -> Outcomes:
+        """Return the displacement errors of each sample [m], see `compute_errors`."""
+        samples = samples_of(data, network.config, frames)
+        paths, probabilities = predict_paths(network, samples, progress)
+        columns = samples.columns
+        future = columns.future.astype(np.float64)
+        errors = compute_errors(paths, probabilities, future, constant_velocity(columns.past))
+        return Outcomes(np.asarray(columns.scene, dtype=np.str_), errors)
+
+    def measure(self, outcomes: Outcomes, times: Times) -> Values:
+        """Return the score of each bootstrap sample."""
+        likeliest, best = (weighted_mean(outcomes.arrays[name], times) for name in ("minFDE_1", "minFDE_K"))
+        return 1 / (1 + (likeliest + best) / 2)
+
+    def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
+        """Return mean final errors [m], the miss rate of the single path, and the number of samples."""
+        errors = outcomes.arrays
+        means = {name: float(errors[column].mean()) for name, column in NUMBERS.items()}
+        return {
+            **means,
+            "missed": float((errors["single_FDE"] > MISS_M).mean()),
+            "road users": float(len(outcomes.scene)),
+        }
+
+
+def register_path_errors(
+    network: TrajectoryNetwork, data: Dataset, samples: Samples, progress: Report = ignore_progress
+) -> Registry:
+    """Return the first miss of each road user and scene: a single path with a final error above `MISS_M`.
+
+    Its position is that of the road user at the present, on the ground of the town.
+    """
+    columns = samples.columns
+    paths, probabilities = predict_paths(network, samples, progress)
+    said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
+    wrong = np.linalg.norm(said - columns.future[:, -1], axis=1) > MISS_M
+    town = data.town()
+    traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns.scene).tolist()}
+    found: dict[int, list[PerceptionError]] = {}
+    for row in np.flatnonzero(wrong):
+        scene, actor = str(columns.scene[row]), int(columns.actor[row])
+        trace = traces[scene]
+        assert trace is not None  # the samples come from it
+        x, y, _ = columns.pose[row].tolist()
+        z, label = 0.0 if town is None else town.ground(x, y), str(trace.category[actor])
+        found.setdefault(int(columns.frame[row]), []).append(
+            PerceptionError(x, y, z, 1.0, FINAL_ERROR, label, 0, float("nan"), scene, str(trace.actor[actor]))
+        )
+    return Registry.of(found)

@@ -1,22 +1,33 @@
-"""Inference of the trajectory network: input and target tensors, batches, single path; forecasts as JSON records."""
+"""Inference of the trajectory network: tensors in and out, batches, single path, and findings of a dataset's frames.
 
-from collections.abc import Sequence
+Findings are the forecasts, drawn on the map around the observing agent, with their JSON record.
+"""
+
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor, nn
 
+from flcav.arrays import Array, Ints, Mask
+from flcav.dataset.layout import read_manifest
+from flcav.dataset.store import Dataset
+from flcav.geometry import pose, yaw_of
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.marks import Light, Paths, RoadUser
-from flcav.perception.task import Result
-from flcav.perception.trajectory.cross_view import Inputs
-from flcav.perception.trajectory.model import TrajectoryNetwork
-from flcav.perception.trajectory.samples import Sample
+from flcav.perception.device import inference
+from flcav.perception.marks import Light, Mode, Paths, RoadUser
+from flcav.perception.task import Finding, Result
+from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
+from flcav.perception.trajectory.model import ForecastInputs, TrajectoryNetwork
+from flcav.perception.trajectory.rasters import OPEN, STATIC_ROWS, RoadMap, load_roads
+from flcav.perception.trajectory.samples import Sample, Samples, extract_columns, find_near, find_pictured, load_traffic
+from flcav.perception.trajectory.tracks import constant_velocity, into_frame, out_of_frame, tracks_around
 from flcav.storage.records import Class
+from flcav.world.map.lanes import rasterise
+from flcav.world.trace import Trace
 
-Array = NDArray[np.float64]
 Point = tuple[float, float]  # x, y in the world [m]
 
 RASTERS, VIEWS = 256, 16  # batch sizes of inference with rasters and with cameras
@@ -75,15 +86,15 @@ class Forecasts(Result):
         return lines or ["nobody to predict"]
 
 
-def inputs_of(samples: Sequence[Sample], network: nn.Module) -> Inputs:
+def inputs_of(samples: Sequence[Sample], network: nn.Module) -> ForecastInputs:
     """Return the input tensors of samples on the network's device; with rasters if the samples have no images."""
     device = next(network.parameters()).device
     past = torch.from_numpy(np.stack([sample.past for sample in samples])).to(device)
     seen = [sample.surround for sample in samples if sample.surround is not None]
     if not seen:
-        return Inputs(past, raster=rasters_of(samples, device))
+        return ForecastInputs(past, raster=rasters_of(samples, device))
     pictures = np.stack([one.pictures for one in seen]).transpose(0, 1, 4, 2, 3)
-    return Inputs(
+    return ForecastInputs(
         past,
         pictures=torch.from_numpy(np.ascontiguousarray(pictures)).to(device).float() / 127.5 - 1,
         intrinsics=_floats([one.intrinsics for one in seen], device),
@@ -102,33 +113,30 @@ def futures_of(samples: Sequence[Sample], device: torch.device) -> Tensor:
     return torch.from_numpy(np.stack([sample.future for sample in samples])).to(device)
 
 
-def _floats(arrays: list[NDArray[np.float64]], device: torch.device) -> Tensor:
+def _floats(arrays: list[Array], device: torch.device) -> Tensor:
     return torch.from_numpy(np.stack(arrays).astype(np.float32)).to(device)
 
 
-def predict(
+def predict_paths(
     network: TrajectoryNetwork, samples: Sequence[Sample], progress: Report = ignore_progress
 ) -> tuple[Array, Array]:
     """Return the forecasts of N samples: paths (N, K, FUTURE, 2) [m] in the samples' frames and probabilities (N, K).
 
     The network's training mode is left as it was.
     """
-    training = network.training
-    network.eval()
     paths, probabilities = [], []
     size = VIEWS if network.config.cameras else RASTERS
-    with torch.inference_mode():
+    with inference(network):
         for first in range(0, len(samples), size):
             batch = [samples[i] for i in range(first, min(first + size, len(samples)))]
             forecast = network(inputs_of(batch, network))
             paths.append(forecast.paths.double().cpu().numpy())
             probabilities.append(forecast.logits.softmax(dim=1).double().cpu().numpy())
             progress(first + len(batch), len(samples), "")
-    network.train(training)
     return np.concatenate(paths), np.concatenate(probabilities)
 
 
-def find_medoid(paths: Array, probabilities: Array) -> NDArray[np.int64]:
+def find_medoid(paths: Array, probabilities: Array) -> Ints:
     """Return the index (N,) of the mode that is given as the single path: the medoid of the forecast.
 
     The medoid is the mode with the least expected average distance to the other modes under the predicted
@@ -163,3 +171,82 @@ def _forecast(user: RoadUser) -> RoadUserForecast:
 
 def _points(path: Array) -> tuple[Point, ...]:
     return tuple((x, y) for x, y in path.tolist())
+
+
+AROUND_M = 50.0  # half side of the map around the observer, and of the square whose vehicles are predicted with rasters
+PIXEL_M = 0.2  # resolution of the map
+TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())  # of the path points, after the present
+
+
+def forecast_frames(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
+    """Yield the forecasts of `frames` of the dataset `path` (None: all).
+
+    `Finding.seen` is the map around the observer, (len(STATIC), H, W), row 0 farthest ahead and column 0 farthest left.
+    Only vehicles with a recorded past of 2 s are predicted. Raises `InputError` if `path` is no dataset, or one
+    without traffic or map.
+    """
+    read_manifest(path)
+    data = Dataset.open(path)
+    traces: dict[str, Trace] = {}
+    for number in data.numbers(frames):
+        key = data.keys[number]
+        if key.scene not in traces:
+            traces = {key.scene: load_traffic(data, key.scene)}
+        trace = traces[key.scene]
+        world_from_agent = data.frame(number).world_from_agent
+        observer = np.array([*world_from_agent[:2, 3], yaw_of(world_from_agent)])
+        found = _predicted(network, data, number, trace, observer)
+        yield Finding(path / data.name(number), map_around(load_roads(data), observer), forecasts(found), (found,))
+
+
+def map_around(roads: RoadMap, observer: Array) -> Mask:
+    """Return the raster (len(STATIC), H, W) of the map in the square of half side `AROUND_M` around x, y, yaw."""
+    middle = pose(float(observer[0]), float(observer[1]), yaw=float(observer[2]))
+    return rasterise(roads.layers, middle, (2 * AROUND_M, 2 * AROUND_M), PIXEL_M)[list(STATIC_ROWS)]
+
+
+def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> Paths:
+    key, config = data.keys[number], network.config
+    instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
+    tracks = tracks_around(trace, key.time_s)
+    if not config.cameras:
+        apart = into_frame(tracks.position[None, PAST], observer[None])[0]
+        wanted = (np.abs(apart) <= AROUND_M).all(axis=1)
+    elif find_pictured(data, number) is None:
+        wanted = np.zeros(len(trace.actor), np.bool_)
+    else:
+        wanted = find_near(trace, tracks, key)
+    columns = extract_columns(trace, tracks, key, number, load_roads(data), config.patch, wanted, complete=False)
+    users: list[RoadUser] = []
+    if len(columns.past):
+        paths, probabilities = predict_paths(network, Samples(data, columns, config.cameras))
+        first = find_medoid(paths, probabilities)
+        present, plain = columns.pose, constant_velocity(columns.past)
+        for i, actor in enumerate(columns.actor):
+            modes = [Mode(float(share), _in_world(way, present[i])) for share, way in zip(probabilities[i], paths[i])]
+            truth = columns.future[i].astype(np.float64)
+            users.append(
+                RoadUser(
+                    str(trace.actor[actor]),
+                    str(trace.category[actor]),
+                    *present[i].tolist(),
+                    speed=float(columns.past[i, -1, 3]),
+                    length=float(trace.size[actor, 0]),
+                    width=float(trace.size[actor, 1]),
+                    modes=(modes.pop(first[i]), *sorted(modes, key=lambda mode: -mode.probability)),
+                    constant_velocity=_in_world(plain[i], present[i]),
+                    truth=_in_world(truth, present[i]) if np.isfinite(truth).all() else None,
+                )
+            )
+    x, y, yaw = observer.tolist()
+    return Paths((x, y, yaw), AROUND_M, TIMES_S, tuple(users), _lights(trace, instant, load_roads(data)))
+
+
+def _lights(trace: Trace, instant: int, roads: RoadMap) -> tuple[Light, ...]:
+    letters = dict(zip(trace.light.tolist(), trace.light_state[instant].tolist()))
+    middles = {name: bar.mean(axis=0).tolist() for name, bar in roads.lights.items() if name in letters}
+    return tuple(Light(x, y, letters[name] in OPEN) for name, (x, y) in middles.items())
+
+
+def _in_world(path: Array, present: Array) -> Array:
+    return out_of_frame(path[None], present[None])[0]

@@ -5,6 +5,7 @@ that projects the vehicle's frame into them. Nothing of them depends on what hap
 of `tracks_around`, and images, which show the smoothed traffic, are `REACH_S` old.
 """
 
+import zlib
 from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,38 +16,37 @@ from typing import NamedTuple, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array, Array32, Bytes, Ints, Mask, Words
 from flcav.config import InputError
 from flcav.dataset.layout import FrameKey
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, pose
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.images import Picture, check_picture, resize_picture
 from flcav.perception.trajectory.config import PAST, CrossView, Patch, TrajectoryConfig
-from flcav.perception.trajectory.rasters import draw_rasters
-from flcav.perception.trajectory.roads import BEFORE_M, RoadMap, load_roads
+from flcav.perception.trajectory.rasters import BEFORE_M, RoadMap, draw_rasters, load_roads
 from flcav.perception.trajectory.tracks import GAP_S, Tracks, check_instants, into_frame, tracks_around
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import REACH_S
-
-Array = NDArray[np.float64]
 
 CAMERAS = 6  # typical number of cameras of a vehicle
 KEPT_BYTES = 2**30  # [B] of images cached in memory
 SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
 LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
 
-Pictured = tuple[NDArray[np.uint8], Array, Array]  # images, intrinsics and camera_from_world of a frame's cameras
+Pictured = tuple[Bytes, Array, Array]  # images, intrinsics and camera_from_world of a frame's cameras
 
 
 class Surround(NamedTuple):
     """The images of n cameras, `REACH_S` before the present, with their calibration relative to a road user there."""
 
-    pictures: NDArray[np.uint8]  # (n, height, width, 3)
+    pictures: Bytes  # (n, height, width, 3)
     intrinsics: Array  # (n, 3, 3) of the resized images [px]
     camera_from_frame: Array  # (n, 4, 4) from the road user's frame to the optical one: x right, y down, z forward
 
 
-def surround(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
+def surround_vehicle(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
     """Return the resized images seen at frame `number` with their calibration relative to a road user at `present`.
 
     They are those of `find_pictured`. `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the
@@ -116,14 +116,14 @@ def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
 class Columns(NamedTuple):
     """The fields of N samples as arrays with a row for each, see `Sample`; without `surround`."""
 
-    past: NDArray[np.float32]  # (N, PAST + 1, 4)
-    future: NDArray[np.float32]  # (N, FUTURE, 2)
-    raster: NDArray[np.uint8]  # (N, LAYERS, cells, cells / 8)
-    pose: NDArray[np.float64]  # (N, 3)
-    actor: NDArray[np.int64]  # (N,)
-    at_junction: NDArray[np.bool_]  # (N,)
-    scene: NDArray[np.str_]  # (N,)
-    frame: NDArray[np.int64]  # (N,)
+    past: Array32  # (N, PAST + 1, 4)
+    future: Array32  # (N, FUTURE, 2)
+    raster: Bytes  # (N, LAYERS, cells, cells / 8)
+    pose: Array  # (N, 3)
+    actor: Ints  # (N,)
+    at_junction: Mask  # (N,)
+    scene: Words  # (N,)
+    frame: Ints  # (N,)
 
 
 @dataclass(frozen=True)
@@ -133,14 +133,14 @@ class Sample:
     Past and present are those of `tracks_around`, which use nothing of later; the future is the recorded one.
     """
 
-    past: NDArray[np.float32]  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
-    future: NDArray[np.float32]  # (FUTURE, 2) x, y; NaN if unknown
-    raster: NDArray[np.uint8]  # (LAYERS, cells, cells / 8) packed bits of `flcav.perception.trajectory.rasters`
-    pose: NDArray[np.float64]  # (3,) x, y, yaw of the present in the world
-    actor: NDArray[np.int64]  # () index in its trace
-    at_junction: NDArray[np.bool_]  # () whether it is inside a junction or at most BEFORE_M before one
-    scene: NDArray[np.str_]  # ()
-    frame: NDArray[np.int64]  # () number of the dataset's frame
+    past: Array32  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
+    future: Array32  # (FUTURE, 2) x, y; NaN if unknown
+    raster: Bytes  # (LAYERS, cells, cells / 8) packed bits of `flcav.perception.trajectory.rasters`
+    pose: Array  # (3,) x, y, yaw of the present in the world
+    actor: Ints  # () index in its trace
+    at_junction: Mask  # () whether it is inside a junction or at most BEFORE_M before one
+    scene: Words  # ()
+    frame: Ints  # () number of the dataset's frame
     surround: Surround | None = None  # images and calibration of the cameras; None with rasters
 
 
@@ -162,7 +162,7 @@ class Samples(Sequence[Sample]):
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
         row = Columns(*(column[index] for column in self.columns))
-        seen = surround(self._data, int(row.frame), row.pose, self._cameras) if self._cameras else None
+        seen = surround_vehicle(self._data, int(row.frame), row.pose, self._cameras) if self._cameras else None
         return Sample(*row, surround=seen)
 
 
@@ -206,7 +206,7 @@ def _parts(data: Dataset, patch: Patch, cameras: CrossView | None, frames: Seque
         yield extract_columns(trace, tracks, key, number, load_roads(data), patch, wanted)
 
 
-def select_fitting_frames(data: Dataset, cameras: bool) -> Sequence[int]:
+def select_pictured_frames(data: Dataset, cameras: bool) -> Sequence[int]:
     """Return the numbers of the frames that can have samples: all; with `cameras` those of vehicles, if any.
 
     With cameras only road users around an observing vehicle are predicted, none around a pole.
@@ -224,7 +224,7 @@ def load_traffic(data: Dataset, scene: str) -> Trace:
     return trace
 
 
-def find_near(trace: Trace, tracks: Tracks, key: FrameKey) -> NDArray[np.bool_]:
+def find_near(trace: Trace, tracks: Tracks, key: FrameKey) -> Mask:
     """Return (A,) which actors are within `SEEN_M` of the observing vehicle, itself included; none for a pole.
 
     `tracks` are those around the time of `key`.
@@ -243,7 +243,7 @@ def extract_columns(
     number: int,
     roads: RoadMap,
     patch: Patch,
-    wanted: NDArray[np.bool_],
+    wanted: Mask,
     complete: bool = True,
 ) -> Columns:
     """Return the samples of the `wanted` (A,) vehicles on the road at the time of the frame of this key and number.
@@ -274,3 +274,41 @@ def extract_columns(
         scene=np.full(len(actor), key.scene),
         frame=np.full(len(actor), number),
     )
+
+
+def pack_frames(data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> Iterator[bytes]:
+    """Yield the message of each frame: its samples, rasters compressed, or its images.
+
+    With rasters, each agent that observes an instant sends all samples of the instant.
+    """
+    columns = samples_of(data, config, frames).columns
+    instants = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
+    rows: dict[object, list[int]] = {}
+    for row, i in enumerate(columns.frame.tolist()):
+        rows.setdefault(instants[i], []).append(row)
+    for i in frames:
+        own: dict[str, NDArray] = {name: each[rows.get(instants[i], [])] for name, each in columns._asdict().items()}
+        own["scene"] = from_names(own["scene"].tolist())
+        own["shape"] = np.array(own["raster"].shape)
+        own["raster"] = np.frombuffer(zlib.compress(own["raster"].tobytes()), dtype=np.uint8)
+        seen = pictures_at(data, i, config.cameras) if config.cameras and len(own["past"]) else None
+        yield pack_arrays(own if seen is None else own | dict(zip(Surround._fields, seen, strict=True)))
+
+
+def unpack_frames(messages: Sequence[bytes]) -> list[Sample]:
+    """Return the samples in messages, each once: of several agents, the first one's."""
+    found: dict[tuple[int, int], Sample] = {}
+    for message in messages:
+        arrays = unpack_arrays(message)
+        arrays["scene"] = to_names(arrays["scene"])
+        packed = zlib.decompress(arrays["raster"].tobytes())
+        arrays["raster"] = np.frombuffer(packed, dtype=np.uint8).reshape(arrays["shape"])
+        for row in zip(*(arrays[name] for name in Columns._fields), strict=True):
+            own = Columns(*map(np.asarray, row))
+            seen = None
+            if "pictures" in arrays:
+                x, y, yaw = own.pose.tolist()
+                views = arrays["camera_from_frame"] @ pose(x, y, yaw=yaw)
+                seen = Surround(arrays["pictures"], arrays["intrinsics"], views)
+            found.setdefault((int(own.frame), int(own.actor)), Sample(*own, surround=seen))
+    return [*found.values()]

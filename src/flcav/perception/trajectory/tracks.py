@@ -9,13 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.arrays import Array
 from flcav.config import InputError
 from flcav.geometry import heading_vectors, wrap_angle
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import REACH_S
-
-Array = NDArray[np.float64]
 
 GAP_S = 0.5  # largest time between two instants of a trace
 OFFSETS_S: Array = np.arange(-PAST, FUTURE + 1, dtype=np.float64) * STEP_S  # of a track's points from the present

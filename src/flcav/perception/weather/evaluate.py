@@ -1,24 +1,33 @@
-"""Classification metrics of the weather task: accuracy, recall per class, and the confusion matrix."""
+"""Predictions of the weather classifier, their metrics, and the outcome of each image for intervals over scenes.
 
-from collections.abc import Mapping, Sequence
+Metrics are accuracy, recall per class, and the confusion matrix.
+"""
+
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
+from torch import Tensor
 
+from flcav.arrays import Ints, Mask
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
+from flcav.perception.device import inference
+from flcav.perception.images import Picture, read_pictures
+from flcav.perception.marks import Bars
 from flcav.perception.metrics import interval_words
-from flcav.perception.task import Evaluated
+from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
+from flcav.perception.task import Evaluated, Finding, Result
 from flcav.perception.weather.model import Classifier
-from flcav.perception.weather.predict import predict_probabilities
-from flcav.perception.weather.samples import Sample, label_pictures
-from flcav.statistics.bootstrap import bootstrap_over_scenes
+from flcav.perception.weather.samples import Sample, label_pictures, reduce_picture, stack_pictures
+from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
 from flcav.statistics.estimates import CONFIDENCE
 from flcav.statistics.streams import stream
-from flcav.storage.records import LEFT_OUT
+from flcav.storage.records import LEFT_OUT, Class
 from flcav.world.weather import find_nearest_class
 
 
@@ -63,7 +72,7 @@ class Classification(Evaluated):
 
 
 def evaluate_classes(
-    truth: NDArray[np.int64], found: NDArray[np.int64], scenes: Sequence[str], classes: Sequence[str], seed: int = 0
+    truth: Ints, found: Ints, scenes: Sequence[str], classes: Sequence[str], seed: int = 0
 ) -> Classification:
     """Return accuracy with its 95 % bootstrap interval over scenes, recall per class, and the confusion matrix.
 
@@ -106,7 +115,81 @@ def evaluate_whole_space(network: Classifier, data: Dataset) -> Classification:
     return evaluate_samples(network, samples)
 
 
-def _interval(right: NDArray[np.bool_], scenes: Sequence[str], seed: int) -> tuple[float, float] | tuple[None, None]:
+def _interval(right: Mask, scenes: Sequence[str], seed: int) -> tuple[float, float] | tuple[None, None]:
     if len(set(scenes)) < 2:
         return None, None
     return bootstrap_over_scenes(lambda times: times @ right / times.sum(axis=1), scenes, rng=stream(seed, "bootstrap"))
+
+
+BATCH = 256  # images of a batch of inference
+
+
+@dataclass(frozen=True)
+class Named(Result):
+    """Classification of one image: the likeliest class, and the probability of each class."""
+
+    label: Class
+    probabilities: Mapping[str, float]  # by class
+
+    def lines(self) -> list[str]:
+        """Return one line with the class and its probability."""
+        return [f"{self.label} ({self.probabilities[self.label]:.2f})"]
+
+
+def predict_probabilities(
+    network: Classifier, small_pictures: Sequence[Picture], progress: Report = ignore_progress
+) -> np.ndarray:
+    """Return the class probabilities (N, classes) of images of 32 x 32 pixels.
+
+    The network's training mode is left as it was.
+    """
+    parts = []
+    with inference(network):
+        for first in range(0, len(small_pictures), BATCH):
+            logits = network(tensor_of(network, list(small_pictures[first : first + BATCH])))
+            parts.append(logits.softmax(1).cpu().numpy())
+            progress(min(first + BATCH, len(small_pictures)), len(small_pictures), "")
+    return np.concatenate(parts)
+
+
+def tensor_of(network: Classifier, small_pictures: list[Picture]) -> Tensor:
+    """Return images as the network's input tensor (N, 3, 32, 32) in [-1, 1], on its device."""
+    return torch.from_numpy(stack_pictures(small_pictures)).to(next(network.parameters()).device)
+
+
+def classify_pictures(network: Classifier, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
+    """Yield the class probabilities and the likeliest class of each image at `path`.
+
+    Raises `InputError` as `flcav.perception.images.read_pictures` does.
+    """
+    classes = network.config.classes
+    for origin, rgb in read_pictures(path, frames):
+        shares = predict_probabilities(network, [reduce_picture(rgb)])[0]
+        rows = {name: float(share) for name, share in zip(classes, shares, strict=True)}
+        yield Finding(origin, rgb, Named(classes[int(shares.argmax())], rows), (Bars(rows),))
+
+
+class WeatherOutcomes:
+    """Measure of the weather task: accuracy, the share of images whose class is predicted correctly."""
+
+    measure_name = "accuracy"
+    redraws = REDRAWS
+
+    def outcomes(
+        self, network: Classifier, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+    ) -> Outcomes:
+        """Return the true class ("truth") and the predicted class ("named") of each image, as indices."""
+        samples = label_pictures(data, network.config.classes, frames)
+        named = predict_probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+        truth = np.array([sample.label for sample in samples])
+        return Outcomes(np.array([sample.scene for sample in samples]), {"truth": truth, "named": named})
+
+    def measure(self, outcomes: Outcomes, times: Times) -> Values:
+        """Return the accuracy of each bootstrap sample."""
+        return weighted_mean((outcomes.arrays["truth"] == outcomes.arrays["named"]).astype(np.float64), times)
+
+    def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
+        """Return the lowest recall of a class, and the number of images."""
+        truth, named = outcomes.arrays["truth"], outcomes.arrays["named"]
+        recalls = [float((named[truth == label] == label).mean()) for label in np.unique(truth)]
+        return {"least recall": min(recalls), "pictures": float(len(truth))}

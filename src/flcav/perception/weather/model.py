@@ -1,15 +1,52 @@
-"""LeNet-5: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", Proc. IEEE 1998, sec. II-B.
+"""LeNet-5 and its configurations: LeCun et al., "Gradient-Based Learning Applied to Document Recognition", 1998, II-B.
 
-Two things differ from the paper in all configurations: images have three channels, and the output layer is linear with
-a softmax instead of radial basis functions around drawn prototypes of digits. With batch normalisation (Ioffe and
-Szegedy, ICML 2015) the maps of C1 and C3 are normalised before the rectifiers.
+Proc. IEEE 86(11). Two things differ from the paper in all configurations: images have three channels, and the output
+layer is linear with a softmax instead of radial basis functions around drawn prototypes of digits. With batch
+normalisation (Ioffe and Szegedy, ICML 2015) the maps of C1 and C3 are normalised before the rectifiers.
 """
 
+from collections.abc import Sequence
+from typing import Annotated, Self
+
 import torch
+from pydantic import AfterValidator, ConfigDict, Field, model_validator
+from pydantic.dataclasses import dataclass
 from torch import Tensor, nn
 from torch.nn import functional
 
-from flcav.perception.weather.config import LeNetConfig
+from flcav.world.weather import WEATHER_CLASSES
+
+
+def _classes(names: Sequence[str]) -> Sequence[str]:
+    if odd := [name for place, name in enumerate(names) if name not in WEATHER_CLASSES or name in names[:place]]:
+        raise ValueError(f"'{odd[0]}' is none of the classes, or there twice; they are {', '.join(WEATHER_CLASSES)}")
+    return names
+
+
+Classes = Annotated[tuple[str, ...], Field(min_length=2), AfterValidator(_classes)]
+
+
+@dataclass(frozen=True, config=ConfigDict(extra="forbid"))
+class LeNetConfig:
+    """Configuration of a LeNet-5 on RGB images of 32 x 32 pixels."""
+
+    classes: Classes = tuple(WEATHER_CLASSES)  # in the order of the scores
+    original: bool = False  # tanh and subsampling as published in 1998; otherwise ReLU and max pooling
+    normalised: Annotated[bool, Field(exclude_if=lambda on: not on)] = False  # batch normalisation of C1 and C3
+
+    @model_validator(mode="after")
+    def _one_kind(self) -> Self:
+        if self.original and self.normalised:
+            raise ValueError("the network as published has no batch normalisation")
+        return self
+
+
+CONFIGURATIONS = {
+    "tiny": LeNetConfig(),
+    "paper": LeNetConfig(original=True),
+    "normalised": LeNetConfig(normalised=True),
+}
+
 
 SIDE = 32  # [px] of the input image
 # Table I: which of the six maps of S2 are inputs of each of the sixteen maps of C3

@@ -4,26 +4,36 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+import torch
 from torch import Tensor
+from torch.nn import functional
 
+from flcav.arrays import Array32
 from flcav.config import Json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.client import ANNOTATED, camera_ahead
-from flcav.perception.study import StudyRecipe
+from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, Practice
-from flcav.perception.weather.augment import augment
-from flcav.perception.weather.config import CONFIGURATIONS, LeNetConfig
-from flcav.perception.weather.evaluate import Classification, evaluate_samples
-from flcav.perception.weather.infer import classify_pictures
-from flcav.perception.weather.loss import batch_loss, imitation_loss
-from flcav.perception.weather.messages import pack_frame, unpack_frame
-from flcav.perception.weather.model import Classifier, LeNet
-from flcav.perception.weather.outcomes import WeatherOutcomes
-from flcav.perception.weather.predict import predict_probabilities
-from flcav.perception.weather.samples import Sample, label_pictures
-from flcav.world.weather import WEATHER_CLASSES
+from flcav.perception.weather.evaluate import (
+    Classification,
+    WeatherOutcomes,
+    classify_pictures,
+    evaluate_samples,
+    predict_probabilities,
+    tensor_of,
+)
+from flcav.perception.weather.model import CONFIGURATIONS, Classifier, LeNet, LeNetConfig
+from flcav.perception.weather.samples import (
+    Sample,
+    augment_picture,
+    label_pictures,
+    pack_pictures_and_weather,
+    unpack_frame,
+)
+from flcav.world.weather import ANY, WEATHER_CLASSES
+
+WHOLE_SPACE = "whole space"  # test of weathers drawn from the whole space of parameters
 
 
 class WeatherTask(WeatherOutcomes):
@@ -40,10 +50,25 @@ class WeatherTask(WeatherOutcomes):
     labels = (ANNOTATED,)
 
     def study(self) -> StudyRecipe:
-        """Return the study recipe, see `flcav.perception.weather.study`."""
-        from flcav.perception.weather.study import STUDY
+        """Return the study recipe: training in three towns, tests on held-out scenes, a held-out town, any weather.
 
-        return STUDY
+        Each scene goes once through all eight classes, so that they are balanced. The test `WHOLE_SPACE` also draws
+        weathers between the classes' regions.
+        """
+        recipe = read_recipe("weather")
+        any_weather = {"classes": [ANY] * 8, "turn_s": 4.0}
+        return StudyRecipe(
+            network="tiny",
+            train=(recipe, {**recipe, "town": "suburb", "seed": 113}, {**recipe, "town": "arterial", "seed": 613}),
+            validation={**recipe, "seed": 213, "split": "validation", "scenes": 20},
+            tests={
+                "held-out scenes": {**recipe, "seed": 1013, "split": "test", "scenes": 12},
+                "held-out town": {**recipe, "town": "grid", "seed": 1113, "split": "test", "scenes": 12},
+                WHOLE_SPACE: {**recipe, "seed": 1213, "split": "test", "scenes": 12, "weather": any_weather},
+            },
+            epochs=60,
+            patience=15,
+        )
 
     def build(self, config: LeNetConfig) -> Classifier:
         """Return a network with random initial weights."""
@@ -54,22 +79,22 @@ class WeatherTask(WeatherOutcomes):
         return label_pictures(data, config.classes, frames)
 
     def draw(self, samples: Sequence[Sample], index: int, config: LeNetConfig, rng: np.random.Generator) -> Sample:
-        """Return an augmented sample, see `flcav.perception.weather.augment`."""
-        return augment(samples[index], rng)
+        """Return an augmented sample, see `flcav.perception.weather.samples`."""
+        return augment_picture(samples[index], rng)
 
     def loss(self, network: Classifier, samples: Sequence[Sample]) -> Tensor:
         """Return the mean cross entropy of a batch."""
-        return batch_loss(network, samples)
+        logits = network(tensor_of(network, [sample.picture for sample in samples]))
+        return functional.cross_entropy(logits, torch.tensor([s.label for s in samples], device=logits.device))
 
-    def class_probabilities(self, network: Classifier, samples: Sequence[Sample]) -> list[NDArray[np.float32]]:
+    def class_probabilities(self, network: Classifier, samples: Sequence[Sample]) -> list[Array32]:
         """Return the class probabilities (1, classes) of each image."""
         return [*predict_probabilities(network, [sample.picture for sample in samples])[:, None]]
 
-    def imitation_loss(
-        self, network: Classifier, samples: Sequence[Sample], targets: Sequence[NDArray[np.float32]]
-    ) -> Tensor:
+    def imitation_loss(self, network: Classifier, samples: Sequence[Sample], targets: Sequence[Array32]) -> Tensor:
         """Return the mean cross entropy of a batch with class probabilities for targets."""
-        return imitation_loss(network, samples, targets)
+        logits = network(tensor_of(network, [sample.picture for sample in samples]))
+        return functional.cross_entropy(logits, torch.from_numpy(np.concatenate(targets)).to(logits))
 
     def evaluate(
         self,
@@ -85,7 +110,7 @@ class WeatherTask(WeatherOutcomes):
     def pack_samples(self, data: Dataset, config: LeNetConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the message of each frame: its images and their class."""
         label_pictures(data, config.classes, frames)  # raises for frames that cannot be used
-        return (pack_frame(data, i) for i in frames)
+        return (pack_pictures_and_weather(data, i) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: LeNetConfig) -> list[Sample]:
         """Return the samples in messages of `pack_samples`."""

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterable, Mapping
 
-from flcav.fusion.detector import TRAINED_IN
+from flcav.fusion.road import TRAINED_IN
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.label_sources import LABEL_SOURCES
 from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MORE_EDGE, RunRecipe

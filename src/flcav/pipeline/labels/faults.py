@@ -8,10 +8,10 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import ground_truth
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 from flcav.pipeline.frames import Frames
 from flcav.pipeline.recipe import Fault
 

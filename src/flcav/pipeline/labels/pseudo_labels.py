@@ -7,10 +7,9 @@ from typing import Any
 import numpy as np
 
 from flcav.dataset.ground import Ground
-from flcav.fusion.detector import road_detector
+from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.fusion.labels import label_sample
-from flcav.fusion.navigation import NavigationErrors, PoseSource
-from flcav.fusion.road import RoadView, build_road_view, label_ideally
+from flcav.fusion.road import RoadView, build_road_view, label_ideally, road_detector
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger, send_message

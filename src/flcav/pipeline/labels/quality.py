@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics import match
-from flcav.perception.metrics.matching import assign_targets
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
 from flcav.pipeline.frames import Frames

@@ -14,24 +14,22 @@ from typing import Any
 import numpy as np
 
 from flcav.federation.trainable import Weights
+from flcav.fusion.average import PoseSource, Sighting
 from flcav.fusion.distillation import (
     Distillation,
     Guidance,
     average_spin,
+    build_context,
     distil_sample,
     pack_sighting,
     unpack_sighting,
 )
-from flcav.fusion.map_context import build_context
-from flcav.fusion.navigation import PoseSource
-from flcav.fusion.posts import posts_of
+from flcav.fusion.pose_graph import posts_of
 from flcav.fusion.road import RoadView
-from flcav.fusion.sightings import Sighting
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Direction, Ledger, send_message
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import second
+from flcav.perception.objects.model import SecondConfig, second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar

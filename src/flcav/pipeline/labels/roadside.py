@@ -6,11 +6,10 @@ from dataclasses import replace
 import numpy as np
 
 from flcav.dataset.ground import Ground
-from flcav.fusion.detector import road_detector
 from flcav.fusion.labels import label_sample
-from flcav.fusion.road import build_road_view
+from flcav.fusion.road import build_road_view, road_detector
 from flcav.geometry import Boxes
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import choose_lidar
 from flcav.pipeline.frames import Frames

@@ -9,11 +9,10 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 from flcav.dataset.layout import navigation_path
 from flcav.dataset.store import Dataset
+from flcav.fusion.average import ESTIMATED, Navigation, PoseSource, Sighting, state_accuracy
 from flcav.fusion.distillation import TOLD, Distillation
-from flcav.fusion.inertial import Estimate, Mounts, estimate_drive
-from flcav.fusion.navigation import ESTIMATED, PoseSource, state_accuracy
-from flcav.fusion.posts import find_posts
-from flcav.fusion.sightings import Navigation, Sighting
+from flcav.fusion.inertial import MotionEstimate, Mounts, estimate_drive
+from flcav.fusion.pose_graph import segment_posts
 from flcav.geometry import Boxes, transform_points
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
@@ -66,11 +65,11 @@ def find_told_posts(frame: Frame, how: Distillation) -> Array:
     if not how.pose_graph:
         return np.zeros((0, 2))
     lidar = choose_lidar(frame)
-    return find_posts(transform_points(frame.assumed.agent_from_sensor[lidar], frame.lidar[lidar][:, :3]), 0.0)
+    return segment_posts(transform_points(frame.assumed.agent_from_sensor[lidar], frame.lidar[lidar][:, :3]), 0.0)
 
 
 @lru_cache(maxsize=KEPT_DRIVES)
-def _estimate(data: Dataset, scene: str, agent: str) -> tuple[Mapping[int, int], Estimate]:
+def _estimate(data: Dataset, scene: str, agent: str) -> tuple[Mapping[int, int], MotionEstimate]:
     """Return the estimated poses of a vehicle's frames in a scene, and frame -> row in them."""
     path, town = data.folder / navigation_path(scene), _find_town(data)
     log = data.navigation_logs(scene).get(agent)

@@ -7,16 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.fusion.average import BoxReport
+from flcav.fusion.average import BoxReport, PoseSource
 from flcav.fusion.labels import label_by_tracks
-from flcav.fusion.navigation import PoseSource
 from flcav.fusion.road import RoadView
-from flcav.fusion.tracks import LEAST_SCORE, Sweep, track_objects
+from flcav.fusion.tracks import LEAST_SCORE, VehicleSweep, track_objects
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
-from flcav.perception.objects.config import SecondConfig
-from flcav.perception.objects.model import Second
+from flcav.perception.objects.model import Second, SecondConfig
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_in
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import asked_of, choose_lidar, detection_labels, in_range
@@ -48,7 +46,7 @@ def track_frame(
     They are of the detections of `network` in the sweeps that the vehicle recorded within `WINDOW_S` of the frame, by
     the `poses` of its navigation. views: of the road sensors at the spin, whose boxes join them.
     """
-    data, sweeps, known = split.data, list[Sweep](), dict[int, NDArray[np.float64]]()
+    data, sweeps, known = split.data, list[VehicleSweep](), dict[int, NDArray[np.float64]]()
     for number in list_window(split, (i,), WINDOW_S):
         frame = data.frame(number)
         lidar = choose_lidar(frame)
@@ -57,7 +55,7 @@ def track_frame(
         (found,) = detect_in(network, [frame], score_threshold=LOWEST_SCORE)
         points = transform_points(world_from_lidar, frame.lidar[lidar][:, :3].astype(np.float64))
         boxes, origin = found.transform(world_from_lidar), world_from_lidar[:3, 3]
-        sweeps.append(Sweep(data.keys[number].time_s, boxes, points, origin))
+        sweeps.append(VehicleSweep(data.keys[number].time_s, boxes, points, origin))
     at_s, told = data.keys[i].time_s, [_classify(view.boxes, network.config) for view in views]
     others = [BoxReport(f"pole {number}", at_s, boxes) for number, boxes in enumerate(told)]
     return track_objects(sweeps, at_s, others, LEAST_SCORE).transform(inverse(known[i]))

@@ -11,13 +11,11 @@ from typing import Any
 import numpy as np
 
 from flcav.federation.links.in_process import update_bytes
+from flcav.fusion.average import NavigationErrors, Sighting
 from flcav.fusion.distillation import Distillation, pack_sighting
-from flcav.fusion.navigation import NavigationErrors
-from flcav.fusion.sightings import Sighting
 from flcav.network.ledger import BYTES_PER_MB
-from flcav.perception.client import as_shared
-from flcav.perception.distillation import SharedSamples
-from flcav.perception.objects.config import SecondConfig
+from flcav.perception.client import SharedSamples, as_shared
+from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.truth import asked_of
 from flcav.perception.task import Task, build_network
 from flcav.perception.weights import to_arrays

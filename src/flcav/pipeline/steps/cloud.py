@@ -24,8 +24,7 @@ from flcav.federation.trainable import Trainable, Update, Weights
 from flcav.interface.progress import Report
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
-from flcav.perception.client import TaskClient
-from flcav.perception.distillation import SharedSamples
+from flcav.perception.client import SharedSamples, TaskClient
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.pipeline.arms import Setting, find_strategies
 from flcav.pipeline.engine import Step, Work

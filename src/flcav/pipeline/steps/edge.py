@@ -10,7 +10,7 @@ from flcav.federation.links.metered import Account
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.network.ledger import Ledger
-from flcav.perception.distillation import SharedSamples
+from flcav.perception.client import SharedSamples
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.arms import Setting, find_strategies
 from flcav.pipeline.engine import Step, Work

@@ -7,8 +7,8 @@ from typing import Any
 from flcav.config import InputError, shorten
 from flcav.dataset.layout import navigation_path, read_manifest
 from flcav.federation.strategies import sends_outputs
+from flcav.fusion.average import ESTIMATED, NavigationErrors
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.navigation import ESTIMATED, NavigationErrors
 from flcav.perception.client import check_network
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Names, Setting, name_repeat, resolve_settings

@@ -14,8 +14,7 @@ from flcav.network.clock.records import save_rounds
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
 from flcav.network.radio.links import RadioLinks
-from flcav.perception.objects.distillation.imitation import ImitatingObjects
-from flcav.perception.objects.distillation.road_average import DistillationTerms, DistilledObjects
+from flcav.perception.objects.distillation import DistillationTerms, DistilledObjects, ImitatingObjects
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.engine import Work
 from flcav.pipeline.frames import Frames

@@ -5,8 +5,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from flcav.config import Config
+from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.tasks import task_named
 from flcav.pipeline.engine import Step, Work

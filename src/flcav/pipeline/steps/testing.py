@@ -7,7 +7,7 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
-from flcav.perception.metrics.matching import assign_targets, on_neutral
+from flcav.perception.metrics.detection import assign_targets, on_neutral
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth, asked_of

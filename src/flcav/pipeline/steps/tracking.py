@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 
 from flcav.config import InputError
-from flcav.fusion.navigation import PoseSource
+from flcav.fusion.average import PoseSource
 from flcav.perception.tasks import task_named
 from flcav.pipeline.arms import Setting
 from flcav.pipeline.engine import Step, Work

@@ -21,8 +21,7 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
-from flcav.perception.client import TaskClient
-from flcav.perception.distillation import SharedSamples
+from flcav.perception.client import SharedSamples, TaskClient
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import to_arrays
 from flcav.pipeline.frames import Frames

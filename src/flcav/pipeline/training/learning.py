@@ -10,8 +10,7 @@ from flcav.federation.loop import Schedule
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import Strategy
 from flcav.federation.trainable import Weights
-from flcav.perception.client import TaskClient
-from flcav.perception.distillation import OutputClient, SharedSamples
+from flcav.perception.client import OutputClient, SharedSamples, TaskClient
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.weights import load_network
 from flcav.pipeline.recipe import Training

@@ -10,8 +10,7 @@ from flcav.config import InputError
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger, pack_arrays, send_message, unpack_arrays
-from flcav.perception.client import as_shared
-from flcav.perception.distillation import SharedSamples
+from flcav.perception.client import SharedSamples, as_shared
 from flcav.perception.errors import Registry, pack_errors, unpack_errors
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, to_arrays
@@ -64,7 +63,7 @@ class SharedFrames:
     messages: tuple[bytes, ...]
     samples: SharedSamples
 
-    def send(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
+    def send_message(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
         """Send the frames to a region's vehicles, and the network that they begin with to those who lack it."""
         have = {entry.client for entry in book.entries if (entry.stage, entry.direction) == (EDGE, "down")}
         if lacking := [client for client in clients if client not in have]:

@@ -19,7 +19,7 @@ from flcav.fleet.releases import ShadowReport
 from flcav.geometry import Boxes
 from flcav.interface.wording import plural
 from flcav.perception.errors import THRESHOLD
-from flcav.perception.metrics.matching import assign_targets
+from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import select_class

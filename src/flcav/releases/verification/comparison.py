@@ -21,11 +21,11 @@ from scipy.special import stdtrit
 from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import Matches, weighted_precision
-from flcav.perception.metrics.matching import lies_on, on_neutral
+from flcav.perception.metrics.detection import lies_on, on_neutral
 from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.evaluate import BORDER_M, OCCLUSIONS
 from flcav.perception.objects.truth import FrameTruth, select_class
-from flcav.perception.ops.rotated import iou
+from flcav.perception.ops.boxes import iou
 from flcav.releases.verification.records import LEAST_MEASURE, Comparison, Judgement
 from flcav.releases.verification.testing import ConditionResults
 from flcav.statistics.bootstrap import REDRAWS

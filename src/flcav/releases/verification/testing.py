@@ -17,8 +17,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse, pose
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
-from flcav.perception.agents import choose_frames
-from flcav.perception.foreground import frame_reader
+from flcav.perception.agents import choose_frames, frame_reader
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.task import OBJECTS

@@ -1,14 +1,17 @@
-"""Pillars: statistics of the points above each cell of the ground, as a dense bird's-eye map.
+"""Point clouds on grids: voxels with the mean of their points, and pillars with statistics of theirs.
 
-The grid is that of Lang et al., "PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019, and
-the statistics take the place of its learned encoder: they cost one pass over the points, and the highest point of a
-pillar tells a network how high an object is.
+Voxels are those of SECOND's published configuration (mean VFE). The grid of pillars is that of Lang et al.,
+"PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019; the statistics take the place of its
+learned encoder: they cost one pass over the points, and the highest point of a pillar is the height of an
+object.
 """
 
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+
+from flcav.perception.ops.rulebook import Triple, encode_cells
 
 BINS_M = (0.3, 0.7, 1.1, 1.5, 1.9, 2.4)  # heights above the ground at which bins of occupancy begin
 STATISTICS = 7 + len(BINS_M)  # channels of the map
@@ -52,3 +55,33 @@ def pillar_statistics(
         bins[number, key[(height >= low_m) & (height < high_m)]] = 1
     channels = torch.cat((torch.log1p(count)[None] / 2, torch.stack(extremes), mean.T, bins))
     return channels.view(STATISTICS, samples, rows, columns).transpose(0, 1)
+
+
+def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:
+    """Return the extents z, y, x of a voxel grid.
+
+    range_m: minima x, y, z, then maxima [m], LiDAR frame; voxel_m: sizes along x, y, z [m]. One empty layer is added on
+    top, as in the published network, so that its strides divide the height.
+    """
+    nx, ny, nz = (round((range_m[i + 3] - range_m[i]) / voxel_m[i]) for i in range(3))
+    return nz + 1, ny, nx
+
+
+def voxelize(
+    points: Tensor, sample: Tensor, range_m: Sequence[float], voxel_m: Sequence[float], shape: Triple
+) -> tuple[Tensor, Tensor]:
+    """Return the mean features (V, C) and the ascending keys (V,) of the occupied voxels of a batch of point clouds.
+
+    points (N, C), x, y, z first [m]; sample (N,) number of each point's cloud; range_m, voxel_m and shape: see
+    `grid_shape`. Points outside the range are left out.
+    """
+    low, size = points.new_tensor(range_m[:3]), points.new_tensor(voxel_m)
+    cell = torch.floor((points[:, :3] - low) / size)
+    inside = ((cell >= 0) & (cell < points.new_tensor((shape[2], shape[1], shape[0] - 1)))).all(1)
+    kept = inside.nonzero()[:, 0]
+    x, y, z = cell[kept].long().unbind(1)
+    keys, order = encode_cells(torch.stack((sample[kept], z, y, x), 1), shape).sort(stable=True)
+    keys, count = torch.unique_consecutive(keys, return_counts=True)
+    own = points[kept[order]]  # may be empty, for which the checks of `unsafe=False` raise
+    means = torch.segment_reduce(own, "mean", lengths=count, axis=0, unsafe=True)
+    return means, keys

@@ -1,4 +1,4 @@
-"""Federated distillation: the loss of a vehicle that learns from the road average of boxes.
+"""Two more losses of a detector: federated distillation from the road average, and imitation of an earlier network.
 
 Wang et al. (IEEE Network 37(3), 2023), "federated distillation": each vehicle updates itself by a contrastive loss
 between its boxes and those of the road average. The loss of a batch is the sum of
@@ -9,6 +9,11 @@ between its boxes and those of the road average. The loss of a batch is the sum 
 - InfoNCE (van den Oord et al., "Representation Learning with Contrastive Predictive Coding", 2018, eq. 4) of
   bird's-eye features pooled in boxes: the query is one of the vehicle's own boxes, its positive the box of the road
   average that it is matched with, its negatives are the other boxes of the sweep, of the road average or its own.
+
+Imitation is knowledge distillation against forgetting (Li and Hoiem, "Learning without Forgetting", ECCV 2016; of
+detectors Shmelkov, Schmid, Alahari, "Incremental Learning of Object Detectors without Catastrophic Forgetting", ICCV
+2017). To the loss on labels it adds the distance of box residuals and headings from those of the earlier network, the
+teacher, where that sees an object. It needs no samples of what was learned before.
 """
 
 from collections.abc import Sequence
@@ -17,23 +22,26 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 import torch.nn.functional as F
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 from torch import Tensor
 
+from flcav.arrays import Ints
 from flcav.geometry import Boxes, concatenate, spread_over_footprints
-from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.loss import (
     BOX_WEIGHT,
     DIRECTION_WEIGHT,
     VARIANCE_WEIGHT,
+    Targets,
+    assign_anchors,
     box_losses,
     classification_loss,
+    residual_errors,
+    second_loss,
+    smooth_l1,
 )
-from flcav.perception.objects.model import HeadOutput, Second
+from flcav.perception.objects.model import HeadOutput, Second, SecondConfig
 from flcav.perception.objects.predict import voxels_of
 from flcav.perception.objects.samples import Sample
-from flcav.perception.objects.targets import Targets, assign_anchors
 from flcav.perception.objects.task import ObjectsTask
 
 MATCH_M = 2.0  # largest distance in bird's-eye view of a vehicle's box from the box of the road average
@@ -131,7 +139,7 @@ def pool_boxes(features: Tensor, boxes: Boxes, config: SecondConfig) -> Tensor:
     return sampled[0].mean(2).T
 
 
-def match_boxes(own: Boxes, road: Boxes) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def match_boxes(own: Boxes, road: Boxes) -> tuple[Ints, Ints]:
     """Return rows of `own` and of `road` that are of one object: one to one, nearest in bird's-eye view together.
 
     They are of one class and at most `MATCH_M` apart.
@@ -141,3 +149,37 @@ def match_boxes(own: Boxes, road: Boxes) -> tuple[NDArray[np.int64], NDArray[np.
     mine, theirs = linear_sum_assignment(np.where(fits, apart, 1e6))
     paired = fits[mine, theirs]
     return mine[paired], theirs[paired]
+
+
+SEEN = 0.1  # score from which on the teacher sees an object
+
+
+class ImitatingObjects(ObjectsTask):
+    """3D object detection that learns from labels, and from the boxes of a `teacher` with a `weight`."""
+
+    def __init__(self, teacher: Second, weight: float) -> None:
+        super().__init__()
+        self.teacher, self.weight = teacher.eval().requires_grad_(False), weight
+
+    def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
+        """Return the loss of SECOND on a batch and that of imitation, differentiable in the network's parameters."""
+        voxels = voxels_of(network, [sample.points for sample in samples])
+        output, seen = network(voxels), self.teacher(voxels)
+        targets = [assign_anchors(sample, network.config) for sample in samples]
+        return second_loss(output, targets, network.config) + self.weight * imitation_loss(output, seen)
+
+
+def imitation_loss(output: HeadOutput, teacher: HeadOutput) -> Tensor:
+    """Return the scalar distance of a batch's boxes from the teacher's, over the anchors where it sees an object.
+
+    That is smooth L1 of the residuals and cross-entropy of the headings, means by the teacher's scores, with the
+    weights of the loss on labels; 0 where it sees nothing.
+    """
+    score = teacher.score.sigmoid().amax(2)  # (B, A)
+    where = score >= SEEN
+    if not where.any():
+        return output.box.sum() * 0
+    share = score[where] / score[where].sum()
+    box = smooth_l1(residual_errors(output.box[where], teacher.box[where])).sum(1)
+    direction = F.cross_entropy(output.direction[where], teacher.direction[where].softmax(1), reduction="none")
+    return ((BOX_WEIGHT * box + DIRECTION_WEIGHT * direction) * share).sum()

@@ -1,4 +1,4 @@
-"""Multi-object tracking (AB3DMOT): a Kalman filter per object, and Hungarian assignment by likelihood.
+"""Multi-object tracking (AB3DMOT): a Kalman filter per object, Hungarian assignment by likelihood, and its evaluation.
 
 The state is x, y, z, length, width, height, yaw, then the velocity along x and y: that of Weng et al., "3D Multi-Object
 Tracking: A Baseline and New Evaluation Metrics", IROS 2020, sec. III-B, without a vertical velocity. The motion model
@@ -12,18 +12,31 @@ so that the variances a detector predicts count.
 
 Detectors confuse front and rear, so that a track has the axis of its detections, and the direction of its first one
 until it moves. One that moves backwards is turned by 180 degrees, see `head_with_motion`.
+
+Recorded sequences are evaluated by MOTA, AMOTA, identity switches and velocity error (`flcav.perception.metrics`).
 """
 
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linear_sum_assignment
 
-from flcav.geometry import Boxes, wrap_angle
-
-Array = NDArray[np.float64]
+from flcav.arrays import Array, Ints
+from flcav.config import InputError
+from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes, inverse, wrap_angle
+from flcav.interface.progress import Report, ignore_progress
+from flcav.perception.agents import frame_reader
+from flcav.perception.metrics import round_or_none
+from flcav.perception.metrics.detection import on_neutral
+from flcav.perception.metrics.tracks import TrackingFrame, TrackScore, TracksEvaluation, amota, count_clear_mot
+from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
+from flcav.sensors.frame import Frame
 
 MEASURED, STATES = 7, 9  # lengths of a measurement and of a state
 YAW = 6  # index in both
@@ -117,7 +130,7 @@ class Tracked:
     """The N tracks seen in one frame."""
 
     boxes: Boxes  # world frame; score: mean over the track's detections so far; variance: of the Kalman filter
-    track: NDArray[np.int64]  # (N,) number of each track, constant over its life
+    track: Ints  # (N,) number of each track, constant over its life
     velocity: Array  # (N, 2) along x and y of the world [m/s]
 
 
@@ -167,7 +180,7 @@ class Tracker:
         for label in sorted({track.label for track in self._tracks}):
             tracks = [track for track in self._tracks if track.label == label]
             own = np.flatnonzero(detections.label == label)
-            for t, d in assign_detections([track.state for track in tracks], rows[own], variance[own], after_s):
+            for t, d in associate_detections([track.state for track in tracks], rows[own], variance[own], after_s):
                 track, number = tracks[t], own[d]
                 state = update_state(track.state, rows[number], variance[number])
                 track.state, track.ahead_m = head_with_motion(state, track.ahead_m, time_s - track.seen_s)
@@ -197,7 +210,9 @@ class Tracker:
         return Tracked(boxes, np.array([track.number for track in told], dtype=np.int64), mean[:, 7:])
 
 
-def assign_detections(states: list[TrackState], boxes: Array, variance: Array, after_s: float) -> list[tuple[int, int]]:
+def associate_detections(
+    states: list[TrackState], boxes: Array, variance: Array, after_s: float
+) -> list[tuple[int, int]]:
     """Return the pairs (index of a state, index of a box) of least total cost: the Hungarian method within the gate.
 
     The cost is twice the negative log-likelihood of the detection's x, y under the prediction, up to a constant.
@@ -217,3 +232,122 @@ def assign_detections(states: list[TrackState], boxes: Array, variance: Array, a
     bound = 1e4
     pairs = zip(*linear_sum_assignment(np.where(np.isfinite(cost), cost, bound)), strict=True)
     return [(int(t), int(d)) for t, d in pairs if np.isfinite(cost[t, d])]
+
+
+LONGEST_GAP_S = 1.0  # between two frames of a sequence
+SCORE = 0.3  # lowest score of a detection that is tracked
+
+
+def evaluate_tracks(
+    network: Second,
+    data: Dataset,
+    frames: Sequence[int] | None = None,
+    *,
+    asked: SecondConfig | None = None,
+    progress: Report = ignore_progress,
+) -> TracksEvaluation:
+    """Return MOTA, AMOTA, identity switches and velocity error per class.
+
+    A sequence is the frames (None: all) of one agent in one scene. Objects to be tracked are the targets of detection,
+    by the network's configuration or by `asked`, one of smaller range.
+
+    Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
+    """
+    numbers, config = group_sequences(data, frames), asked or network.config
+    total = sum(map(len, numbers.values()))
+    per_class: dict[str, list[list[TrackingFrame]]] = {name: [] for name in network.config.classes}
+    speed_errors: dict[str, list[float]] = {name: [] for name in network.config.classes}
+    read, done = frame_reader(data, network.config.foreground), 0
+    for sequence in numbers.values():
+        tracker = Tracker()
+        story: list[tuple[Frame, Tracked]] = []
+        for number in sequence:
+            frame = read(number)
+            lidar = choose_lidar(frame)
+            (found,) = detect_in(network, [frame], score_threshold=SCORE)
+            story.append((frame, tracker.step(found.transform(frame.world_from_sensor(lidar)), frame.time_s)))
+            done += 1
+            progress(done, total, "")
+        final = _final_scores([tracked for _, tracked in story])
+        for name in per_class:
+            moments = [_moment(frame, tracked, final, config, name) for frame, tracked in story]
+            per_class[name].append([moment for moment, _ in moments])
+            speed_errors[name] += [error for _, errors in moments for error in errors]
+    rows = []
+    for name, moments in per_class.items():
+        counts = count_clear_mot(moments)
+        rows.append(
+            TrackScore(
+                name,
+                objects=counts.objects,
+                mota=round_or_none(counts.mota),
+                amota=round_or_none(amota(moments)),
+                motp_m=round_or_none(counts.motp_m),
+                misses=counts.misses,
+                false_positives=counts.false_positives,
+                id_switches=counts.switches,
+                velocity_error_mps=round_or_none(float(np.mean(speed_errors[name] or [np.nan]))),
+            )
+        )
+    return TracksEvaluation(len(numbers), total, tuple(rows))
+
+
+def group_sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[tuple[str, str], list[int]]:
+    """Return the numbers of the frames (None: all) by (scene, agent), in time order.
+
+    Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
+    """
+    found: dict[tuple[str, str], list[int]] = defaultdict(list)
+    for number in sorted(data.numbers(frames), key=lambda i: data.keys[i].time_s):
+        found[data.keys[number].scene, data.keys[number].agent].append(number)
+    for (scene, agent), numbers in found.items():
+        gap = max(np.diff([data.keys[i].time_s for i in numbers]), default=0.0)
+        if gap > LONGEST_GAP_S + 1e-6:
+            apart = f"frames of {agent} in {scene} are {gap:g} s apart"
+            raise InputError(f"{data.folder}: {apart}; tracks need {LONGEST_GAP_S:g} s at most")
+    return found
+
+
+def _final_scores(story: Sequence[Tracked]) -> dict[int, float]:
+    """Return the score of each track in the last frame it is reported in, by its number."""
+    final: dict[int, float] = {}
+    for tracked in story:
+        score = tracked.boxes.score if tracked.boxes.score is not None else np.ones(len(tracked.boxes))
+        final |= dict(zip(tracked.track.tolist(), score.tolist(), strict=True))
+    return final
+
+
+def _moment(
+    frame: Frame, tracked: Tracked, final: Mapping[int, float], config: SecondConfig, name: str
+) -> tuple[TrackingFrame, list[float]]:
+    """Return ground truth and tracks of class `name` in a frame, and velocity errors [m/s].
+
+    There is one error for each track within 1 m of an object: that of the velocity in the plane, against the nearest
+    object.
+    """
+    truth, annotations = ground_truth(frame, config), frame.annotations
+    of_class = truth.boxes.label == name
+    wanted = of_class & truth.target
+    sensor_from_world = inverse(frame.world_from_sensor(choose_lidar(frame)))
+    own = np.flatnonzero(tracked.boxes.label == name)
+    own = own[in_range(tracked.boxes[own].transform(sensor_from_world), config)]
+    boxes: Boxes = tracked.boxes[own]
+    objects = np.flatnonzero(wanted)
+    places, found = annotations.boxes.center[objects, :2], boxes.center[:, :2]
+    moment = TrackingFrame(
+        objects=annotations.track[objects],
+        places=places,
+        tracks=tracked.track[own],
+        found=found,
+        score=np.array([final[int(track)] for track in tracked.track[own]]),
+        neutral=on_neutral(boxes, annotations.boxes[of_class & ~wanted]),
+    )
+    errors = []
+    if len(objects) and len(own):
+        apart = np.linalg.norm(places[:, None] - found[None], axis=2)
+        nearest = apart.argmin(0)
+        for number in np.flatnonzero(apart.min(0) <= 1.0):
+            true = annotations.velocity[objects[nearest[number]]][:2]
+            if np.isfinite(true).all():  # unknown in an imported dataset
+                errors.append(float(np.linalg.norm(true - tracked.velocity[own[number]])))
+    return moment, errors

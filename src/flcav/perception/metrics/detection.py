@@ -1,0 +1,259 @@
+"""Metrics of detection: greedy matching, average precision at 40 recalls, orientation similarity, calibration error.
+
+Detections are matched to truth by IoU, with neutral objects as in the KITTI benchmark. AP|R40 is the mean over recalls
+1/40, 2/40, ..., 1 of the highest precision at that recall or a higher one (Simonelli et al., "Disentangling Monocular
+3D Object Detection", ICCV 2019, sec. 5; KITTI's measure since then). Average orientation similarity (AOS) is the same
+mean of a weighted precision: a true positive with heading error t counts (1 + cos t) / 2 (Geiger et al., "Are we ready
+for autonomous driving? The KITTI vision benchmark suite", CVPR 2012, sec. 2.5, eqs. 1-2). Intervals are bootstrap ones
+over scenes, see `flcav.statistics`.
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import ArrayLike, NDArray
+from scipy.optimize import minimize
+from scipy.special import expit, logit
+
+from flcav.arrays import Array, Ints, Mask
+from flcav.geometry import Boxes, wrap_angle
+from flcav.perception.ops.boxes import Kind, intersection_area, iou
+from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
+
+
+@dataclass(frozen=True)
+class Matches:
+    """True and false positives: the D detections of F frames that count, highest score first.
+
+    Detections that lie on a neutral object are not among them.
+    """
+
+    score: Array  # (D,)
+    hit: Mask  # (D,) True: true positive; False: false positive
+    turned: Array  # (D,) heading error [rad], in [0, pi]; NaN for a false positive
+    frame: Ints  # (D,) number of the frame, 0 to F - 1
+    targets: Ints  # (F,) number of targets in each frame
+
+
+def match(
+    detections: Sequence[Boxes],
+    targets: Sequence[Boxes],
+    neutral: Sequence[Boxes],
+    overlap: float,
+    kind: Kind = "3d",
+) -> Matches:
+    """Return the true and false positives of one class over frames; the three sequences run over the same frames.
+
+    In each frame, in order of score, a detection is matched to the unmatched target of highest IoU (of `kind`), if that
+    is at least `overlap`. An unmatched detection is left out where it lies on a neutral object, see `on_neutral`;
+    otherwise it is a false positive. This is the rule of the KITTI benchmark, with greedy assignment by score.
+
+    Raises ValueError where there are detections without scores.
+    """
+    parts = [_match_frame(*one, overlap, kind) for one in zip(detections, targets, neutral, strict=True)]
+    frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _ in parts])
+    score, turned = (np.concatenate(column) for column in zip(*parts)) if parts else (np.zeros(0), np.zeros(0))
+    order = np.argsort(-score, kind="stable")
+    wanted = np.array([len(boxes) for boxes in targets], dtype=np.int64)
+    return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], wanted)
+
+
+def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> Ints:
+    """Return (D,) the index of the target matched to each detection, -1 for none: `match_greedily` by score.
+
+    overlap: IoU of `kind` from which a detection is of a target. Raises ValueError where there are detections without
+    scores.
+    """
+    if not len(detections) or not len(targets):
+        return np.full(len(detections), -1)
+    ious = iou(torch.from_numpy(detections.array()), torch.from_numpy(targets.array()), kind).numpy()
+    return match_greedily(ious, overlap, np.argsort(-_scores(detections), kind="stable"))
+
+
+def match_greedily(overlap: Array, least: float, order: Iterable[int] | None = None) -> Ints:
+    """Return (D,) the target matched to each of D detections, -1 for none.
+
+    One detection after the other takes the target left that it overlaps most, from an overlap of `least` (> 0) on.
+
+    Args:
+        overlap: (D, T) of each detection with each target.
+        least: smallest overlap of a match.
+        order: of the detections, by falling score; None: as they stand.
+    """
+    found, left = np.full(len(overlap), -1), overlap.copy()
+    for number in range(len(left)) if order is None else order:
+        if left.size and left[number, best := int(left[number].argmax())] >= least:
+            found[number] = best
+            left[:, best] = -1
+    return found
+
+
+def on_neutral(detections: Boxes, neutral: Boxes) -> Mask:
+    """Return (D,) whether at least half of a detection's footprint lies on one neutral object.
+
+    The intersection is divided by the area of the detection. IoU would not do: a car detected on a bus covers a small
+    part of the bus.
+    """
+    return np.any(lies_on(detections, neutral), axis=1)
+
+
+def lies_on(detections: Boxes, objects: Boxes) -> Mask:
+    """Return (D, N) whether at least half of a detection's footprint lies on each of N objects."""
+    out = np.zeros((len(detections), len(objects)), dtype=bool)
+    if not len(objects):
+        return out
+    radius = np.hypot(detections.size[:, :1], detections.size[:, 1:2]) + np.hypot(
+        objects.size[:, 0], objects.size[:, 1]
+    )
+    distance = np.linalg.norm(detections.center[:, None, :2] - objects.center[None, :, :2], axis=2)
+    of, on = np.nonzero(distance < radius / 2)
+    rows, boxes = torch.from_numpy(detections.array()[of]), torch.from_numpy(objects.array()[on])
+    shared = intersection_area(rows, boxes).numpy()
+    out[of, on] = shared >= 0.5 * detections.size[of, 0] * detections.size[of, 1]
+    return out
+
+
+def _match_frame(detections: Boxes, targets: Boxes, neutral: Boxes, overlap: float, kind: Kind) -> tuple[Array, Array]:
+    """Return the scores (D,) of one frame's detections that count, and their heading errors (D,), see `Matches`."""
+    found = assign_targets(detections, targets, overlap, kind)
+    hit = found >= 0
+    turned = np.full(len(found), np.nan)
+    turned[hit] = np.abs(wrap_angle(detections.yaw[hit] - targets.yaw[found[hit]]))
+    counts = hit | ~on_neutral(detections, neutral)
+    return _scores(detections)[counts], turned[counts]
+
+
+def _scores(detections: Boxes) -> Array:
+    if detections.score is None:
+        if len(detections):
+            raise ValueError("detections without scores cannot be matched")
+        return np.zeros(0)
+    return detections.score
+
+
+RECALLS = np.arange(1, 41) / 40
+AT_ONCE = 2**15  # bootstrap resamples times detections: arrays of 0.25 MB stay in a processor's cache
+
+
+def average_precision(matches: Matches, frames: ArrayLike | None = None) -> float:
+    """Return the average precision AP|R40 in [0, 1] over `frames`; NaN where those frames hold no targets.
+
+    frames: indices, in which a frame may repeat (None: each frame once).
+    """
+    return float(weighted_precision(matches, _times(matches, frames))[0])
+
+
+def orientation_similarity(matches: Matches, frames: ArrayLike | None = None) -> float:
+    """Return the average orientation similarity AOS|R40 in [0, AP|R40] over `frames`; NaN where they hold no targets.
+
+    frames: as in `average_precision`.
+    """
+    worth = (1 + np.cos(np.nan_to_num(matches.turned))) / 2
+    return float(weighted_precision(matches, _times(matches, frames), worth)[0])
+
+
+def right_headings(matches: Matches) -> float:
+    """Return the share of true positives with a heading error below 90 degrees; NaN without true positives."""
+    return float((matches.turned[matches.hit] < np.pi / 2).mean()) if matches.hit.any() else float("nan")
+
+
+def bootstrap_interval(
+    matches: Matches, scene_of_frame: ArrayLike, n: int = REDRAWS, *, rng: np.random.Generator
+) -> tuple[float, float]:
+    """Return the 95 % percentile bootstrap interval (low, high) of AP over `n` resamples of the scenes.
+
+    scene_of_frame (F,): scene of each frame. NaN where fewer than two scenes hold targets.
+    """
+    if len(np.unique(np.asarray(scene_of_frame)[matches.targets > 0])) < 2:
+        return float("nan"), float("nan")
+    return bootstrap_over_scenes(lambda times: weighted_precision(matches, times), scene_of_frame, n, rng=rng)
+
+
+def interval_words(low: float | None, high: float | None) -> str:
+    """Return an interval over scenes as text: "[0.123, 0.456]", or that there is none where a limit is None."""
+    return "(no interval: one scene)" if low is None or high is None else f"[{low:.3f}, {high:.3f}]"
+
+
+def round_or_none(value: float) -> float | None:
+    """Return the number rounded to six decimals, or None for NaN, which JSON cannot hold."""
+    return None if np.isnan(value) else round(value, 6)
+
+
+def _times(matches: Matches, frames: ArrayLike | None) -> Ints:
+    """Return (1, F) the multiplicity of each frame in `frames`."""
+    if frames is None:
+        return np.ones((1, len(matches.targets)), dtype=np.int64)
+    return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))[None]
+
+
+def weighted_precision(matches: Matches, times: Ints, worth: Array | float = 1.0) -> Array:
+    """Return weighted average precision (n,) of n resamples of the frames; NaN where a resample holds no targets.
+
+    times (n, F): multiplicity of each frame in each resample; worth (D,) or one number: what a true positive adds to
+    the precision, 1 for AP, (1 + cos t) / 2 for AOS.
+    """
+    ends = np.flatnonzero(np.diff(matches.score, append=-np.inf) != 0)  # detections of equal score enter together
+    worths, block = np.where(matches.hit, worth, 0.0), max(AT_ONCE // max(len(matches.score), 1), 1)
+    blocks = (times[start : start + block] for start in range(0, len(times), block))
+    return np.concatenate([_average(matches, worths, ends, part) for part in blocks])
+
+
+def _average(matches: Matches, worths: Array, ends: NDArray[np.intp], times: Ints) -> Array:
+    """Return weighted AP (n,) of `times` (n, F); `ends` (E,): index of the last detection of each distinct score."""
+    wanted = times @ matches.targets
+    weight = np.take(times, matches.frame, axis=1)
+    hits, detections = np.cumsum(weight * matches.hit, axis=1)[:, ends], np.cumsum(weight, axis=1)[:, ends]
+    precision = np.cumsum(weight * worths, axis=1)[:, ends] / np.maximum(detections, 1)
+    best_onwards = np.maximum.accumulate(precision[:, ::-1], axis=1)[:, ::-1]
+    best_onwards = np.column_stack((best_onwards, np.zeros(len(times))))
+    needed = RECALLS * wanted[:, None] - 1e-9
+    place = np.stack([np.searchsorted(*one) for one in zip(hits, needed)])  # first threshold that reaches the recall
+    found = np.take_along_axis(best_onwards, place, axis=1).mean(axis=1)
+    return np.where(wanted > 0, found, np.nan)
+
+
+BINS = 10
+PULL = 0.01  # weight of the quadratic penalty on the summand and on the logarithm of the factor
+
+
+def calibration_error(score: ArrayLike, hit: ArrayLike, bins: int = BINS) -> float:
+    """Return the expected calibration error (ECE) of D detections, in [0, 1]; NaN without detections.
+
+    score (D,) in [0, 1]; hit (D,) whether the detection is correct. The ECE is the mean over detections of |mean score
+    - share of hits| in the detection's bin, `bins` of equal width (Naeini et al., "Obtaining well calibrated
+    probabilities using Bayesian binning", AAAI 2015).
+    """
+    scores, hits = np.asarray(score, dtype=np.float64), np.asarray(hit, dtype=np.float64)
+    if not len(scores):
+        return float("nan")
+    number = np.minimum((scores * bins).astype(np.int64), bins - 1)
+    gap = np.bincount(number, scores - hits, bins)
+    return float(np.abs(gap).sum() / len(scores))
+
+
+def fit_logistic(score: ArrayLike, hit: ArrayLike) -> tuple[float, float]:
+    """Return factor (positive) and summand of Platt scaling: calibrated logit = factor * logit + summand.
+
+    Fitted by penalised maximum likelihood to scores (D,) in [0, 1] and hits (D,), with the smoothed targets of Platt,
+    "Probabilistic outputs for support vector machines", 1999, sec. 2.2. (1, 0), no change, where all or none are hits.
+    """
+    x = logit(np.clip(np.asarray(score, dtype=np.float64), 1e-7, 1 - 1e-7))
+    hits = np.asarray(hit, dtype=bool)
+    right, wrong = int(hits.sum()), int((~hits).sum())
+    if not right or not wrong:
+        return 1.0, 0.0
+    wanted = np.where(hits, (right + 1) / (right + 2), 1 / (wrong + 2))
+
+    def loss(parameters: Array) -> tuple[float, Array]:
+        factor = np.exp(parameters[0])
+        z = factor * x + parameters[1]
+        value = np.logaddexp(0, z) - wanted * z
+        slope = expit(z) - wanted
+        prior = PULL * parameters
+        gradient = np.array(((slope * x).sum() * factor, slope.sum())) + 2 * prior
+        return float(value.sum() + (prior * parameters).sum()), gradient
+
+    found = minimize(loss, np.zeros(2), jac=True, method="L-BFGS-B", bounds=((-3, 3), (-10, 10)))
+    return float(np.exp(found.x[0])), float(found.x[1])

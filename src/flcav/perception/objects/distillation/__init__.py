@@ -1,1 +1,0 @@
-"""Distillation, as losses of a detector: from the road average of boxes, and from the network that it began with."""
