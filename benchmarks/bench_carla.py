@@ -22,10 +22,10 @@ from typing import Any
 
 from cpu_time import cpu_ms
 
-from flcav.sources.carla.server.calls import Calls
-from flcav.sources.carla.server.maps import Maps
-from flcav.sources.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb, sense_semantic
-from flcav.sources.carla.server.sensing.sight import Sensor, Sight
+from flcav.carla.server.calls import Calls
+from flcav.carla.server.maps import Maps
+from flcav.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb, sense_semantic
+from flcav.carla.server.sensing.sight import Sensor, Sight
 
 DT_S = 0.05
 VEHICLES = 20

@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.blueprints import list_blueprints
-from flcav.sources.carla.server.calls import Calls
+from flcav.carla.server import wire
+from flcav.carla.server.blueprints import list_blueprints
+from flcav.carla.server.calls import Calls
 
 SKIPPED = {"load_new_episode", "copy_opendrive_to_file"}  # they take seconds where they work: a few are enough
 FEW = 0.001  # share of them

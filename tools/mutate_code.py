@@ -36,7 +36,7 @@ PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
     "runtimes": (["federation/runtimes"], [FEDERATION]),
     "privacy": (["federation/privacy.py", "federation/noise.py"], [FEDERATION]),
     "releases": (["releases"], ["tests/unit/releases"]),
-    "carla": (["sources/carla/server"], ["tests/unit/sources/carla_server", "tests/integration/test_carla_server.py"]),
+    "carla": (["carla/server"], ["tests/unit/carla", "tests/integration/test_carla_server.py"]),
     "driving": (
         ["driving/measures.py", "driving/loop.py", "driving/driver.py", "driving/corridor.py", "driving/following.py"],
         ["tests/unit/driving"],

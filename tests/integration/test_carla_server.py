@@ -13,8 +13,8 @@ import msgpack
 import pytest
 from waiting import LONGEST_S
 
+from flcav.carla.server import wire
 from flcav.cli.main import run
-from flcav.sources.carla.server import wire
 
 SESSION = Path(__file__).with_name("carla_session.py")
 SESSIONS = (

@@ -25,9 +25,9 @@ def record(
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav.dataset.layout import read_manifest, trace_path
+    from flcav.dataset.recording.recorder import open_source
     from flcav.dataset.recording.recorder import record as write
     from flcav.interface import progress
-    from flcav.sources.opening import open_source
     from flcav.sources.recipe import find_recipe, load_recipe, parse_recipe
     from flcav.storage.files import check_writable
     from flcav.world.trace import Trace

@@ -12,6 +12,7 @@ import numpy as np
 import yaml
 from numpy.typing import ArrayLike, NDArray
 
+from flcav.carla.frames import MIRROR, MapFrame
 from flcav.dataset.formats.exporter import (
     Exported,
     ExportFormat,
@@ -32,7 +33,6 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.sources.carla.frames import MIRROR, MapFrame
 
 Array = NDArray[np.float64]
 
