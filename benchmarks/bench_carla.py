@@ -24,8 +24,8 @@ from cpu_time import cpu_ms
 
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb, sense_semantic
-from flcav.carla.server.sensing.sight import Sensor, Sight
+from flcav.carla.server.sensors import sense_depth, sense_instance, sense_rgb, sense_semantic
+from flcav.carla.server.sight import Sensor, Sight
 
 DT_S = 0.05
 VEHICLES = 20

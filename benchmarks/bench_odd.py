@@ -18,8 +18,7 @@ from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain, read_domain
 from flcav.odd.judge import judge
 from flcav.odd.measure import AROUND_M, Measurements, describe_weather, measure, scenery_of
-from flcav.odd.recipes import write_recipes
-from flcav.odd.sampling import METHODS, Space, sample_domain
+from flcav.odd.sampling import METHODS, Space, sample_domain, write_recipes
 from flcav.odd.scenery import Scenery
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

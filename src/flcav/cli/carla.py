@@ -6,7 +6,7 @@ from pathlib import Path
 
 import typer
 
-from flcav.carla.server.catalogue import Quality
+from flcav.carla.server.blueprints import Quality
 from flcav.cli.terminal import echo
 
 carla = typer.Typer(help="CARLA: serve its clients from a town, without a GPU.", no_args_is_help=True)

@@ -26,7 +26,7 @@ class Perceives(StrEnum):
 
 
 class CouplingName(StrEnum):
-    """Couplings of perception and driving, see `flcav.driving.couplings`."""
+    """Couplings of perception and driving, see `flcav.driving.seen`."""
 
     bare = "bare"
     cautious = "cautious"

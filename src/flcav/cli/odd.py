@@ -48,8 +48,8 @@ def check(
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
     from flcav.odd.domain import read_domain
+    from flcav.odd.judge import check_frames, check_towns
     from flcav.odd.measure import measure
-    from flcav.odd.realise import check_frames, check_towns
     from flcav.odd.scenery import Scenery
     from flcav.world.map.town import TOWNS, load_town
 
@@ -146,7 +146,7 @@ def inside(
     rate = len(truth.frames) / (time.perf_counter() - begun)
     seen, agreement = None, None
     if perceived:
-        from flcav.odd.perceive import perceive
+        from flcav.odd.measure import perceive
         from flcav.perception.networks import resolve_network
         from flcav.perception.tasks import task_named
 
@@ -199,7 +199,7 @@ def cover(
     use_threads(1)
     from flcav.cli.options import parse_axes, refuse_unused
     from flcav.interface import progress
-    from flcav.odd.covering import cover_domain
+    from flcav.odd.coverage import cover_domain
     from flcav.odd.domain import read_domain
     from flcav.storage.files import check_writable
 
@@ -251,7 +251,7 @@ def tasks(
     import yaml
 
     from flcav.config import InputError
-    from flcav.odd.tasks import generate_tasks, make_run, name_region, town_of
+    from flcav.odd.scenario_tasks import generate_tasks, make_run, name_region, town_of
     from flcav.storage.files import check_writable, write_bytes
     from flcav.world.map.town import load_town
 

@@ -69,8 +69,7 @@ def sample(
     from flcav.odd.coverage import load_report
     from flcav.odd.domain import read_domain
     from flcav.odd.openscenario import to_openscenario
-    from flcav.odd.recipes import write_recipes
-    from flcav.odd.sampling import Sample, Space, count_pairs, sample_domain
+    from flcav.odd.sampling import Sample, Space, count_pairs, sample_domain, write_recipes
     from flcav.odd.scenery import Scenery
     from flcav.sources.recipe import Recipe
     from flcav.storage.files import check_writable, write_bytes

@@ -20,9 +20,19 @@ from flcav.driving.following import MOTIONS, Following, Spread
 from flcav.driving.loop import Sensing
 from flcav.driving.networks import LIGHTS_M, load_networks, load_roads
 from flcav.driving.scenarios import Staged
-from flcav.driving.seen import EGO, TIMES_S, WEATHER_SPEED, Perception, Seen
-from flcav.driving.truth import find_around, read_actors, read_lights
-from flcav.driving.visibility import EYE_M, FIELD_M, share_seen
+from flcav.driving.seen import (
+    EGO,
+    EYE_M,
+    FIELD_M,
+    TIMES_S,
+    WEATHER_SPEED,
+    Perception,
+    Seen,
+    find_around,
+    read_actors,
+    read_lights,
+    share_seen,
+)
 from flcav.geometry import Boxes, heading_vectors, rotate
 from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.statistics.streams import stream

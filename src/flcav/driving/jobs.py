@@ -8,13 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TextIO
 
-from flcav.driving.couplings import Coupling, Without
 from flcav.driving.errors import ErrorModel, sense_model
 from flcav.driving.loop import LOOP, Loop, Sensing, drive, sense_truth
 from flcav.driving.measures import Drive
 from flcav.driving.networks import sense_networks
 from flcav.driving.scenarios import Scenario, Staged
-from flcav.driving.seen import Perception
+from flcav.driving.seen import Coupling, Perception, Without
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.storage.records import Record, to_json

@@ -8,8 +8,7 @@ import numpy as np
 from flcav.driving.driver import DEFAULT, Motion, Settings, decide
 from flcav.driving.measures import HARD_MPS2, NEAR_S, STANDS_MPS, Drive, Hit, judge_collision, measure_ttc, score_drive
 from flcav.driving.scenarios import DT_S, Scenario, Staged
-from flcav.driving.seen import EGO, Perception
-from flcav.driving.truth import Truth, read_lights
+from flcav.driving.seen import EGO, Perception, Truth, read_lights
 from flcav.geometry import heading_vectors
 from flcav.world.map.routes import Route
 from flcav.world.snapshot import Snapshot

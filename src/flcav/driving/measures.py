@@ -12,8 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.driving.corridor import find_meeting, find_occupied
-from flcav.driving.driver import Motion
+from flcav.driving.driver import Motion, find_meeting, find_occupied
 from flcav.driving.seen import EGO, TIMES_S, Seen
 from flcav.geometry import heading_vectors
 from flcav.storage.records import Record

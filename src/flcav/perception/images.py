@@ -16,9 +16,8 @@ from PIL import Image, ImageEnhance, UnidentifiedImageError
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, read_calibration
 from flcav.dataset.layout import MANIFEST
-from flcav.dataset.payloads import open_image
+from flcav.dataset.payloads import open_image, turn_upright
 from flcav.dataset.store import Dataset
-from flcav.dataset.upright import turn_upright
 from flcav.geometry import inverse, transform_points
 from flcav.network.messages import from_names, to_names
 from flcav.sensors.frame import Frame

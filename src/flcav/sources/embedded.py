@@ -13,9 +13,8 @@ from flcav.sensors.frame import Frame
 from flcav.sensors.navigation_log import NavigationLog, log_drive
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
-from flcav.sources.division import Division
 from flcav.sources.randomisation import randomise_bodies, randomise_rig, randomise_town, town_files
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import Division, Recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, Town, check_town_name, load_town
 from flcav.world.scene import Scene

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from carla_calls import describe, invoke, place
 
-from flcav.carla.server import catalogue, wire
-from flcav.carla.server.blueprints import Refused, check, list_blueprints
+from flcav.carla.server import wire
+from flcav.carla.server.blueprints import NOT_SERVED, SENSORS, Refused, check, list_blueprints
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.episode import Measurement
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.sensing.table import KINDS, Clock
+from flcav.carla.server.sensors import KINDS, Clock
 from flcav.carla.server.weather import to_weather
 from flcav.config import InputError
 from flcav.world.shapes import SHAPES
@@ -32,7 +32,7 @@ def calls(maps):
 
 
 def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
-    for name in (*catalogue.SENSORS, *catalogue.NOT_SERVED):
+    for name in (*SENSORS, *NOT_SERVED):
         spawn = (describe(name), [[0.0, 0.0, 10.0], [0.0, 0.0, 0.0]])
         if name in KINDS:
             assert invoke(calls, "spawn_actor", spawn).token

@@ -22,8 +22,7 @@ from flcav.carla.recording.sensors import Feed, SemanticSweep, read_depths, read
 from flcav.carla.recording.session import Session, _check_version, check_installed
 from flcav.carla.recording.source import CarlaSource
 from flcav.carla.recording.traffic import Body, State
-from flcav.carla.recording.weather import make_weather
-from flcav.carla.server.weather import to_weather
+from flcav.carla.server.weather import make_weather, to_weather
 from flcav.carla.server.wire import WeatherParameters
 from flcav.world.weather import WEATHERS
 

@@ -15,7 +15,7 @@ from flcav.carla.server.blueprints import list_blueprints
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.episode import Episode
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.sensing.table import KINDS, Kind
+from flcav.carla.server.sensors import KINDS, Kind
 from flcav.carla.server.serve import Server
 from flcav.carla.server.wire import Stream
 

@@ -11,13 +11,12 @@ from shapely.geometry import LineString, Point
 from flcav.carla.frames import mirror
 from flcav.carla.server import maps as carla_maps
 from flcav.carla.server import wire
-from flcav.carla.server.blueprints import Refused, check, list_blueprints
+from flcav.carla.server.actors import choose_gear
+from flcav.carla.server.blueprints import Quality, Refused, check, list_blueprints
 from flcav.carla.server.calls import Calls
-from flcav.carla.server.catalogue import Quality
-from flcav.carla.server.driving import choose_gear
 from flcav.carla.server.lights import find_limits, list_signals
 from flcav.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
-from flcav.carla.server.sensing.cameras import sense_rgb
+from flcav.carla.server.sensors import sense_rgb
 from flcav.carla.server.wire import VehicleControl
 from flcav.config import InputError
 from flcav.sensors.frame import SEMANTICS

@@ -13,10 +13,21 @@ from toy_source import ToySource
 
 from flcav.cli.main import run
 from flcav.dataset.formats.coco import encode_run_lengths
-from flcav.dataset.formats.mounts import assign_channels, find_front_camera, quaternion
-from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, encode_lidar, encode_radar, map_mask
-from flcav.dataset.formats.nuscenes.tables import CAMERAS, Row, attributes, link_rows, token, visibility
+from flcav.dataset.formats.nuscenes.files import (
+    CAMERAS,
+    RADAR,
+    RESOLUTION_M,
+    Row,
+    attributes,
+    encode_lidar,
+    encode_radar,
+    link_rows,
+    map_mask,
+    token,
+    visibility,
+)
 from flcav.dataset.formats.opv2v.write import agent_numbers, carla_pose, encode_pcd
+from flcav.dataset.formats.writing import assign_channels, find_front_camera, quaternion
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.sensors.lens import BODY_FROM_OPTICAL

@@ -9,14 +9,21 @@ from shapely.affinity import rotate as turn
 from shapely.affinity import translate
 
 from flcav.config import InputError
-from flcav.driving.corridor import find_meeting, find_occupied
-from flcav.driving.couplings import TASKS, leave_out
-from flcav.driving.driver import EMERGENCY_MPS2, GAIN_MPS2, Motion, Settings, _cover, decide
+from flcav.driving.driver import (
+    EMERGENCY_MPS2,
+    GAIN_MPS2,
+    Motion,
+    Settings,
+    _cover,
+    decide,
+    find_meeting,
+    find_occupied,
+)
 from flcav.driving.jobs import Job, Sensed, run_job
 from flcav.driving.loop import LOOP
 from flcav.driving.measures import Drive, Hit, judge_collision, score_drive
 from flcav.driving.scenarios import find_scenarios, list_scenarios, spread_scenarios
-from flcav.driving.seen import TIMES_S, Perception, Seen, predict_motion
+from flcav.driving.seen import TASKS, TIMES_S, Perception, Seen, leave_out, predict_motion
 from flcav.driving.studies.importance import compare, kendall, weigh
 from flcav.geometry import Boxes
 from flcav.world.dynamics.blueprints import blueprint

@@ -22,8 +22,15 @@ from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
 from flcav.driving.studies import importance
 from flcav.driving.studies.error_measurement import Tally, summarise
-from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
-from flcav.driving.studies.pole_gain import FusionTally, PoleGain, Precision, measure_precision
+from flcav.driving.studies.pole_gain import (
+    FusionTally,
+    Hidden,
+    PoleGain,
+    Precision,
+    find_hidden,
+    measure_precision,
+    summarise_hidden,
+)
 from flcav.geometry import Boxes, left_vectors
 from flcav.network.messages import unpack
 from flcav.optimization.problem import Problem

@@ -9,10 +9,9 @@ from PIL import Image
 
 from flcav.experiments.failure_search.run import RULES, SOBOL, FailureSearchResult, Found, mean_ratio, summarise
 from flcav.experiments.failure_search.tables import failure_search_tables
-from flcav.odd.failures import Failure, TriedFrame
 from flcav.odd.sampling import Sample
 from flcav.odd.scenery import Place
-from flcav.odd.searching import Searched
+from flcav.odd.searching import Failure, Searched, TriedFrame
 from flcav.storage.records import from_json
 from flcav.world.weather import Weather
 

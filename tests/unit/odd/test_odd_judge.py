@@ -9,8 +9,7 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain, read_domain
 from flcav.odd.judge import INSIDE, OUTSIDE, UNKNOWN, compare_verdicts, judge, judge_values
-from flcav.odd.measure import Measurements, measure
-from flcav.odd.perceive import _narrow, perceive
+from flcav.odd.measure import Measurements, _narrow, measure, perceive
 
 URBAN = read_domain("urban")
 FINE = {

@@ -16,8 +16,7 @@ from flcav.odd.coverage import collect_runs, list_covered, merge_runs
 from flcav.odd.domain import Domain, read_domain
 from flcav.odd.measure import measure
 from flcav.odd.openscenario import to_openscenario, write_script
-from flcav.odd.recipes import make_recipe
-from flcav.odd.sampling import CASE, CASES, METHODS, Axis, Sample, Space, sample_domain
+from flcav.odd.sampling import CASE, CASES, METHODS, Axis, Sample, Space, make_recipe, sample_domain
 from flcav.odd.scenery import Scenery
 from flcav.sources.recipe import load_recipe, parse_recipe
 from flcav.world.map.town import load_town

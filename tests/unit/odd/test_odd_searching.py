@@ -11,10 +11,19 @@ import torch
 from flcav.cli.main import run
 from flcav.odd import searching
 from flcav.odd.domain import Domain
-from flcav.odd.failures import Candidate, Failure, TriedFrame, list_candidates, take_apart
 from flcav.odd.sampling import Sample, Space, sample_domain
 from flcav.odd.scenery import Scenery
-from flcav.odd.searching import FailureModel, choose_frames, distinct, search_failures
+from flcav.odd.searching import (
+    Candidate,
+    Failure,
+    FailureModel,
+    TriedFrame,
+    choose_frames,
+    distinct,
+    list_candidates,
+    search_failures,
+    take_apart,
+)
 from flcav.perception.objects.model import Second
 from flcav.statistics.streams import stream
 from flcav.world.trace import Event, Trace

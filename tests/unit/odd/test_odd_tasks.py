@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.odd.tasks import ORDER, Complexity, count_tasks, generate_tasks, make_run, saturate, town_of
+from flcav.odd.scenario_tasks import ORDER, Complexity, count_tasks, generate_tasks, make_run, saturate, town_of
 from flcav.pipeline.recipe import load_run_recipe
 
 SHARE = st.floats(0, 0.999)

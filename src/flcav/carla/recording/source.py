@@ -35,16 +35,15 @@ from flcav.carla.recording.traffic import (
     spawn_vehicles,
     spawn_walkers,
 )
-from flcav.carla.recording.weather import make_weather
+from flcav.carla.server.weather import make_weather
 from flcav.config import InputError, Json
 from flcav.geometry import Boxes, points_in_boxes, pose, transform_points
 from flcav.sensors.calibration import build_calibration, perturb_calibration
 from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.navigation import draw_fix_errors, draw_imu_errors
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
-from flcav.sources.division import Division
 from flcav.sources.embedded import check_mounts, read_town_files
-from flcav.sources.recipe import STEP_S, CarlaRecipe
+from flcav.sources.recipe import STEP_S, CarlaRecipe, Division
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.parameters import GeoReference

@@ -1,19 +1,24 @@
 """The actors that clients know, beside the bodies of the live world."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame, mirror, mirror_spin, to_rotation
 from flcav.carla.server import wire
-from flcav.carla.server.sensing.sight import Sensor
-from flcav.carla.server.sensing.table import Clock
-from flcav.carla.server.wire import BoundingBox, Transform
+from flcav.carla.server.blueprints import FLOAT, TRIGGER
+from flcav.carla.server.sensors import Clock
+from flcav.carla.server.sight import Sensor
+from flcav.carla.server.wire import AckermannControl, BoundingBox, Transform, VehicleControl
 from flcav.geometry import rotations
 from flcav.sensors.frame import SEMANTICS
+from flcav.world.commands import Grip
+from flcav.world.dynamics.blueprints import blueprint
+from flcav.world.dynamics.bodies import Body
+from flcav.world.live import LiveWorld
 from flcav.world.snapshot import Snapshot
 
 Array = NDArray[np.float64]
@@ -144,3 +149,88 @@ def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
     )
     rows = zip(*((map(tuple, column.tolist())) for column in columns))
     return [Place(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
+
+
+PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
+SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
+SETTLE_S = 0.5  # time in which a difference of speed is to be made up
+STOPPED_MPS = 0.05
+
+
+def choose_gear(control: VehicleControl, speed_mps: float) -> int:
+    """Return the gear of a vehicle: the driver's, or that of an automatic gearbox at its speed."""
+    if control.manual:
+        return control.gear
+    return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
+
+
+def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
+    """Return the share of a dry road's friction in a box of friction; None where `point` (3,) is not in the box."""
+    told = {each.id: float(each.value) for each in box.description.attributes if each.type == FLOAT}
+    half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]
+    inside = np.abs(box.pose[:3, :3].T @ (point - box.pose[:3, 3])) <= half
+    return min(told["friction"], 1.0) if inside.all() else None
+
+
+def list_grips(actors: Collection[Actor], bodies: Iterable[Body]) -> list[Grip]:
+    """Return how the tyres of vehicles hold, by the last box of friction that each is in, where that has changed."""
+    known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
+    boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []
+    for body in bodies:
+        if (actor := known.get(body.name)) is not None:
+            shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
+            share = shares[-1] if shares else 1.0
+            if body.grip != share:
+                changed.append(Grip(body.name, share))
+    return changed
+
+
+def steer_towards(
+    told: AckermannControl, now: VehicleControl, speed_mps: float, limit_rad: float, dt_s: float
+) -> VehicleControl:
+    """Return the control of a vehicle with the greatest steering angle `limit_rad` at `speed_mps`, for one step."""
+    steer = min(max(told.steer / limit_rad, -1.0), 1.0)
+    if told.steer_speed > 0:
+        most = told.steer_speed / limit_rad * dt_s
+        steer = min(max(steer, now.steer - most), now.steer + most)
+    wanted = (told.speed - speed_mps) / SETTLE_S
+    if told.acceleration > 0:
+        wanted = min(max(wanted, -told.acceleration), told.acceleration)
+    backwards = told.speed < 0
+    push = -wanted if backwards else wanted
+    if abs(told.speed) < STOPPED_MPS and abs(speed_mps) < STOPPED_MPS:
+        return VehicleControl(steer=steer, brake=1.0, hand_brake=True)
+    if push >= 0:
+        return VehicleControl(throttle=min(push / PULL_MPS2, 1.0), steer=steer, reverse=backwards)
+    return VehicleControl(steer=steer, brake=min(-push / BRAKE_MPS2, 1.0), reverse=backwards)
+
+
+WHEEL_M = 0.35  # radius
+TORQUE = [[0.0, 400.0], [1890.0, 500.0], [5729.0, 400.0]]  # of the engine over its speed [N m, 1/min]
+GEARS = [[4.0, 0.5, 0.65], [2.0, 0.5, 0.65]]  # ratio, shares of the speed at which it shifts
+STEERING = [[0.0, 1.0], [20.0, 0.9], [120.0, 0.7]]  # share of the angle over the speed [km/h]
+
+
+def describe_physics(vehicle: Actor, world: LiveWorld) -> list[Any]:
+    """Return a vehicle's physics: those of its size, and CARLA's defaults for what plays no part here."""
+    made = blueprint(vehicle.category, 0, vehicle.size)
+    steer = float(np.degrees(made.steer_limit_rad))
+    wheels = []
+    for front in (True, False):
+        for left in (True, False):
+            along = made.wheelbase_m / 2 * (1 if front else -1)
+            across = vehicle.size[1] * 0.4 * (1 if left else -1)
+            x, y, z = (vehicle.pose @ (along, across, WHEEL_M, 1.0))[:3]
+            place = [100.0 * x, -100.0 * y, 100.0 * z]  # [cm]
+            turns, hand = (steer, 0.0) if front else (0.0, 3000.0)
+            wheels.append([3.5, 0.25, turns, 100 * WHEEL_M, 1500.0, hand, 2.0, 17.0, 1000.0, place])
+    engine = [TORQUE, 5729.0, 1.0, 0.15, 2.0, 0.35]
+    gearbox = [True, 0.5, 10.0, 4.0, GEARS]
+    return [*engine, *gearbox, made.mass_kg, 0.3, [0.45, 0.0, -0.3], STEERING, wheels, True]
+
+
+def describe_telemetry(vehicle: Actor, speed_mps: float) -> list[Any]:
+    """Return a vehicle's telemetry."""
+    control = vehicle.control
+    wheel = [3.5] + [0.0] * 10
+    return [speed_mps, control.steer, control.throttle, control.brake, 1000.0, max(control.gear, 1), 0.3, [wheel] * 4]

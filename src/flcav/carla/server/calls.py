@@ -13,12 +13,10 @@ import numpy as np
 
 from flcav.carla.frames import mirror, mirror_spin, to_vector
 from flcav.carla.server import wire
-from flcav.carla.server.actors import NOTHING, Actor, Counters
-from flcav.carla.server.blueprints import Refused, list_blueprints
-from flcav.carla.server.catalogue import Quality
+from flcav.carla.server.actors import NOTHING, Actor, Counters, describe_physics, describe_telemetry
+from flcav.carla.server.blueprints import Quality, Refused, list_blueprints
 from flcav.carla.server.episode import Episode
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.physics import describe_physics, describe_telemetry
 from flcav.carla.server.scenery import find_boxes, find_objects, project
 from flcav.carla.server.wire import BoundingBox, Transform, Vector
 from flcav.config import InputError, shorten

@@ -14,17 +14,31 @@ from numpy.typing import NDArray
 
 from flcav.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.carla.server import wire
-from flcav.carla.server.actors import STANDING, WAITING, Actor, Counters, list_places
-from flcav.carla.server.blueprints import TRUE, Blueprint, Refused, check, find_paint, list_blueprints
-from flcav.carla.server.catalogue import Quality
-from flcav.carla.server.driving import choose_gear, list_grips, steer_towards
+from flcav.carla.server.actors import (
+    STANDING,
+    WAITING,
+    Actor,
+    Counters,
+    choose_gear,
+    list_grips,
+    list_places,
+    steer_towards,
+)
+from flcav.carla.server.blueprints import TRUE, Blueprint, Quality, Refused, check, find_paint, list_blueprints
 from flcav.carla.server.lights import Lights, find_approaches, find_limits, list_signals, list_signs
 from flcav.carla.server.maps import ServedMap
 from flcav.carla.server.recorder import Recorder
-from flcav.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb
-from flcav.carla.server.sensing.events import describe_thing, find_collisions, find_obstacle
-from flcav.carla.server.sensing.sight import Scenes, Sensor, Sight
-from flcav.carla.server.sensing.table import KINDS, Clock
+from flcav.carla.server.sensors import (
+    KINDS,
+    Clock,
+    describe_thing,
+    find_collisions,
+    find_obstacle,
+    sense_depth,
+    sense_instance,
+    sense_rgb,
+)
+from flcav.carla.server.sight import Scenes, Sensor, Sight
 from flcav.carla.server.weather import to_weather
 from flcav.carla.server.wire import Transform
 from flcav.sensors.rendering.appearance import build_appearance

@@ -12,7 +12,7 @@ from flcav.dataset.formats.formats import EXPORTS, export_format
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
-    from flcav.dataset.formats.exporter import LeftOut
+    from flcav.dataset.formats.writing import LeftOut
 
 
 def register(app: typer.Typer) -> None:
@@ -42,8 +42,8 @@ def export(
 ) -> None:
     """Write a dataset in a format that other software reads: docs/formats.md has the tables."""
     from flcav.config import parse_config
-    from flcav.dataset.formats.export import export as write
-    from flcav.dataset.formats.exporter import ExportOptions
+    from flcav.dataset.formats.conversion import export as write
+    from flcav.dataset.formats.writing import ExportOptions
     from flcav.dataset.store import Dataset
     from flcav.interface import progress
 

@@ -29,9 +29,9 @@ def import_(
 
     Files that need no conversion are linked to, so they have to stay where they are.
     """
-    from flcav.dataset.checks.copies import find_copies
-    from flcav.dataset.formats.importing import import_dataset
+    from flcav.dataset.formats.conversion import import_dataset
     from flcav.dataset.layout import read_manifest
+    from flcav.dataset.scene_checks import find_copies
     from flcav.dataset.validation import find_leaks
     from flcav.interface import progress
 

@@ -17,8 +17,8 @@ def validate(
     folders: list[Path] = typer.Argument(metavar="DIR...", help="Datasets; several are also checked for leakage."),
 ) -> None:
     """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
-    from flcav.dataset.checks.copies import find_copies
     from flcav.dataset.layout import read_manifest
+    from flcav.dataset.scene_checks import find_copies
     from flcav.dataset.validation import find_leaks
     from flcav.dataset.validation import validate as problems_of
     from flcav.interface import progress

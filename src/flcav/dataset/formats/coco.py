@@ -14,7 +14,7 @@ from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
 from flcav.config import Json
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
     ExportOptions,

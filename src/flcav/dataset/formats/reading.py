@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, Json, parse_config, shorten
-from flcav.dataset.payloads import open_image, read_image
+from flcav.dataset.payloads import measure_upright, open_image, read_image
 from flcav.dataset.store import LazyMapping
-from flcav.dataset.upright import measure_upright
 from flcav.geometry import Boxes, count_points_in_boxes, inverse, is_rigid
 from flcav.interface.wording import plural
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views

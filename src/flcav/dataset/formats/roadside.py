@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, read_json, shorten
-from flcav.dataset.formats.layout import BRIGHTEST
-from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.clouds import BRIGHTEST, read_pcd
 from flcav.dataset.formats.reading import (
     ImportFormat,
     LogSource,

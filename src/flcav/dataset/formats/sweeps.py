@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, read_file
+from flcav.dataset.formats.clouds import has_nuscenes_layout, is_pcd, read_pcd
 from flcav.dataset.formats.kitti.files import read_points
-from flcav.dataset.formats.layout import has_nuscenes_layout
 from flcav.dataset.formats.nuscenes.files import read_lidar
-from flcav.dataset.formats.pcd import is_pcd, read_pcd
 from flcav.dataset.formats.reading import check_cloud
 from flcav.dataset.payloads import TIMES
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
     ExportOptions,

@@ -43,8 +43,9 @@ from flcav.dataset.recording.jobs import (
     find_pending,
     record_scenes,
     split_scene,
+    start_actors,
+    start_processes,
 )
-from flcav.dataset.recording.workers import start_actors, start_processes
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, list_files, read_table, write_table
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer

@@ -16,8 +16,7 @@ from flcav.driving.jobs import begin_worker
 from flcav.driving.loop import Loop, drive
 from flcav.driving.networks import NetworkPerception
 from flcav.driving.scenarios import Scenario, Staged
-from flcav.driving.seen import EGO, TIMES_S, Seen
-from flcav.driving.truth import Truth, find_around
+from flcav.driving.seen import EGO, TIMES_S, Seen, Truth, find_around
 from flcav.geometry import rotate, wrap_angle
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool

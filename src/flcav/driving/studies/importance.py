@@ -13,11 +13,11 @@ from typing import get_args
 
 import numpy as np
 
-from flcav.driving.couplings import FEEDS, TASKS, Coupling
 from flcav.driving.jobs import Job, Sensed, run_jobs
 from flcav.driving.loop import Loop
 from flcav.driving.measures import Drive
 from flcav.driving.scenarios import Scenario
+from flcav.driving.seen import FEEDS, TASKS, Coupling
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import find_shipped, read_card

@@ -14,10 +14,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, path_within, read_file
-from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout
+from flcav.dataset.formats.clouds import describe_numbers, has_kitti_layout
 from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
-from flcav.dataset.payloads import open_image
-from flcav.dataset.upright import turn_upright
+from flcav.dataset.payloads import open_image, turn_upright
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
 LAYOUT, POINT = "4 columns of float32", "x, y, z [m], intensity 0 to 1"

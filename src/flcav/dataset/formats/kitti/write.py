@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
+from flcav.dataset.formats.writing import (
     SPLITS,
     Exported,
     ExportFormat,
@@ -20,14 +21,13 @@ from flcav.dataset.formats.exporter import (
     check_rectified,
     count_points_in_boxes,
     count_unwritten,
+    find_front_camera,
     lacks_points,
     missing_data_error,
     read_frame,
     select_objects,
     split_scenes,
 )
-from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
-from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, transform_points, wrap_angle

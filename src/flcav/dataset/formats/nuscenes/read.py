@@ -16,10 +16,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, path_within, read_json, shorten
-from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar, read_lidar
-from flcav.dataset.formats.nuscenes.rows import COLUMNS, References, Row, read_table, stream_table
-from flcav.dataset.formats.nuscenes.tables import VERSION
-from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.clouds import read_pcd
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, VERSION, decode_radar, read_lidar
+from flcav.dataset.formats.nuscenes.tables import COLUMNS, References, Row, read_table, stream_table
 from flcav.dataset.formats.reading import (
     AgentNames,
     ImportFormat,

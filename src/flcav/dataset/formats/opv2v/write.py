@@ -13,21 +13,23 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from flcav.carla.frames import MIRROR, MapFrame
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
     ExportOptions,
     LeftOut,
+    agent_velocities,
+    assign_channels,
     check_rectified,
     count_points_in_boxes,
     count_unwritten,
     lacks_points,
     missing_data_error,
+    optical_yaw,
     read_frame,
     select_objects,
     split_with_validation,
 )
-from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report

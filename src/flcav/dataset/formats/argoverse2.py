@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, check_is_file, path_within
-from flcav.dataset.checks.frames import LONGEST_SPIN_S
 from flcav.dataset.formats.reading import (
     FARTHEST,
     AgentNames,
@@ -37,6 +36,7 @@ from flcav.dataset.formats.reading import (
     read_pictures,
     view_boxes,
 )
+from flcav.dataset.frame_checks import LONGEST_SPIN_S
 from flcav.geometry import Boxes, pose, transform_points, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, check_is_file
-from flcav.dataset.formats.carlaflcav.labels import Labels, read_labels
+from flcav.dataset.formats.carlaflcav_labels import Labels, read_labels
 from flcav.dataset.formats.reading import (
     FARTHEST,
     AgentNames,

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame
-from flcav.carla.server.catalogue import Quality
+from flcav.carla.server.blueprints import Quality
 from flcav.geometry import inverse
 from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens

@@ -1,11 +1,10 @@
-"""Foxglove messages of a frame: measurements, transforms, annotations; JSON messages where Foxglove has no schema.
+"""Writer of MCAP files, one for each scene, with time stamps of the simulation."""
 
-Topics and coordinate frames of an agent are prefixed by its name. Frames of sensors are children of the agent's frame,
-and that one of `world` (ENU, z up). Transforms are given at the spin, and at the trigger time of every sensor with
-another.
-"""
-
+import json
+from collections import Counter
 from collections.abc import Iterator, Mapping
+from functools import cache
+from pathlib import Path
 from typing import NamedTuple, TypedDict
 
 import numpy as np
@@ -31,12 +30,24 @@ from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.message import Message
 from google.protobuf.timestamp_pb2 import Timestamp
+from mcap.writer import Writer
+from mcap_protobuf.schema import register_schema
 from numpy.typing import NDArray
 
 from flcav.config import Json
-from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
-from flcav.dataset.formats.mounts import quaternion
+from flcav.dataset.formats.writing import (
+    COLOURS,
+    OTHER,
+    SIGN,
+    Exported,
+    ExportFormat,
+    ExportOptions,
+    quaternion,
+    read_frame,
+)
 from flcav.dataset.payloads import encode_png
+from flcav.dataset.store import Dataset
+from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
 
@@ -241,3 +252,60 @@ def _transforms(tree: list[tuple[str, str, NDArray[np.float64]]], time_s: float)
 
 def _stamp(time_s: float) -> Timestamp:
     return Timestamp(seconds=round(time_s * 1e9) // 10**9, nanos=round(time_s * 1e9) % 10**9)
+
+
+def export_mcap(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
+    """Write `<scene>.mcap` for each scene of `dataset`: see `ExportFormat`."""
+    counts: Counter[str] = Counter(files=0, messages=0, objects=0)
+    done = 0
+    for scene in dict.fromkeys(key.scene for key in dataset.keys):
+        with (out / f"{scene}.mcap").open("wb") as file:
+            log = _Log(Writer(file))
+            for i in dataset.select(scenes=[scene]):
+                frame = read_frame(dataset, i, options)
+                for logged in make_messages(frame):
+                    log.write(f"/{frame.agent}/{logged.topic}", logged.message, logged.time_s)
+                    counts["messages"] += 1
+                counts["objects"] += len(frame.annotations)
+                done += 1
+                progress(done, len(dataset), "")
+            log.writer.finish()
+        counts["files"] += 1
+    return Exported(counts)
+
+
+EXPORT = ExportFormat(export_mcap, ("calibration",))
+
+
+class _Log:
+    """An open MCAP file with a channel for each topic, registered by its first message."""
+
+    def __init__(self, writer: Writer) -> None:
+        writer.start(profile="", library="flcav")
+        self.writer = writer
+        self._channels: dict[str, int] = {}
+        self._schema = cache(lambda kind: register_schema(writer, kind))
+        self._json_schema = cache(lambda kind, schema: writer.register_schema(kind, "jsonschema", schema))
+
+    def write(self, topic: str, message: Message | JsonMessage, time_s: float) -> None:
+        if topic not in self._channels:
+            self._channels[topic] = self._open(topic, message)
+        if isinstance(message, JsonMessage):
+            data = json.dumps(message.values, allow_nan=False).encode()
+        else:
+            data = message.SerializeToString(deterministic=True)
+        stamp = round(time_s * 1e9)
+        self.writer.add_message(self._channels[topic], log_time=stamp, publish_time=stamp, data=data)
+
+    def _open(self, topic: str, message: Message | JsonMessage) -> int:
+        if isinstance(message, JsonMessage):
+            schema = json.dumps(_schema_of(message.values)).encode()
+            return self.writer.register_channel(topic, "json", self._json_schema(f"flcav.{message.kind}", schema))
+        return self.writer.register_channel(topic, "protobuf", self._schema(type(message)))
+
+
+def _schema_of(value: Json) -> dict[str, Json]:
+    """Return the JSON schema of a value made of objects, texts and numbers."""
+    if isinstance(value, Mapping):
+        return {"type": "object", "properties": {name: _schema_of(part) for name, part in value.items()}}
+    return {"type": "string" if isinstance(value, str) else "number"}

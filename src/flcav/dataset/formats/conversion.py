@@ -1,20 +1,25 @@
 """Import of datasets of other formats, by reading them as a source of frames and recording that."""
 
+import contextlib
+import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 from flcav.config import InputError, Json
-from flcav.dataset.checks.frames import check_triggers
-from flcav.dataset.checks.scenes import EmptyBoxes
-from flcav.dataset.formats.formats import IMPORTS, import_format
+from flcav.dataset.formats.formats import IMPORTS, export_format, import_format
 from flcav.dataset.formats.reading import LogSource
+from flcav.dataset.formats.writing import Exported, ExportOptions
+from flcav.dataset.frame_checks import check_triggers
 from flcav.dataset.layout import WORK
 from flcav.dataset.recording.recorder import drop_unbegun, record
+from flcav.dataset.scene_checks import EmptyBoxes
+from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
-from flcav.machine.locks import only_writer
+from flcav.machine.locks import LOCK, only_writer
 from flcav.sensors.frame import Frame
 from flcav.sources.source import Source
+from flcav.storage.files import flush_tree
 from flcav.world.trace import Trace
 
 
@@ -100,3 +105,56 @@ class _Checked:
 
 def _shows(folder: Path, signs: tuple[str, ...]) -> bool:
     return any(next(folder.glob(sign), None) is not None for sign in signs)
+
+
+DEFAULTS = ExportOptions()
+
+
+def export(
+    dataset: Dataset, name: str, out: Path, options: ExportOptions = DEFAULTS, *, progress: Report = ignore_progress
+) -> Exported:
+    """Write `dataset` in the format `name` to the new or empty folder `out`; return counts.
+
+    Raises `InputError` for an unknown format, an option that is set but does not apply to the format, a folder that is
+    not empty, and a dataset that lacks what the format needs. After any failure no partial output is left.
+
+    Args:
+        dataset: the dataset.
+        name: a name of `EXPORTS`, or a user's own format as `module:NAME`.
+        out: new or empty folder.
+        options: options that the format takes.
+        progress: callback for the frames written so far and in total.
+    """
+    chosen = export_format(name)
+    if refused := options.model_fields_set.difference(chosen.options):
+        flag, *taken = (f"--{option.replace('_', '-')}" for option in (min(refused), *chosen.options))
+        raise InputError(f"format '{name}': has no use for {flag}; it takes {', '.join(taken) or 'no options'}")
+    with only_writer(out), _new_folder(out) as folder:
+        return chosen.write(dataset, folder, options, progress)
+
+
+@contextlib.contextmanager
+def _new_folder(path: Path) -> Iterator[Path]:
+    """Yield a hidden folder beside `path` to write into; it is renamed to `path` on success and removed on failure.
+
+    Raises `InputError` where `path` is a file or a folder that is not empty.
+    """
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: is a file; an export needs a folder")
+    if path.is_dir() and any(each.name != LOCK for each in path.iterdir()):
+        raise InputError(f"{path}: holds other files; export into a new or empty folder")
+    part = path.absolute().with_name(f".{path.absolute().name}.part")
+    shutil.rmtree(part, ignore_errors=True)  # leftover of a killed export
+    part.mkdir(parents=True)
+    try:
+        yield part
+        flush_tree(part)
+        if path.is_dir():
+            path.rmdir()
+        part.rename(path)
+    except OSError as error:
+        if error.strerror and error.filename is None:
+            error.filename = str(path)
+        raise
+    finally:
+        shutil.rmtree(part, ignore_errors=True)
