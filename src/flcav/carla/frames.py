@@ -9,9 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import angles_of, pose
+from flcav.geometry import Array, angles_of, pose
 
-Array = NDArray[np.float64]
 Vector = tuple[float, float, float]
 
 MIRROR = np.array((1.0, -1.0, 1.0))

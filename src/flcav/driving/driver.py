@@ -12,12 +12,10 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 
 from flcav.driving.seen import TIMES_S, Seen
-from flcav.geometry import Boxes, heading_vectors, left_vectors, rotate
+from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
 from flcav.world.commands import Controls
 from flcav.world.dynamics.blueprints import Blueprint
 from flcav.world.map.routes import Route
-
-Array = NDArray[np.float64]
 
 PARTS = 6
 SPACING_M = 1.0  # of the points of the route that a place is compared with

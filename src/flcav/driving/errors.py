@@ -33,14 +33,12 @@ from flcav.driving.seen import (
     read_lights,
     share_seen,
 )
-from flcav.geometry import Boxes, heading_vectors, rotate
+from flcav.geometry import Array, Boxes, heading_vectors, rotate
 from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
 CLASSES = ("Car", "Pedestrian", "Cyclist")

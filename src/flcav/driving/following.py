@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.layout import FrameKey
 from flcav.driving.seen import TIMES_S, predict_motion
-from flcav.geometry import Boxes, concatenate, heading_vectors, wrap_angle
+from flcav.geometry import Array, Boxes, concatenate, heading_vectors, wrap_angle
 from flcav.perception.tracking.tracker import Tracker
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
@@ -24,8 +24,6 @@ from flcav.perception.trajectory.roads import RoadMap
 from flcav.perception.trajectory.samples import Sample, extract_columns
 from flcav.perception.trajectory.tracks import OFFSETS_S, Tracks, out_of_frame
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 KEPT_S = 0.45
 EVERY_S = 0.5  # between two forecasts of a track

@@ -10,7 +10,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.driving.driver import Motion, find_meeting, find_occupied
 from flcav.driving.seen import EGO, TIMES_S, Seen
@@ -18,8 +17,6 @@ from flcav.geometry import heading_vectors
 from flcav.storage.records import Record
 from flcav.world.map.routes import Route
 from flcav.world.snapshot import Collision, Snapshot
-
-Array = NDArray[np.float64]
 
 HARD_MPS2 = 4.0  # deceleration of a hard brake
 STANDS_MPS = 0.3

@@ -11,11 +11,9 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.geometry import Boxes, heading_vectors, wrap_angle
+from flcav.geometry import Array, Boxes, heading_vectors, wrap_angle
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 TIMES_S: Array = np.arange(0.0, 4.01, 0.25)  # of the points of predicted paths, from the present on
 EGO = "ego"

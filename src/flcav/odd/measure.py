@@ -4,11 +4,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError, parse_config
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import WEATHER_COLUMNS
+from flcav.geometry import Array
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.odd.domain import Domain, Value
@@ -24,8 +24,6 @@ from flcav.perception.weather.samples import reduce_picture
 from flcav.sensors.rig import Rig
 from flcav.storage.records import Record
 from flcav.world.weather import NIGHT_DEG, WEATHER_CLASSES, Weather
-
-Array = NDArray[np.float64]
 
 AROUND_M = 50.0  # within which road users count
 LOW_LIGHT_DEG = 10.0  # sun elevation below which the light is low

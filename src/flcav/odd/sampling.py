@@ -14,7 +14,6 @@ from pathlib import Path
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 from openodd import CoverageReport, OddKnob, OddSampler
 from scipy.stats import qmc
 
@@ -31,8 +30,6 @@ from flcav.storage.records import Record
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import Kind
 from flcav.world.weather import Weather
-
-Array = NDArray[np.float64]
 
 METHODS = ("coverage", "lhs", "sobol")
 CASES: Mapping[str, tuple[Kind, ...]] = {  # corner cases that a kind of place lends itself to

@@ -11,10 +11,10 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError, Json, parse_config
 from flcav.dataset.store import Dataset
+from flcav.geometry import Array
 from flcav.odd.measure import measure, scenery_of
 from flcav.odd.scenery import Scenery
 from flcav.perception.tasks import task_named
@@ -22,8 +22,6 @@ from flcav.pipeline.label_sources import choose_labels
 from flcav.pipeline.recipe import RunRecipe
 from flcav.storage.records import Record
 from flcav.world.map.town import PACKAGED
-
-Array = NDArray[np.float64]
 
 LEVELS = (0.2, 0.35, 0.5)  # of complexity, from which a scenario has one more task
 HALF_AGENTS, HALF_CONFLICTS, HALF_ERRORS = 15.0, 32.0, 2.0  # at which a component is one half

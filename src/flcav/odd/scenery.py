@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 from shapely.geometry.base import BaseGeometry
 
+from flcav.geometry import Array
 from flcav.world.map.roads import Connection, RoadNet, read_net
 from flcav.world.map.town import Town
 
-Array = NDArray[np.float64]
 Column = NDArray[np.float64] | NDArray[np.str_]  # NaN and "" are missing
 
 NEAR_M = 15.0  # a frame this near to the area of a junction is at it; so with parking spaces

@@ -14,14 +14,12 @@ from scipy.spatial import KDTree
 
 from flcav.carla.recording.sensors import SemanticSweep
 from flcav.carla.recording.traffic import State
-from flcav.geometry import Boxes, count_points_in_boxes, inverse, points_in_boxes, transform_points
+from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse, points_in_boxes, transform_points
 from flcav.sensors.frame import SEMANTICS, Annotations, SignViews, Views
 from flcav.sensors.labels.outlines import clip_boxes, outline_boxes
 from flcav.sensors.labels.views import find_actor_regions
 from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
-
-Array = NDArray[np.float64]
 
 SLACK_M = 0.1  # by which a surface may stand out of its box
 SAME_M, SIGMAS = 0.02, 4.0  # two LiDARs' points by one ray are as near, and within so many deviations of the noise

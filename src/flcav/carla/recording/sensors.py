@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from flcav.carla.frames import MapFrame, mirror, mirror_spin
 from flcav.carla.recording.session import Session
 from flcav.carla.recording.traffic import make_transform
+from flcav.geometry import Array
 from flcav.sensors.lens import Lens
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.rig import Rig
@@ -24,8 +25,6 @@ from flcav.sources.recipe import STEP_S
 
 if TYPE_CHECKING:
     import carla
-
-Array = NDArray[np.float64]
 
 SEMANTIC_POINT = np.dtype([("xyz", "<f4", 3), ("cosine", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
 FAR_M = 1000.0  # depth that is coded by three bytes of ones

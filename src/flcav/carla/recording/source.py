@@ -37,7 +37,7 @@ from flcav.carla.recording.traffic import (
 )
 from flcav.carla.server.weather import make_weather
 from flcav.config import InputError, Json
-from flcav.geometry import Boxes, points_in_boxes, pose, transform_points
+from flcav.geometry import Array, Boxes, points_in_boxes, pose, transform_points
 from flcav.sensors.calibration import build_calibration, perturb_calibration
 from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.navigation import draw_fix_errors, draw_imu_errors
@@ -52,8 +52,6 @@ from flcav.world.weather import Weather
 
 if TYPE_CHECKING:
     import carla
-
-Array = NDArray[np.float64]
 
 SETTLED = 2  # ticks that the traffic takes to begin: one for walkers, one to list who is there
 LEAD = 2  # ticks from the spawning of sensors to the first spin

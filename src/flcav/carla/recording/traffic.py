@@ -5,18 +5,15 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame, mirror
 from flcav.carla.recording.session import Session
 from flcav.config import InputError
-from flcav.geometry import Boxes, turned_boxes
+from flcav.geometry import Array, Boxes, turned_boxes
 from flcav.sources.recipe import CarlaRecipe
 
 if TYPE_CHECKING:
     import carla
-
-Array = NDArray[np.float64]
 
 CATEGORIES = ("car", "van", "truck", "bus", "motorcycle", "bicycle")  # as in CARLA's attribute base_type
 ALONE = "vehicle.tesla.model3"  # blueprint of the vehicles that record

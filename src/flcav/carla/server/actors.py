@@ -13,15 +13,13 @@ from flcav.carla.server.blueprints import FLOAT, TRIGGER
 from flcav.carla.server.sensors import Clock
 from flcav.carla.server.sight import Sensor
 from flcav.carla.server.wire import AckermannControl, BoundingBox, Transform, VehicleControl
-from flcav.geometry import rotations
+from flcav.geometry import Array, rotations
 from flcav.sensors.frame import SEMANTICS
 from flcav.world.commands import Grip
 from flcav.world.dynamics.blueprints import blueprint
 from flcav.world.dynamics.bodies import Body
 from flcav.world.live import LiveWorld
 from flcav.world.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 NOTHING = (0.0, 0.0, 0.0)
 STILL = (NOTHING, NOTHING, NOTHING)

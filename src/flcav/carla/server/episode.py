@@ -10,7 +10,6 @@ from functools import cache, cached_property, partial
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.carla.frames import from_mount, mirror, mirror_spin, to_vector
 from flcav.carla.server import wire
@@ -41,6 +40,7 @@ from flcav.carla.server.sensors import (
 from flcav.carla.server.sight import Scenes, Sensor, Sight
 from flcav.carla.server.weather import to_weather
 from flcav.carla.server.wire import Transform
+from flcav.geometry import Array
 from flcav.sensors.rendering.appearance import build_appearance
 from flcav.world import commands
 from flcav.world.commands import Controls, Drive, Push, Remove, Simulate, Spawn, Walk
@@ -48,8 +48,6 @@ from flcav.world.live import LiveWorld, Obstructed, Settings
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
     "car": "vehicle.seat.leon",

@@ -17,7 +17,7 @@ from shapely.geometry import LineString, Point
 from flcav.carla.frames import mirror
 from flcav.carla.server.maps import ServedMap
 from flcav.carla.server.wire import BoundingBox
-from flcav.geometry import heading_vectors, inverse, pose, wrap_angle
+from flcav.geometry import Array, heading_vectors, inverse, pose, wrap_angle
 from flcav.world.commands import SetLight
 from flcav.world.live import LiveWorld
 from flcav.world.map.roads import Edge, Lane
@@ -25,8 +25,6 @@ from flcav.world.opendrive.document import STOP_SIGN, drop_namespaces
 from flcav.world.opendrive.exporting import TRAFFIC_LIGHT, list_approaches, name_signal
 from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.reference_line import ReferenceLine
-
-Array = NDArray[np.float64]
 
 RED, YELLOW, GREEN, OFF, UNKNOWN = 0, 1, 2, 3, 4
 LETTERS_OF = {GREEN: "Gg", YELLOW: "yYu", RED: "rRs", OFF: "oO"}

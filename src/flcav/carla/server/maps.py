@@ -11,7 +11,6 @@ from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 from shapely.geometry import LineString
 
 from flcav import world
@@ -28,8 +27,6 @@ from flcav.world.map.town import NAME, PACKAGED, Town, load_town
 from flcav.world.opendrive.exporting import export_town
 from flcav.world.opendrive.importing import import_town
 from flcav.world.static import recall_static_world, save_static_world
-
-Array = NDArray[np.float64]
 
 SPAWN_EVERY_M, SPAWN_FROM_END_M = 20.0, 7.0  # between spawn points of a lane, and to its ends
 ABOVE_M = 0.3  # of spawn points above the road

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame
 from flcav.carla.server.blueprints import Quality
-from flcav.geometry import inverse
+from flcav.geometry import Array, inverse
 from flcav.sensors.camera.camera import Camera, Exposure, label, photograph
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.sensors.rendering.appearance import build_appearance
@@ -20,8 +20,6 @@ from flcav.world.rays.hits import Hits
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace
 from flcav.world.weather import Weather
-
-Array = NDArray[np.float64]
 
 THREADS = min(os.cpu_count() or 1, 4)  # that draw an image
 

@@ -37,12 +37,10 @@ from flcav.dataset.formats.reading import (
     view_boxes,
 )
 from flcav.dataset.frame_checks import LONGEST_SPIN_S
-from flcav.geometry import Boxes, pose, transform_points, turned_boxes
+from flcav.geometry import Array, Boxes, pose, transform_points, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import Lens
-
-Array = NDArray[np.float64]
 
 CATEGORIES = {  # a bicycle of flcav's has a rider; Argoverse 2's without one keeps its name, as do all other classes
     "REGULAR_VEHICLE": "car",

@@ -36,13 +36,12 @@ from flcav.dataset.formats.reading import (
     view_boxes,
 )
 from flcav.dataset.payloads import check_image, read_image
-from flcav.geometry import angles_of, inverse, pose, rotations, turned_boxes
+from flcav.geometry import Array, angles_of, inverse, pose, rotations, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens
 from flcav.storage.exchange import read_csv
 
-Array = NDArray[np.float64]
 Poses = Mapping[int, Array]  # tick -> (4, 4)
 
 WORLD, STATUS, POSES, CAMERA = "others.world_*", "vehicle_status.csv", "poses.csv", "camera_info.csv"

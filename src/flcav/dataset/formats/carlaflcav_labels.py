@@ -25,9 +25,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, check_is_file, shorten
 from flcav.dataset.formats.reading import FARTHEST
-from flcav.geometry import pose
-
-Array = NDArray[np.float64]
+from flcav.geometry import Array, pose
 
 MOST_BYTES = 2**22  # of a file; a label takes some 300
 MOST_LABELS = 10_000

@@ -19,13 +19,11 @@ from PIL import Image
 from flcav.config import InputError, Json, parse_config, shorten
 from flcav.dataset.payloads import measure_upright, open_image, read_image
 from flcav.dataset.store import LazyMapping
-from flcav.geometry import Boxes, count_points_in_boxes, inverse, is_rigid
+from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse, is_rigid
 from flcav.interface.wording import plural
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
 from flcav.sensors.labels.outlines import outline_boxes
 from flcav.sensors.lens import Lens
-
-Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
 FARTHEST = 1e9  # largest number that a measurement is taken to have

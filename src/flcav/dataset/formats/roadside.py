@@ -30,11 +30,9 @@ from flcav.dataset.formats.reading import (
     choose_split,
     name_some,
 )
-from flcav.geometry import Boxes, turned_boxes, wrap_angle
+from flcav.geometry import Array, Boxes, turned_boxes, wrap_angle
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, Frame
-
-Array = NDArray[np.float64]
 
 LIDAR = "lidar"
 CATEGORIES = {  # of both datasets, without regard to case; others keep their names

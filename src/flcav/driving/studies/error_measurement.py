@@ -8,7 +8,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.driving.errors import CLASSES, EDGES_M, ErrorModel, find_in_field
 from flcav.driving.following import MOTIONS
@@ -17,12 +16,10 @@ from flcav.driving.loop import Loop, drive
 from flcav.driving.networks import NetworkPerception
 from flcav.driving.scenarios import Scenario, Staged
 from flcav.driving.seen import EGO, TIMES_S, Seen, Truth, find_around
-from flcav.geometry import rotate, wrap_angle
+from flcav.geometry import Array, rotate, wrap_angle
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.world.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 MATCH_M = 2.5
 ONE_SIGMA = 0.6827  # share of a normal distribution within one standard deviation: outliers do not widen that

@@ -17,7 +17,7 @@ from flcav.driving.road import SPIN_S, RoadUnits
 from flcav.driving.scenarios import Scenario, Staged
 from flcav.driving.seen import EGO, EYE_M, FIELD_M, Seen, share_seen
 from flcav.driving.studies.importance import paired_difference
-from flcav.geometry import Boxes, rotate
+from flcav.geometry import Array, Boxes, rotate
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.metrics.average_precision import weighted_precision
 from flcav.perception.metrics.matching import match
@@ -31,8 +31,6 @@ from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 INSTANTS = 40
 

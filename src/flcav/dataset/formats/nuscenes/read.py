@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, path_within, read_json, shorten
@@ -33,10 +32,9 @@ from flcav.dataset.formats.reading import (
     read_pictures,
     view_boxes,
 )
-from flcav.geometry import inverse, turned_boxes
+from flcav.geometry import Array, inverse, turned_boxes
 from flcav.sensors.frame import Calibration, LinkedFrame
 
-Array = NDArray[np.float64]
 SMALL = [name for name in COLUMNS if name not in ("sample_data", "ego_pose", "sample_annotation")]  # kept as they are
 
 CATEGORIES = {  # other classes keep their names, and so do cycles without a rider

@@ -11,7 +11,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.dataset.formats.nuscenes.files import (
     CAMERAS,
@@ -49,13 +48,11 @@ from flcav.dataset.formats.writing import (
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import pose, transform_points, yaw_of
+from flcav.geometry import Array, pose, transform_points, yaw_of
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sensors.radar.radar import compute_echo_directions
-
-Array = NDArray[np.float64]
 
 MAP = "maps/map.png"
 UNKNOWN_MARGIN_M = 120.0  # margin of the map around the agents where the town is unknown

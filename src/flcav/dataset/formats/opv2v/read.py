@@ -40,7 +40,7 @@ from flcav.dataset.formats.reading import (
     read_pictures,
     view_boxes,
 )
-from flcav.geometry import Boxes, heading_vectors, inverse, turned_boxes, wrap_angle
+from flcav.geometry import Array, Boxes, heading_vectors, inverse, turned_boxes, wrap_angle
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
@@ -168,8 +168,6 @@ NumbersLoader.add_constructor(f"{TAG}python/object/apply:numpy.dtype", _read_dty
 NumbersLoader.add_constructor(f"{TAG}python/name:numpy.ndarray", lambda *_: None)
 NumbersLoader.add_constructor(f"{TAG}python/tuple", _read_parts)
 
-
-Array = NDArray[np.float64]
 
 PERIOD_S = 0.1
 LIDAR, CATEGORY = "lidar", "car"

@@ -32,11 +32,10 @@ from flcav.dataset.formats.writing import (
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
+from flcav.geometry import Array
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-
-Array = NDArray[np.float64]
 
 FOLDERS = {"train": "train", "val": "validate", "test": "test"}
 VEHICLES = ("car", "van", "truck", "bus")
