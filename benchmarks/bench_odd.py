@@ -16,8 +16,8 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain, read_domain
-from flcav.odd.judge import judge
-from flcav.odd.measure import AROUND_M, Measurements, describe_weather, measure, scenery_of
+from flcav.odd.judge import judge_frames
+from flcav.odd.measure import AROUND_M, Measurements, describe_weather, measure_domain, scenery_of
 from flcav.odd.sampling import METHODS, Space, sample_domain, write_recipes
 from flcav.odd.scenery import Scenery
 from flcav.sources.embedded import EmbeddedSource
@@ -54,7 +54,7 @@ def judge_one_by_one(domain: Domain, data: Dataset, scenery: Scenery, frames: ra
         columns = scenery.measure(place[None], np.array([yaw])) | describe_weather(sky)
         columns |= {"agents": np.array([((away <= AROUND_M) & moving).sum()]), "surface_type": np.array(["asphalt"])}
         columns |= {"ego_speed": np.zeros(1), "field_of_view": np.full(1, 360.0), "sensing_range": np.full(1, 100.0)}
-        verdicts += judge(domain, Measurements((i,), columns)).verdict.tolist()
+        verdicts += judge_frames(domain, Measurements((i,), columns)).verdict.tolist()
     return verdicts
 
 
@@ -70,12 +70,12 @@ def main() -> None:
         every, part = tuple(range(len(data))), range(READ)
 
         assert scenery is not None
-        verdicts = judge(urban, measure(data, every, scenery)).verdict.tolist()
+        verdicts = judge_frames(urban, measure_domain(data, every, scenery)).verdict.tolist()
         assert judge_one_by_one(urban, data, scenery, part) == verdicts[:READ]
 
         ours, reference = cpu_ms(
             [
-                lambda: judge(urban, measure(data, every, scenery)),
+                lambda: judge_frames(urban, measure_domain(data, every, scenery)),
                 lambda: judge_one_by_one(urban, data, scenery, part),
             ],
             repeats,

@@ -95,7 +95,7 @@ def draw_message(rng: random.Random, methods: list[str]) -> bytes:
     method = rng.choice(methods)
     if method in SKIPPED and rng.random() > FEW:
         method = "apply_batch"
-    return wire.pack([0, rng.randrange(2**32), method, [[False], *draw_arguments(rng, method)]])
+    return wire.pack_value([0, rng.randrange(2**32), method, [[False], *draw_arguments(rng, method)]])
 
 
 def draw_noise(rng: random.Random, message: bytes) -> bytes:
@@ -112,7 +112,7 @@ def ask_version(port: int) -> bool:
     """Return whether the server answers."""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=60) as link:
-            link.sendall(wire.pack([0, 1, "version", [[False]]]))
+            link.sendall(wire.pack_value([0, 1, "version", [[False]]]))
             return wire.VERSION.encode() in link.recv(1000)
     except OSError:
         return False

@@ -38,7 +38,7 @@ def serve(
     from flcav.carla.server.calls import Calls
     from flcav.carla.server.maps import Maps
     from flcav.carla.server.serve import open_doors
-    from flcav.carla.server.serve import serve as serve_calls
+    from flcav.carla.server.serve import serve_clients as serve_calls
     from flcav.carla.server.wire import VERSION
 
     logging.basicConfig(format="flcav: %(message)s", level=logging.WARNING)

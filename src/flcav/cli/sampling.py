@@ -69,7 +69,7 @@ def sample(
     from flcav.odd.coverage import load_report
     from flcav.odd.domain import read_domain
     from flcav.odd.openscenario import to_openscenario
-    from flcav.odd.sampling import Sample, Space, count_pairs, sample_domain, write_recipes
+    from flcav.odd.sampling import SampledScenario, Space, count_pairs, sample_domain, write_recipes
     from flcav.odd.scenery import Scenery
     from flcav.sources.recipe import Recipe
     from flcav.storage.files import check_writable, write_bytes
@@ -93,7 +93,7 @@ def sample(
         else sample_domain(space, count, method.value, seed, None if covered is None else load_report(covered))
     )
 
-    def write_scenario(sample: Sample, recipe: Recipe, path: Path) -> None:
+    def write_scenario(sample: SampledScenario, recipe: Recipe, path: Path) -> None:
         if openscenario:
             path.with_suffix(".xosc").write_bytes(to_openscenario(sample, f"{sample.place.town}.xodr"))
 

@@ -113,7 +113,7 @@ SCHEMAS: dict[str, pa.Schema] = {
 }
 
 
-def write_table(table: pa.Table, path: Path) -> None:
+def write_rows(table: pa.Table, path: Path) -> None:
     """Write a table as Parquet with fixed settings, so that equal rows give equal bytes."""
     pq.write_table(table.combine_chunks(), path, row_group_size=ROWS_PER_GROUP, compression="zstd")
 

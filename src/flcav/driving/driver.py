@@ -95,7 +95,7 @@ FARTHEST_GAP_M = 1e3
 
 
 @dataclass(frozen=True)
-class Settings:
+class DriverSettings:
     """Safety margins of a driver: a fixed distance, and a multiple of its perception's uncertainty."""
 
     margin_m: float = 0.4
@@ -103,11 +103,11 @@ class Settings:
     most_m: float = 3.0  # the margin is never more
 
 
-DEFAULT = Settings()
+DEFAULT = DriverSettings()
 
 
 @dataclass(frozen=True)
-class Motion:
+class EgoMotion:
     """Pose and speed of the ego vehicle, by its own navigation."""
 
     x: float  # of the box's middle [m]
@@ -126,7 +126,9 @@ class Decision:
     emergency: bool
 
 
-def decide(route: Route, own: Motion, seen: Seen, vehicle: Blueprint, settings: Settings = DEFAULT) -> Decision:
+def decide_controls(
+    route: Route, own: EgoMotion, seen: Seen, vehicle: Blueprint, settings: DriverSettings = DEFAULT
+) -> Decision:
     """Return the controls for the next tenth of a second."""
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
@@ -147,7 +149,7 @@ def decide(route: Route, own: Motion, seen: Seen, vehicle: Blueprint, settings: 
     return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency)
 
 
-def find_speed(route: Route, own: Motion, share: float) -> float:
+def find_speed(route: Route, own: EgoMotion, share: float) -> float:
     """Return the speed [m/s] that limits, curves ahead and the weather allow."""
     ahead = own.along + CURVES_M
     turn = np.abs(np.diff(np.unwrap(route.at(np.append(ahead - 1.5, ahead[-1] + 1.5))[:, 2])))
@@ -182,7 +184,7 @@ def _halt(speed: float, wanted: float, gap_m: float) -> float:
     return _follow(speed, wanted, gap_m + STANDSTILL_M, 0.0)
 
 
-def _stop_at_light(route: Route, own: Motion, seen: Seen, half_m: float, wanted: float) -> float:
+def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> float:
     """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
     for stop, link in route.stops:
         gap = stop - LINE_M - own.along - half_m
@@ -195,7 +197,7 @@ def _stop_at_light(route: Route, own: Motion, seen: Seen, half_m: float, wanted:
     return np.inf
 
 
-def _avoid(route: Route, own: Motion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
+def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
     """Return the acceleration for each road user that is, or is going to be, in the way."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
@@ -234,7 +236,7 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: Route, own: Motion, vehicle: Blueprint) -> float:
+def _steer(route: Route, own: EgoMotion, vehicle: Blueprint) -> float:
     """Return the share of the greatest steering angle (pure pursuit)."""
     aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
     ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)

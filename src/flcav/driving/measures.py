@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.driving.driver import Motion, find_meeting, find_occupied
+from flcav.driving.driver import EgoMotion, find_meeting, find_occupied
 from flcav.driving.seen import EGO, TIMES_S, Seen
 from flcav.geometry import heading_vectors
 from flcav.storage.records import Record
@@ -36,7 +36,7 @@ class Hit(Record):
 
 
 @dataclass(frozen=True)
-class Drive(Record):
+class DriveResult(Record):
     """The measures of one drive."""
 
     scenario: str
@@ -71,7 +71,7 @@ def score_drive(progress: float, hits: Sequence[Hit], red_lights: int) -> float:
     return progress * penalty * PENALTY["red light"] ** red_lights
 
 
-def measure_ttc(route: Route, own: Motion, truth: Seen, size: tuple[float, float]) -> float:
+def measure_ttc(route: Route, own: EgoMotion, truth: Seen, size: tuple[float, float]) -> float:
     """Return the time to collision [s] by true states, if all keep their motion; the horizon if there is no collision.
 
     The ego vehicle, `size` its length and width [m], keeps its speed along the route.

@@ -114,7 +114,7 @@ def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
     return learn_background(sweeps)
 
 
-def fuse(own: Boxes, road: Boxes) -> Boxes:
+def merge_detections(own: Boxes, road: Boxes) -> Boxes:
     """Return the vehicle's own boxes, and those of the road that are none of them."""
     if not len(road):
         return own

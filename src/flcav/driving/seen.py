@@ -123,7 +123,7 @@ AMBER, CLOSED = "y", "ryu"  # SUMO's letters
 SIGHT_M = 90.0
 
 
-class Truth:
+class TruePerception:
     """Ground truth within `SIGHT_M` of the ego vehicle; one per drive, since parked vehicles are looked up once."""
 
     def __init__(self, weather: str = "clear") -> None:

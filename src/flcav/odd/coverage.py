@@ -16,7 +16,7 @@ from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.odd.cells import CellErrors, Trial, cells_of, find_failures, full_name, measure_cells
 from flcav.odd.domain import Domain, Value
-from flcav.odd.measure import Measurements, measure
+from flcav.odd.measure import Measurements, measure_domain
 from flcav.perception.agents import choose_frames
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
@@ -154,7 +154,7 @@ MATRIX = "matrix.html"
 
 
 @dataclass(frozen=True)
-class Coverage(Record):
+class DomainCoverage(Record):
     """Coverage of a domain by recordings, and a detector's errors by cell."""
 
     domain: str
@@ -177,7 +177,7 @@ def cover_domain(
     range_m: float = 40.0,
     device: str = "auto",
     progress: Report = ignore_progress,
-) -> Coverage:
+) -> DomainCoverage:
     """Return how much of a domain recordings cover; writes coverage.json, matrix.html and runs/*.json to `out`.
 
     Covered are the attributes that the domain tests, and those of `by`. With `detect` the detector of objects runs on
@@ -191,7 +191,7 @@ def cover_domain(
     outcomes: list[Outcomes] = []
     for number, folder in enumerate(folders):
         data = Dataset.open(folder)
-        measured = measure(data)
+        measured = measure_domain(data)
         failures = None
         if network is not None:
             cells = dict(zip(measured.frames, cells_of(domain, measured, axes), strict=True))
@@ -205,7 +205,7 @@ def cover_domain(
     covered = tuple(row for row in every if row.attribute in {*domain.tested, *axes})
     grade = float(np.mean([row.grade for row in covered])) if covered else 0.0
     cells = measure_cells(OBJECTS.measure, join_outcomes(outcomes), tested, range_m) if tested else []
-    result = Coverage(
+    result = DomainCoverage(
         domain.name, domain.definition.revision, len(documents), grade, covered, tuple(axes), tuple(cells)
     )
     write_runs(documents, out)

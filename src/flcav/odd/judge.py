@@ -17,7 +17,7 @@ from flcav.dataset.store import Dataset
 from flcav.interface.wording import plural
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements, reach_of
-from flcav.odd.scenery import Place, Scenery
+from flcav.odd.scenery import ScenarioPlace, Scenery
 from flcav.sensors.rig import RIGS
 from flcav.statistics.estimates import Estimate, score_interval
 from flcav.storage.exchange import write_table
@@ -59,7 +59,7 @@ class Rates(Record):
 
 
 @dataclass(frozen=True)
-class Agreement(Record):
+class PerceptionAgreement(Record):
     """How often perceived verdicts are right, on the frames that truth decides, dependent as those of a scene are."""
 
     frames: int
@@ -68,7 +68,7 @@ class Agreement(Record):
     undecided: int  # frames that perception leaves unknown
 
 
-def describe_agreement(agreement: Agreement) -> list[str]:
+def describe_agreement(agreement: PerceptionAgreement) -> list[str]:
     """Return the agreement in words."""
     rows = []
     for name, rates in ((INSIDE, agreement.inside), (OUTSIDE, agreement.outside)):
@@ -89,7 +89,7 @@ def judge_values(domain: Domain, measured: Mapping[str, Value]) -> str:
     return OUTSIDE if not verdict.inside else UNKNOWN if verdict.assumed else INSIDE
 
 
-def judge(domain: Domain, measured: Measurements) -> Verdicts:
+def judge_frames(domain: Domain, measured: Measurements) -> Verdicts:
     """Return the verdict on each frame, and which modules put frames outside.
 
     Raises `InputError` where the domain tests an attribute that nothing measures.
@@ -106,7 +106,7 @@ def judge(domain: Domain, measured: Measurements) -> Verdicts:
     return Verdicts(measured.frames, np.array(verdicts, dtype=np.str_), dict(failed.most_common()))
 
 
-def compare_verdicts(truth: Sequence[str], perceived: Sequence[str]) -> Agreement:
+def compare_verdicts(truth: Sequence[str], perceived: Sequence[str]) -> PerceptionAgreement:
     """Return how well perceived verdicts match those of truth, on the frames that truth decides."""
     wanted, found = np.asarray(truth), np.asarray(perceived)
     decided = wanted != UNKNOWN
@@ -120,7 +120,7 @@ def compare_verdicts(truth: Sequence[str], perceived: Sequence[str]) -> Agreemen
         )
         return Rates(*shares)
 
-    return Agreement(int(decided.sum()), rate(INSIDE), rate(OUTSIDE), int((found == UNKNOWN).sum()))
+    return PerceptionAgreement(int(decided.sum()), rate(INSIDE), rate(OUTSIDE), int((found == UNKNOWN).sum()))
 
 
 SET, FOUND, RIG, TRAFFIC, UNMEASURED = "set", "found", "rig", "traffic", "unmeasured"
@@ -131,7 +131,7 @@ GROUND = {"surface_type": "asphalt"}  # of every town
 
 
 @dataclass(frozen=True)
-class Part(Record):
+class DomainPart(Record):
     """How far one attribute of a domain is realised."""
 
     attribute: str
@@ -160,7 +160,7 @@ class Part(Record):
         return f"inside at {self.inside} of {of}{missing}"
 
 
-def check_towns(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[Part, ...]:
+def check_towns(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[DomainPart, ...]:
     """Return the parts of a domain that recipes for these towns realise, at all their places."""
     rows: list[dict[str, Value]] = []
     for scenery in sceneries:
@@ -168,13 +168,13 @@ def check_towns(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[Part, ...
     return tuple(_check_part(domain, name, rows) for name in domain.tested)
 
 
-def check_frames(domain: Domain, measured: Measurements) -> tuple[Part, ...]:
+def check_frames(domain: Domain, measured: Measurements) -> tuple[DomainPart, ...]:
     """Return the parts of a domain that the frames of a recording realise."""
     rows = measured.rows()
     return tuple(
         _count_part(domain, name, FOUND, "frames", [row.get(domain.bound[name]) for row in rows])
         if name in domain.bound
-        else Part(name, UNMEASURED, "", 0, 0, len(rows))
+        else DomainPart(name, UNMEASURED, "", 0, 0, len(rows))
         for name in domain.tested
     )
 
@@ -189,7 +189,9 @@ def choose_rig(domain: Domain) -> str | None:
     return None
 
 
-def find_places(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[tuple[Place, dict[str, Value]], ...]:
+def find_inside_places(
+    domain: Domain, sceneries: Sequence[Scenery]
+) -> tuple[tuple[ScenarioPlace, dict[str, Value]], ...]:
     """Return the places of towns that can be inside a domain, with the scenery of each; the rest is left open.
 
     A place whose scenery is missing an attribute that the domain tests is none: it is not inside by silence.
@@ -204,7 +206,7 @@ def find_places(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[tuple[Pla
     return tuple(inside)
 
 
-def _describe_places(scenery: Scenery) -> list[tuple[Place, dict[str, Value]]]:
+def _describe_places(scenery: Scenery) -> list[tuple[ScenarioPlace, dict[str, Value]]]:
     places = scenery.places()
     if not places:
         return []
@@ -213,30 +215,30 @@ def _describe_places(scenery: Scenery) -> list[tuple[Place, dict[str, Value]]]:
     )
 
 
-def _check_part(domain: Domain, name: str, rows: list[dict[str, Value]]) -> Part:
+def _check_part(domain: Domain, name: str, rows: list[dict[str, Value]]) -> DomainPart:
     column = domain.bound.get(name)
     knobs = domain.knobs()
     if column is None:
-        return Part(name, UNMEASURED, "", 0, 0, 1)
+        return DomainPart(name, UNMEASURED, "", 0, 0, 1)
     if name in knobs and column != "junction":
         low, high = knobs[name].reach or (-np.inf, np.inf)
         allowed = [value for value in domain.allowed(name) if isinstance(value, float | int) and low <= value <= high]
-        return Part(name, SET, knobs[name].key, int(bool(allowed)), int(not allowed), 0)
+        return DomainPart(name, SET, knobs[name].key, int(bool(allowed)), int(not allowed), 0)
     if column in ("light", "surface_condition"):
         field = "weather.sun_elevation_deg" if column == "light" else "weather.wetness"
-        return Part(name, SET, field, 1, 0, 0)
+        return DomainPart(name, SET, field, 1, 0, 0)
     if column in OF_RIG:
         fits = any(_can(domain, name, reach_of(RIGS[rig])[column]) for rig in VEHICLE_RIGS)
-        return Part(name, RIG, "vehicle_rig", int(fits), int(not fits), 0)
+        return DomainPart(name, RIG, "vehicle_rig", int(fits), int(not fits), 0)
     if column in OF_TRAFFIC:
-        return Part(name, TRAFFIC, column, 0, 0, 0)
+        return DomainPart(name, TRAFFIC, column, 0, 0, 0)
     return _count_part(domain, name, FOUND, "places", [row.get(column) for row in rows])
 
 
-def _count_part(domain: Domain, name: str, how: str, by: str, values: Sequence[Value]) -> Part:
+def _count_part(domain: Domain, name: str, how: str, by: str, values: Sequence[Value]) -> DomainPart:
     known = [value for value in values if value is not None]
     inside = sum(_can(domain, name, value) for value in known)
-    return Part(name, how, by, inside, len(known) - inside, len(values) - len(known))
+    return DomainPart(name, how, by, inside, len(known) - inside, len(values) - len(known))
 
 
 def _can(domain: Domain, name: str, value: Value) -> bool:

@@ -68,7 +68,7 @@ class Span(Record):
         return "unknown" if self.low is None else f"{self.low:g} to {self.high:g}{missing}"
 
 
-def summarise(measured: Measurements) -> tuple[Span, ...]:
+def summarise_measurements(measured: Measurements) -> tuple[Span, ...]:
     """Return the range or the values of each attribute in the frames, in the order of the columns."""
     spans = []
     for name, column in measured.columns.items():
@@ -91,7 +91,7 @@ def select_vehicles(data: Dataset) -> tuple[int, ...]:
     return frames
 
 
-def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
+def measure_domain(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
     """Return the value of each attribute in `frames` (None: all of vehicles), by ground truth.
 
     scenery: that of the recording's town, where it has been read before. What a recording does not say is missing.
@@ -108,7 +108,7 @@ def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery
     columns |= {name: column[list(chosen)] for name, column in describe_weather(weather).items()}
     columns |= {"ego_speed": _speeds(data)[list(chosen)]}
     columns |= {name: column[list(chosen)] for name, column in _count_agents(data).items()}
-    columns |= {name: np.full(len(chosen), number) for name, number in describe_rig(data.manifest.recipe).items()}
+    columns |= {name: np.full(len(chosen), number) for name, number in describe_reach(data.manifest.recipe).items()}
     return Measurements(chosen, columns)
 
 
@@ -133,7 +133,7 @@ def describe_weather(weather: Mapping[str, Array]) -> dict[str, Column]:
     }
 
 
-def describe_rig(recipe: Mapping[str, object]) -> dict[str, float]:
+def describe_reach(recipe: Mapping[str, object]) -> dict[str, float]:
     """Return the field of view [deg] and the range [m] of a recipe's vehicle rig; NaN without a recipe."""
     if "vehicle_rig" not in recipe:
         return {"field_of_view": np.nan, "sensing_range": np.nan}
@@ -231,7 +231,7 @@ def perceive(
 
     Raises `InputError` where a frame lacks the camera of the weather network, or the LiDAR of the detector.
     """
-    known = measure(data, frames)
+    known = measure_domain(data, frames)
     unseen = np.full(len(frames), np.nan)
     columns: dict[str, Column] = dict(known.columns)
     columns |= describe_weather(dict.fromkeys(Weather.model_fields, unseen))

@@ -19,9 +19,9 @@ from scipy.stats import qmc
 
 from flcav.config import InputError, Json
 from flcav.odd.domain import Domain, Value
-from flcav.odd.judge import OUTSIDE, choose_rig, find_places, judge_values
+from flcav.odd.judge import OUTSIDE, choose_rig, find_inside_places, judge_values
 from flcav.odd.measure import describe_weather, reach_of
-from flcav.odd.scenery import Place, Scenery
+from flcav.odd.scenery import ScenarioPlace, Scenery
 from flcav.sensors.rig import RIGS
 from flcav.sources.recipe import Recipe, parse_recipe
 from flcav.statistics.streams import stream
@@ -68,10 +68,10 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Sample(Record):
+class SampledScenario(Record):
     """One drawn scenario of a domain."""
 
-    place: Place
+    place: ScenarioPlace
     case: Kind
     weather: Weather
     buckets: Mapping[str, str]  # attribute, and the corner case -> bucket
@@ -83,7 +83,7 @@ class Sample(Record):
 class Sampled:
     """Samples of a domain, and the pairs of buckets that they have."""
 
-    samples: tuple[Sample, ...]
+    samples: tuple[SampledScenario, ...]
     pairs: int  # pairs of buckets of two axes in the samples
     possible: int  # pairs that a sample can have
     refused: int  # points that were outside the domain
@@ -103,8 +103,8 @@ class Space:
     def __init__(self, domain: Domain, sceneries: Sequence[Scenery]) -> None:
         domain.require_bound()
         self.domain = domain
-        self.places: dict[str, list[tuple[Place, dict[str, Value]]]] = {}
-        for place, row in find_places(domain, sceneries):
+        self.places: dict[str, list[tuple[ScenarioPlace, dict[str, Value]]]] = {}
+        for place, row in find_inside_places(domain, sceneries):
             if cases_at(place):
                 self.places.setdefault(place.kind, []).append((place, row))
         if not self.places:
@@ -149,7 +149,7 @@ class Space:
         given = {each: known[own] for each, own in self.domain.bound.items() if known.get(own) not in (None, "")}
         return self.domain.can_hold({each: one for each, one in given.items() if one == one})
 
-    def realise(self, values: Mapping[str, Value], case: float, place: float) -> Sample | None:
+    def realise(self, values: Mapping[str, Value], case: float, place: float) -> SampledScenario | None:
         """Return the sample with these values, shares in [0, 1) of its cases and places; None if it cannot be.
 
         Where it rains, fewer clouds than `RAIN_CLOUDS` are lifted above it. A sample is refused where the domain is
@@ -181,7 +181,9 @@ class Space:
             for name in self.knobs
             if (item := items[name]) is not None
         }
-        return Sample(here, chosen, weather, {**buckets, CASE: chosen}, self.rig, float(row["speed_limit"] or 0.0))
+        return SampledScenario(
+            here, chosen, weather, {**buckets, CASE: chosen}, self.rig, float(row["speed_limit"] or 0.0)
+        )
 
     def possible_pairs(self) -> set[tuple[tuple[str, str], tuple[str, str]]]:
         """Return the pairs of buckets, of two axes or of an axis and the corner cases, that a sample can have."""
@@ -208,7 +210,7 @@ class Space:
         }
 
 
-def cases_at(place: Place) -> tuple[Kind, ...]:
+def cases_at(place: ScenarioPlace) -> tuple[Kind, ...]:
     """Return the corner cases that can happen at a place."""
     return tuple(case for case in CASES.get(place.kind, ()) if case != LIT or place.control == "signalised")
 
@@ -226,10 +228,12 @@ def sample_domain(
     covered: report of earlier runs, of the method "coverage". Points that are refused are replaced by further ones.
     Raises `InputError` where hardly any point can be realised.
     """
-    samples: list[Sample] = []
+    samples: list[SampledScenario] = []
     refused = 0
     points = (
-        _draw_covering(space, count, seed, covered) if method == "coverage" else draw_points(space, count, method, seed)
+        _draw_covering(space, count, seed, covered)
+        if method == "coverage"
+        else draw_sample_points(space, count, method, seed)
     )
     for values, case, place in points:
         found = space.realise(values, case, place)
@@ -244,7 +248,7 @@ def sample_domain(
     return count_pairs(space, samples, refused)
 
 
-def count_pairs(space: Space, samples: Sequence[Sample], refused: int = 0) -> Sampled:
+def count_pairs(space: Space, samples: Sequence[SampledScenario], refused: int = 0) -> Sampled:
     """Return samples of a space with the pairs of buckets that they have."""
     possible = space.possible_pairs()
     order = [axis.attribute for axis in space.axes] + [CASE]
@@ -256,7 +260,9 @@ def count_pairs(space: Space, samples: Sequence[Sample], refused: int = 0) -> Sa
     return Sampled(tuple(samples), len(had & possible), len(possible), refused)
 
 
-def draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
+def draw_sample_points(
+    space: Space, count: int, method: str, seed: int
+) -> Iterator[tuple[dict[str, Value], float, float]]:
     """Yield values by attribute and the shares of case and place, without end, in batches of quasi-random points."""
     axes, rng = space.axes, stream(seed, "odd", method)
     sobol = qmc.Sobol(len(axes) + 2, scramble=True, rng=rng)
@@ -293,7 +299,7 @@ POLE_M = 40.0  # a pole this near to the place records, too
 INDEX = "samples.json"
 
 
-def make_recipe(sample: Sample, scenery: Scenery, seed: int, split: str = "train") -> dict[str, Json]:
+def make_recipe(sample: SampledScenario, scenery: Scenery, seed: int, split: str = "train") -> dict[str, Json]:
     """Return the fields of the recipe of a sample, which `parse_recipe` takes."""
     town, place = scenery.town, sample.place
     away = np.linalg.norm(town.poles.position[:, :2] - (place.x, place.y), axis=1)
@@ -321,7 +327,7 @@ def write_recipes(
     sceneries: Sequence[Scenery],
     out: Path,
     seed: int,
-    also: Callable[[Sample, Recipe, Path], None],
+    also: Callable[[SampledScenario, Recipe, Path], None],
     told: Sequence[Mapping[str, Json]] = (),
 ) -> list[Path]:
     """Write the recipe of each sample as OUT/NUMBER.yaml, and OUT/samples.json last; return the recipes' paths.

@@ -15,7 +15,7 @@ import numpy as np
 from flcav.config import InputError, Json, parse_config
 from flcav.dataset.store import Dataset
 from flcav.geometry import Array
-from flcav.odd.measure import measure, scenery_of
+from flcav.odd.measure import measure_domain, scenery_of
 from flcav.odd.scenery import Scenery
 from flcav.perception.tasks import task_named
 from flcav.pipeline.label_sources import choose_labels
@@ -50,7 +50,7 @@ class Complexity(Record):
 
 
 @dataclass(frozen=True)
-class Task(Record):
+class ScenarioTask(Record):
     """A task of a scenario: which data, which labels, which network."""
 
     data: str  # dataset folder
@@ -67,7 +67,7 @@ class ScenarioTasks(Record):
     kind: str  # of place
     frames: int
     complexity: Complexity
-    tasks: tuple[Task, ...]
+    tasks: tuple[ScenarioTask, ...]
 
 
 def count_tasks(complexity: Complexity) -> int:
@@ -90,7 +90,7 @@ def generate_tasks(folder: Path, errors: Sequence[tuple[str, float, float]] = ()
     scenery = scenery_of(data)
     if scenery is None:
         raise InputError(f"{folder}: its town is not known, so that its scenarios are not")
-    measured = measure(data, scenery=scenery)
+    measured = measure_domain(data, scenery=scenery)
     kind, frames = measured.columns["junction"], np.array(measured.frames)
     agents = np.asarray(measured.columns["agents"], dtype=np.float64)
     hidden = _occlusion(data)
@@ -151,9 +151,9 @@ def town_of(folder: Path) -> str:
     return name if town is None or name in PACKAGED else str(town.net.parent)
 
 
-def _task(name: str, folder: Path) -> Task:
+def _task(name: str, folder: Path) -> ScenarioTask:
     network = next(iter(task_named(name).configurations))
-    return Task(str(folder), choose_labels(name, None), network, name)
+    return ScenarioTask(str(folder), choose_labels(name, None), network, name)
 
 
 def _occlusion(data: Dataset) -> Array:

@@ -7,11 +7,11 @@ import pytest
 from carla_calls import describe, invoke, place
 
 from flcav.carla.server import wire
-from flcav.carla.server.blueprints import NOT_SERVED, SENSORS, Refused, check, list_blueprints
+from flcav.carla.server.blueprints import NOT_SERVED, SENSORS, CallRefused, check_description, list_blueprints
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.episode import Measurement
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.sensors import KINDS, Clock
+from flcav.carla.server.sensors import KINDS, SensorClock
 from flcav.carla.server.weather import to_weather
 from flcav.config import InputError
 from flcav.world.shapes import SHAPES
@@ -37,7 +37,7 @@ def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
         if name in KINDS:
             assert invoke(calls, "spawn_actor", spawn).token
         else:
-            with pytest.raises(Refused, match=f"{name} is not served"):
+            with pytest.raises(CallRefused, match=f"{name} is not served"):
                 invoke(calls, "spawn_actor", spawn)
 
 
@@ -46,7 +46,7 @@ def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):
 def test_far_above_and_below_an_actor_there_is_room(height, kind, calls):
     here = place(calls)
     invoke(calls, "spawn_actor", (describe("vehicle.tesla.model3"), here))
-    with pytest.raises(Refused, match="because of collision"):
+    with pytest.raises(CallRefused, match="because of collision"):
         invoke(calls, "spawn_actor", (describe(kind), here))
     here[0][2] += height
     number = invoke(calls, "spawn_actor", (describe(kind), here)).id
@@ -66,7 +66,7 @@ def test_blueprints_that_scripts_ask_for_by_name(calls):
     for name in (*(f"static.prop.{prop}" for prop in props.split()), "walker.pedestrian.0052", "util.actor.empty"):
         here = [[0.0, 0.0, 30.0], [0.0, 0.0, 0.0]]
         if name == "static.prop.mesh":
-            with pytest.raises(Refused, match=r"static\.prop\.mesh is not served here$"):
+            with pytest.raises(CallRefused, match=r"static\.prop\.mesh is not served here$"):
                 invoke(calls, "spawn_actor", (describe(name), here))
         else:
             invoke(calls, "destroy_actor", (invoke(calls, "spawn_actor", (describe(name), here)).id,))
@@ -124,13 +124,13 @@ def test_two_wheelers_are_as_wide_as_their_riders():
     ],
 )
 def test_attributes_out_of_range_are_refused(name, attribute, told):
-    with pytest.raises(Refused, match=told):
-        check(wire.read(wire.Description, describe(name, attribute)))
+    with pytest.raises(CallRefused, match=told):
+        check_description(wire.read(wire.Description, describe(name, attribute)))
 
 
 def test_unknown_blueprints_are_refused_with_a_suggestion():
-    with pytest.raises(Refused, match=r"did you mean 'vehicle\.tesla\.model3'"):
-        check(wire.Description(1, "vehicle.tesla.modl3", ()))
+    with pytest.raises(CallRefused, match=r"did you mean 'vehicle\.tesla\.model3'"):
+        check_description(wire.Description(1, "vehicle.tesla.modl3", ()))
 
 
 @pytest.mark.parametrize(
@@ -150,7 +150,7 @@ def test_unknown_blueprints_are_refused_with_a_suggestion():
     ],
 )
 def test_refusals(calls, method, arguments, told):
-    with pytest.raises((Refused, InputError), match=told):
+    with pytest.raises((CallRefused, InputError), match=told):
         invoke(calls, method, arguments)
 
 
@@ -224,7 +224,7 @@ def test_an_image_that_is_drawn_after_further_ticks_is_that_of_its_tick(maps):
 
 @pytest.mark.parametrize(("tick_s", "due"), [(0.0, [1, 2, 3, 4, 5, 6]), (0.1, [1, 3, 5]), (0.15, [1, 4])])
 def test_sensors_are_due_every_sensor_tick(tick_s, due):
-    clock = Clock(tick_s)
+    clock = SensorClock(tick_s)
     taken = {tick: clock.take(tick * 0.05, 0.05) for tick in range(1, 7)}
     assert [tick for tick, elapsed in taken.items() if elapsed is not None] == due
     assert taken[due[-1]] == pytest.approx(max(tick_s, 0.05))

@@ -17,11 +17,11 @@ from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sources.recipe import CarlaRecipe, Recipe, parse_recipe
 
 pytest.importorskip("carla")
-from flcav.carla.recording.labels import Sight, Sweep, annotate, enter_box
-from flcav.carla.recording.sensors import Feed, SemanticSweep, read_depths, read_points
+from flcav.carla.recording.labels import CameraSight, LidarSweep, annotate_bodies, enter_box
+from flcav.carla.recording.sensors import Feed, SemanticSweep, read_depths, read_lidar_points
 from flcav.carla.recording.session import Session, _check_version, check_installed
 from flcav.carla.recording.source import CarlaSource
-from flcav.carla.recording.traffic import Body, State
+from flcav.carla.recording.traffic import State, TrackedBody
 from flcav.carla.server.weather import make_weather, to_weather
 from flcav.carla.server.wire import WeatherParameters
 from flcav.world.weather import WEATHERS
@@ -142,7 +142,7 @@ def test_data_are_decoded_as_carla_documents_them() -> None:
     assert depth[0, 1] == pytest.approx((3 + 2 * 256 + 1 * 256**2) / (256**3 - 1) * 1000)
     assert np.isinf(depth[0, 2])
     sweep = cast(Any, SimpleNamespace(raw_data=np.array([(1, 2, 3, 0.5)], np.float32).tobytes()))
-    np.testing.assert_array_equal(read_points(sweep), [(1, -2, 3, 0.5)])
+    np.testing.assert_array_equal(read_lidar_points(sweep), [(1, -2, 3, 0.5)])
 
 
 @settings(max_examples=100, deadline=None)
@@ -163,12 +163,12 @@ def test_rays_enter_a_box_where_segments_first_meet_it(seed: int) -> None:
 # ---- occlusion: a car behind a wall that hides a share of it
 
 LIDAR = Lidar(channels=64, azimuth_steps=1800, up_deg=5.0, down_deg=-15.0)
-CAR = Body(7, "veh0", "car", (4.0, 2.0, 1.6), pose(0, 0, 0.8))
-PARKED = Body(0, "parked0", "car", (4.0, 2.0, 1.6), pose(0, 0, 0.8))
+CAR = TrackedBody(7, "veh0", "car", (4.0, 2.0, 1.6), pose(0, 0, 0.8))
+PARKED = TrackedBody(0, "parked0", "car", (4.0, 2.0, 1.6), pose(0, 0, 0.8))
 HERE = pose(3.0, 1.0, 1.7, 0.4)  # world_from_sensor
 
 
-def make_state(body: Body) -> State:
+def make_state(body: TrackedBody) -> State:
     boxes = Boxes(np.array([[20.0, 0.0, 0.8]]), np.array([body.size]), np.array([1.2]), np.array(["car"]))
     boxes = boxes.transform(HERE @ pose(0, 0, -1.7))
     return State((body,), boxes, np.zeros((1, 3)), np.zeros((1, 3)))
@@ -190,14 +190,14 @@ def cast_rays(state: State, lines: NDArray[np.floating], wall_y: float) -> tuple
 
 @pytest.mark.parametrize("body", [CAR, PARKED], ids=["actor", "parked"])
 @pytest.mark.parametrize(("wall_y", "expected"), [(99.0, 0.0), (0.0, 0.5), (-99.0, 1.0)])
-def test_occlusion_is_the_share_that_a_wall_hides(body: Body, wall_y: float, expected: float) -> None:
+def test_occlusion_is_the_share_that_a_wall_hides(body: TrackedBody, wall_y: float, expected: float) -> None:
     state, lines = make_state(body), build_ray_pattern(LIDAR).astype(np.float64)
     distance, met = cast_rays(state, lines, wall_y)
     back = np.isfinite(distance)
     points = (lines[back] * distance[back, None]).astype(np.float32)
     actor = np.where(met[back] == 2, body.number, 0).astype(np.uint32)
     tag = np.where(met[back] == 2, 14, 4).astype(np.uint32)
-    sweep = Sweep(
+    sweep = LidarSweep(
         LIDAR, HERE, np.column_stack((points, np.ones(len(points), np.float32))), SemanticSweep(points, actor, tag)
     )
     eye = Lens(width=640, height=240, fov_deg=60)
@@ -206,8 +206,8 @@ def test_occlusion_is_the_share_that_a_wall_hides(body: Body, wall_y: float, exp
     far, what = cast_rays(state, transform_points(BODY_FROM_OPTICAL, rays), wall_y)
     depth = (far * rays[:, 2]).astype(np.float32).reshape(240, 640)
     classes = np.array([11, 4, 14], np.uint8)[what].reshape(240, 640)
-    sight = Sight(eye, world_from_camera, depth, classes)
-    truth, images = annotate(state, None, np.array([True]), {"top": sweep}, {"eye": sight})
+    sight = CameraSight(eye, world_from_camera, depth, classes)
+    truth, images = annotate_bodies(state, None, np.array([True]), {"top": sweep}, {"eye": sight})
     assert truth.returns[0] == (met == 2).sum()
     assert truth.occlusion[0] == pytest.approx(expected, abs=0.08)
     assert truth.views["eye"].pixels[0] == (what == 2).sum() == (images["eye"] == 1).sum()
@@ -217,5 +217,5 @@ def test_occlusion_is_the_share_that_a_wall_hides(body: Body, wall_y: float, exp
 
 def test_the_carrier_is_not_annotated() -> None:
     state = make_state(CAR)
-    truth, _ = annotate(state, 7, np.array([True]), {}, {})
+    truth, _ = annotate_bodies(state, 7, np.array([True]), {}, {})
     assert len(truth) == 0

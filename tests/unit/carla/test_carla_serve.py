@@ -16,10 +16,10 @@ from flcav.carla.server.calls import Calls
 from flcav.carla.server.episode import Episode
 from flcav.carla.server.maps import Maps
 from flcav.carla.server.sensors import KINDS, Kind
-from flcav.carla.server.serve import Server
+from flcav.carla.server.serve import CarlaServer
 from flcav.carla.server.wire import Stream
 
-SYNCHRONOUS = wire.Settings(synchronous=True, fixed_dt_s=0.05).packed()
+SYNCHRONOUS = wire.EpisodeSettings(synchronous=True, fixed_dt_s=0.05).packed()
 UNFINISHED = b"\x94\x00\x01\xa7version\xdd\x00\x03\x00\x00"  # the beginning of a call with 196,608 arguments
 
 
@@ -38,7 +38,7 @@ class Client:
 
     async def call(self, method, *arguments):
         self.number += 1
-        self.writer.write(wire.pack([0, self.number, method, [[False], *arguments]]))
+        self.writer.write(wire.pack_value([0, self.number, method, [[False], *arguments]]))
         while True:
             for _, number, error, answer in self.unpacker:
                 assert (number, error) == (self.number, None)
@@ -54,7 +54,7 @@ async def serving(maps):
     """Give the port of a server, and its calls."""
     calls_door, streams_door = (socket.create_server(("127.0.0.1", 0)) for _ in range(2))
     calls = Calls(maps, "suburb", seed=3, traffic=0, port=streams_door.getsockname()[1] - 1)
-    task = asyncio.create_task(Server(calls).run((calls_door, streams_door), lambda: None))
+    task = asyncio.create_task(CarlaServer(calls).run((calls_door, streams_door), lambda: None))
     try:
         yield calls_door.getsockname()[1], streams_door.getsockname()[1], calls
     finally:
@@ -72,7 +72,7 @@ def test_who_bursts_cues_is_read_no_further_while_others_are_served(maps):
         async with serving(maps) as (port, _, calls):
             other, burst = await Client().connect(port), await Client().connect(port)
             await other.call("set_episode_settings", SYNCHRONOUS)
-            burst.writer.write(wire.pack([0, 1, "tick_cue", [[False]]]) * 5_000)
+            burst.writer.write(wire.pack_value([0, 1, "tick_cue", [[False]]]) * 5_000)
             for _ in range(10):
                 assert await other.call("version") == wire.VERSION
                 assert calls.ticks <= serve.MOST_CUES
@@ -88,13 +88,13 @@ def test_who_bursts_cues_is_read_no_further_while_others_are_served(maps):
 
 
 def test_a_server_ends_although_cues_wait(maps, monkeypatch):
-    monkeypatch.setattr(Server, "_tick", lambda self: asyncio.sleep(60.0))
+    monkeypatch.setattr(CarlaServer, "_tick", lambda self: asyncio.sleep(60.0))
 
     async def session():
         async with serving(maps) as (port, _, calls):
             client = await Client().connect(port)
             await client.call("set_episode_settings", SYNCHRONOUS)
-            client.writer.write(wire.pack([0, 2, "tick_cue", [[False]]]) * 100)
+            client.writer.write(wire.pack_value([0, 2, "tick_cue", [[False]]]) * 100)
             while calls.ticks < serve.MOST_CUES - 1:
                 await asyncio.sleep(0.001)
             ending = time.monotonic()
@@ -141,7 +141,7 @@ def test_of_many_unfinished_calls_the_largest_are_dropped(maps, monkeypatch):
     async def session():
         async with serving(maps) as (port, _, _):
             small = await Client().connect(port)
-            small.writer.write(wire.pack([0, 1, "version", [[False]]])[:5])
+            small.writer.write(wire.pack_value([0, 1, "version", [[False]]])[:5])
             links = [await Client().connect(port) for _ in range(6)]
             for link in links:
                 link.writer.write(UNFINISHED + b"\xc0" * 180_000)
@@ -155,8 +155,8 @@ def test_of_many_unfinished_calls_the_largest_are_dropped(maps, monkeypatch):
                 except TimeoutError:
                     pass
             assert ended == 1  # six are more than a million bytes, five are not
-            small.writer.write(wire.pack([0, 1, "version", [[False]]])[5:])
-            assert await small.reader.read(100) == wire.pack([1, 1, None, [[1, wire.VERSION]]])
+            small.writer.write(wire.pack_value([0, 1, "version", [[False]]])[5:])
+            assert await small.reader.read(100) == wire.pack_value([1, 1, None, [[1, wire.VERSION]]])
 
     asyncio.run(session())
 
@@ -218,7 +218,7 @@ def test_replies_that_nobody_reads_are_not_piled_up(maps, monkeypatch):
     async def session():
         async with serving(maps) as (port, _, _):
             greedy, other = await Client().connect(port), await Client().connect(port)
-            greedy.writer.write(wire.pack([0, 1, "get_map_data", [[False]]]) * 2000)  # 150 kB each
+            greedy.writer.write(wire.pack_value([0, 1, "get_map_data", [[False]]]) * 2000)  # 150 kB each
             begun = time.monotonic()
             while time.monotonic() < begun + 1.0:
                 assert await other.call("version") == wire.VERSION

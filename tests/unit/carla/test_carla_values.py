@@ -12,7 +12,7 @@ from flcav.carla.frames import mirror
 from flcav.carla.server import maps as carla_maps
 from flcav.carla.server import wire
 from flcav.carla.server.actors import choose_gear
-from flcav.carla.server.blueprints import Quality, Refused, check, list_blueprints
+from flcav.carla.server.blueprints import CallRefused, Quality, check_description, list_blueprints
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.lights import find_limits, list_signals
 from flcav.carla.server.maps import OPENDRIVE_MAP, SPAWN_POINTS, Maps
@@ -387,9 +387,13 @@ def test_low_quality_is_told_and_draws_smaller_pictures_of_the_same_street(maps,
         ]
         assert 0 < np.abs(smooth[0] - smooth[1]).mean() < 3.0
         assert smooth[0].std() > 20.0
-        with pytest.raises(Refused, match="'quality' = 'medium' is not high or low"):
-            check(wire.Description(0, "sensor.camera.rgb", (wire.Attribute("quality", 2, "medium"),)), Quality.LOW)
-        assert not {each.id for each in check(wire.Description(0, "sensor.camera.rgb", ()))[1].attributes} & {"quality"}
+        with pytest.raises(CallRefused, match="'quality' = 'medium' is not high or low"):
+            check_description(
+                wire.Description(0, "sensor.camera.rgb", (wire.Attribute("quality", 2, "medium"),)), Quality.LOW
+            )
+        assert not {
+            each.id for each in check_description(wire.Description(0, "sensor.camera.rgb", ()))[1].attributes
+        } & {"quality"}
     finally:
         low.episode.close()
 
@@ -415,7 +419,7 @@ def test_signs_of_a_map_are_actors_that_count_on_their_lane(maps):
         middle = sign.pose @ np.append(mirror(np.array(sign.bounding_box().location)), 1.0)
         x, y, _ = calls.episode.served.frame.to_location(middle[:3])
         assert (x, y) == pytest.approx((along - 3.0, 1.75), abs=0.1)
-        with pytest.raises(Refused, match="cannot be destroyed"):
+        with pytest.raises(CallRefused, match="cannot be destroyed"):
             invoke(calls, "destroy_actor", (sign.id,))
     still = b"\x00" * 36  # motion of an actor at rest, before what is particular to it: the sign's id
     assert calls.episode.describe_world(0.05).count(still + b"7\x00") == 1

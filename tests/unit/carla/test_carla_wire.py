@@ -18,7 +18,7 @@ HERE = Transform((1.0, 2.0, 3.0), (4.0, 5.0, 6.0))
 SIX = "0000803f0000004000004040000080400000a0400000c040"  # of HERE, as float32
 BOX = wire.BoundingBox((0.0, 0.0, 0.5), (1.0, 0.5, 0.5), actor_id=7)
 DESCRIPTION = wire.Description(3, "vehicle.a.b", (wire.Attribute("color", 5, "1,2,3"),))
-ACTOR = wire.Actor(7, 0, DESCRIPTION, BOX, b"\x0e", b"")
+ACTOR = wire.ActorRecord(7, 0, DESCRIPTION, BOX, b"\x0e", b"")
 
 
 def test_header():
@@ -67,7 +67,7 @@ def test_image():
 
 def test_sweep():
     points = np.array([[1, 2, 3, 4]], "<f4")
-    packed = wire.pack_sweep(0.5, np.array([0, 1]), points)
+    packed = wire.pack_lidar(0.5, np.array([0, 1]), points)
     assert packed.hex() == "0000003f" + "02000000" + "00000000" + "01000000" + points.tobytes().hex()
 
 
@@ -81,7 +81,7 @@ def test_token():
 
 
 def test_records_are_arrays_of_their_fields():
-    record = wire.Collision(ACTOR, ACTOR, (1.0, 2.0, 3.0))
+    record = wire.CollisionEvent(ACTOR, ACTOR, (1.0, 2.0, 3.0))
     told = [7, 0, [3, "vehicle.a.b", [["color", 5, "1,2,3"]]]]
     told += [[[0.0, 0.0, 0.5], [1.0, 0.5, 0.5], [0.0, 0.0, 0.0], 7], b"\x0e", b""]
     assert msgpack.unpackb(wire.pack_record(record)) == [told, told, [1.0, 2.0, 3.0]]
@@ -101,13 +101,15 @@ def test_replies(response, golden):
 
 
 def test_settings_have_an_optional():
-    assert wire.Settings(fixed_dt_s=0.05).packed()[2] == [True, 0.05]
-    assert wire.Settings().packed()[2] == [False]
-    assert wire.read(wire.Settings, wire.Settings(True, fixed_dt_s=0.1).packed()) == wire.Settings(True, fixed_dt_s=0.1)
+    assert wire.EpisodeSettings(fixed_dt_s=0.05).packed()[2] == [True, 0.05]
+    assert wire.EpisodeSettings().packed()[2] == [False]
+    assert wire.read(wire.EpisodeSettings, wire.EpisodeSettings(True, fixed_dt_s=0.1).packed()) == wire.EpisodeSettings(
+        True, fixed_dt_s=0.1
+    )
 
 
 def test_calls_are_read_one_after_another_and_in_parts():
-    message = wire.pack([0, 1, "version", [[False]]]) + wire.pack([2, "tick_cue", [[True], 4]])
+    message = wire.pack_value([0, 1, "version", [[False]]]) + wire.pack_value([2, "tick_cue", [[True], 4]])
     unpacker = connections.Unpacker()
     unpacker.feed(message[:5])
     assert list(unpacker) == []
@@ -181,7 +183,7 @@ def test_values_of_other_types_are_refused(kind: Any, value: Any):
 
 leaves = st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | st.floats() | st.text(max_size=5)
 trees: Any = st.recursive(leaves | st.binary(max_size=5), lambda inner: st.lists(inner, max_size=5), max_leaves=20)
-KINDS = (Transform, wire.Description, wire.Settings, wire.WeatherParameters, int | None, wire.BoundingBox)
+KINDS = (Transform, wire.Description, wire.EpisodeSettings, wire.WeatherParameters, int | None, wire.BoundingBox)
 
 
 @given(trees, st.sampled_from(KINDS))

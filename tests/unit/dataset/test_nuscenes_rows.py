@@ -8,7 +8,7 @@ import pytest
 
 from flcav.config import InputError
 from flcav.dataset.formats.nuscenes import tables
-from flcav.dataset.formats.nuscenes.tables import read_table, stream_table
+from flcav.dataset.formats.nuscenes.tables import read_rows_by_token, stream_table
 
 NAMES = ['a "quoted" one', "ends in \\", "brackets ]},{[", "überall", "", "1e5", "a\nb"]
 
@@ -28,7 +28,7 @@ def test_rows_are_those_of_the_file_read_at_once(
     folder = _write(tmp_path, f" \n{json.dumps(table, **layout)}\n ")  # type: ignore[arg-type]
     read = json.loads((folder / "category.json").read_text(encoding="utf-8"))
     assert list(stream_table(folder, "category")) == [{"name": row["name"], "token": row["token"]} for row in read]
-    assert read_table(_write(tmp_path, "[ ]"), "category") == {}
+    assert read_rows_by_token(_write(tmp_path, "[ ]"), "category") == {}
 
 
 @pytest.mark.parametrize("chunk", [3, 1 << 20])
@@ -55,7 +55,7 @@ def test_what_is_no_table_is_one_sentence(
 ):
     monkeypatch.setattr(tables, "CHUNK", chunk)
     with pytest.raises(InputError, match=sentence) as error:
-        read_table(_write(tmp_path, text), "category")
+        read_rows_by_token(_write(tmp_path, text), "category")
     assert str(error.value).startswith(f"{tmp_path / 'category.json'}: ")
 
 
@@ -64,7 +64,7 @@ def test_memory_is_that_of_the_rows_that_are_kept(tmp_path: Path, monkeypatch: p
     table = [{"token": f"{n:032d}", "name": f"{n:064d}", "description": "x" * 200} for n in range(3000)]
     folder = _write(tmp_path, json.dumps(table))
     tracemalloc.start()
-    found = read_table(folder, "category", lambda row: row["token"].endswith("00"))
+    found = read_rows_by_token(folder, "category", lambda row: row["token"].endswith("00"))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found) == 30

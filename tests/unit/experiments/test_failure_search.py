@@ -9,14 +9,14 @@ from PIL import Image
 
 from flcav.experiments.failure_search.run import RULES, SOBOL, FailureSearchResult, Found, mean_ratio, summarise
 from flcav.experiments.failure_search.tables import failure_search_tables
-from flcav.odd.sampling import Sample
-from flcav.odd.scenery import Place
+from flcav.odd.sampling import SampledScenario
+from flcav.odd.scenery import ScenarioPlace
 from flcav.odd.searching import Failure, Searched, TriedFrame
 from flcav.storage.records import from_json
 from flcav.world.weather import Weather
 
-PLACE = Place("ring", "none", "none", 0.0, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0)
-SAMPLE = Sample(PLACE, "crash", Weather(), {}, "car", 50.0)
+PLACE = ScenarioPlace("ring", "none", "none", 0.0, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0)
+SAMPLE = SampledScenario(PLACE, "crash", Weather(), {}, "car", 50.0)
 
 
 def scenario(*cells: str) -> Searched:

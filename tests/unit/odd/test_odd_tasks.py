@@ -44,9 +44,9 @@ def test_errors_of_a_network_raise_the_complexity_of_where_they_are(drive: Datas
 
 
 def _kind_at(drive: Dataset, i: int) -> list[str]:
-    from flcav.odd.measure import measure
+    from flcav.odd.measure import measure_domain
 
-    measured = measure(drive)
+    measured = measure_domain(drive)
     return [str(measured.columns["junction"][measured.frames.index(i)])]
 
 

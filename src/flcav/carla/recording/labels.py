@@ -27,7 +27,7 @@ VEHICLES = tuple(SEMANTICS[name] for name in ("rider", "car", "truck", "bus", "m
 PEOPLE = (SEMANTICS["pedestrian"],)
 
 
-class Sweep(NamedTuple):
+class LidarSweep(NamedTuple):
     """The sweep of a LiDAR, and what the semantic one beside it met."""
 
     lidar: Lidar
@@ -36,7 +36,7 @@ class Sweep(NamedTuple):
     met: SemanticSweep
 
 
-class Sight(NamedTuple):
+class CameraSight(NamedTuple):
     """Depth and semantic class of a camera's pixels, with its pose."""
 
     lens: Lens
@@ -45,8 +45,12 @@ class Sight(NamedTuple):
     semantic: NDArray[np.uint8]  # (H, W)
 
 
-def annotate(
-    state: State, own: int | None, within: NDArray[np.bool_], sweeps: Mapping[str, Sweep], sights: Mapping[str, Sight]
+def annotate_bodies(
+    state: State,
+    own: int | None,
+    within: NDArray[np.bool_],
+    sweeps: Mapping[str, LidarSweep],
+    sights: Mapping[str, CameraSight],
 ) -> tuple[Annotations, dict[str, NDArray[np.uint16]]]:
     """Return the annotations of M bodies, and the instance image (H, W) of each camera.
 
@@ -90,7 +94,7 @@ def enter_box(origin: Array, directions: Array, half: Array) -> tuple[NDArray[np
     return (near <= far) & (far > 0), np.maximum(near, 0.0)
 
 
-def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: Sweep) -> NDArray[np.int64]:
+def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) -> NDArray[np.int64]:
     """Return the number (M,) of a LiDAR's points from each body: those beside a point of it of the semantic LiDAR's.
 
     A parked vehicle is no actor of CARLA's: points of its class in its box count.
@@ -107,7 +111,7 @@ def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: Sweep) -> ND
     return counts
 
 
-def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[Sweep]) -> Array:
+def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[LidarSweep]) -> Array:
     """Return the share (M,) of rays at each box that ends before it, all LiDARs together; 1 where none arrives."""
     visible, hidden, rays = np.zeros((3, len(boxes)), np.int64)
     for sweep in sweeps:
@@ -142,7 +146,7 @@ def _towards(lines: Array, turn: Array, origin: Array, half: Array) -> NDArray[n
     return np.flatnonzero(lines @ middle >= np.sqrt(1 - (radius / away) ** 2))
 
 
-def _find_instances(boxes: Boxes, sight: Sight) -> NDArray[np.int32]:
+def _find_instances(boxes: Boxes, sight: CameraSight) -> NDArray[np.int32]:
     """Return the image (H, W) of row + 1 of the nearest box that a pixel of its class is in, else 0."""
     lens, found = sight.lens, np.zeros(sight.depth_m.shape, np.int32)
     outlines, _ = outline_boxes(boxes.corners(), lens, sight.world_from_camera)
@@ -163,7 +167,7 @@ def _find_instances(boxes: Boxes, sight: Sight) -> NDArray[np.int32]:
     return found
 
 
-def _view(boxes: Boxes, sight: Sight, instance: NDArray[np.uint16]) -> Views:
+def _view(boxes: Boxes, sight: CameraSight, instance: NDArray[np.uint16]) -> Views:
     lens = sight.lens
     outlines, truncation = outline_boxes(boxes.corners(), lens, sight.world_from_camera)
     regions = find_actor_regions(instance.astype(np.int32), len(boxes))

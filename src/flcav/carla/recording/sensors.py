@@ -123,7 +123,7 @@ def depth_name(name: str) -> str:
     return f"{name}.depths"
 
 
-def read_points(data: "carla.LidarMeasurement") -> NDArray[np.float32]:
+def read_lidar_points(data: "carla.LidarMeasurement") -> NDArray[np.float32]:
     """Return the points (N, 4) x, y, z [m], intensity of a sweep, sensor frame."""
     points = np.frombuffer(bytes(data.raw_data), "<f4").reshape(-1, 4) * np.array((1, -1, 1, 1), np.float32)
     return np.clip(points, (-np.inf, -np.inf, -np.inf, 0), (np.inf, np.inf, np.inf, 1)).astype(np.float32)
@@ -152,7 +152,7 @@ def read_classes(image: "carla.Image") -> NDArray[np.uint8]:
     return np.ascontiguousarray(_pixels(image)[..., 2])
 
 
-def read_position(data: "carla.GnssMeasurement") -> Array:
+def read_fix(data: "carla.GnssMeasurement") -> Array:
     """Return (3,) latitude, longitude [degrees], altitude [m]."""
     return np.array((data.latitude, data.longitude, data.altitude))
 

@@ -11,24 +11,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame
-from flcav.carla.recording.labels import Sight, Sweep, annotate
+from flcav.carla.recording.labels import CameraSight, LidarSweep, annotate_bodies
 from flcav.carla.recording.sensors import (
     Feed,
     depth_name,
     read_classes,
     read_colours,
     read_depths,
+    read_fix,
     read_inertia,
-    read_points,
-    read_position,
+    read_lidar_points,
     read_semantic_points,
     semantic_name,
     spawn_feeds,
 )
 from flcav.carla.recording.session import Session, check_installed, open_session
 from flcav.carla.recording.traffic import (
-    Body,
     State,
+    TrackedBody,
     list_bodies,
     read_pose,
     read_state,
@@ -163,7 +163,12 @@ class CarlaSource:
                     return
 
     def _equip(
-        self, session: Session, name: str, spawned: Mapping[str, "carla.Actor"], bodies: Sequence[Body], scene: str
+        self,
+        session: Session,
+        name: str,
+        spawned: Mapping[str, "carla.Actor"],
+        bodies: Sequence[TrackedBody],
+        scene: str,
     ) -> Agent:
         """Return an agent with its sensors, which CARLA's then has."""
         vehicle = spawned.get(name)
@@ -199,17 +204,17 @@ class CarlaSource:
 
         carrier = [row for row, body in enumerate(state.bodies) if body.number == agent.number]
         sweeps = {
-            name: Sweep(
+            name: LidarSweep(
                 mounted.settings,
                 world_from_agent @ mounts[name],
-                _drop_carrier(read_points(take(name)), state.boxes[carrier], world_from_agent @ mounts[name]),
+                _drop_carrier(read_lidar_points(take(name)), state.boxes[carrier], world_from_agent @ mounts[name]),
                 read_semantic_points(take(semantic_name(name))),
             )
             for name, mounted in agent.rig.lidars.items()
         }
         colours = {name: read_colours(take(name)) for name in agent.rig.cameras}
         sights = {
-            name: Sight(
+            name: CameraSight(
                 mounted.settings,
                 world_from_agent @ mounts[name],
                 read_depths(take(depth_name(name))),
@@ -218,7 +223,7 @@ class CarlaSource:
             for name, mounted in agent.rig.cameras.items()
         }
         within = _within_range(state, agent.rig, world_from_agent, mounts)
-        annotations, instances = annotate(state, agent.number, within, sweeps, sights)
+        annotations, instances = annotate_bodies(state, agent.number, within, sweeps, sights)
         return Frame(
             scene=scene,
             index=spin,
@@ -234,7 +239,7 @@ class CarlaSource:
                 for name, sight in sights.items()
             },
             gnss={
-                name: _fix(read_position(take(name)), np.add(*draw_fix_errors(mounted.settings, time_s, *errors(name))))
+                name: _fix(read_fix(take(name)), np.add(*draw_fix_errors(mounted.settings, time_s, *errors(name))))
                 for name, mounted in agent.rig.gnss.items()
             },
             imu={
@@ -277,7 +282,7 @@ def _find_town(name: str, beside: Path | None) -> Town | None:
     return load_town(name, beside) if name in PACKAGED or os.path.isdir(folder) else None  # noqa: PTH112 - a long name
 
 
-def _find_body(bodies: Sequence[Body], number: int) -> Body:
+def _find_body(bodies: Sequence[TrackedBody], number: int) -> TrackedBody:
     return next(body for body in bodies if body.number == number)
 
 

@@ -22,7 +22,7 @@ THINNEST_M = 0.05  # side of any box
 
 
 @dataclass(frozen=True)
-class Body:
+class TrackedBody:
     """An actor of CARLA's, or a parked vehicle of its map, with its box."""
 
     number: int  # CARLA's; 0 of a parked vehicle, which is no actor
@@ -42,7 +42,7 @@ class Body:
 class State:
     """The N bodies that are in town at a tick."""
 
-    bodies: tuple[Body, ...]
+    bodies: tuple[TrackedBody, ...]
     boxes: Boxes  # (N,) world frame
     velocity: Array  # (N, 3) world [m/s]
     acceleration: Array  # (N, 3) world [m/s^2]
@@ -109,7 +109,7 @@ def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generato
     return found
 
 
-def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: MapFrame) -> list[Body]:
+def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: MapFrame) -> list[TrackedBody]:
     """Return the bodies of a world: all its vehicles and walkers, and the vehicles that are parked in its map.
 
     Those that others than us have spawned are called `other` and CARLA's number.
@@ -122,18 +122,18 @@ def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: M
         category = "pedestrian" if actor.type_id.startswith("walker.") else _category(actor)
         if category and (actor.type_id.startswith(("walker.", "vehicle."))):
             middle, size = _read_box(actor.bounding_box, MapFrame(), category)
-            bodies.append(Body(actor.id, track.get(actor.id, f"other{actor.id}"), category, size, middle))
+            bodies.append(TrackedBody(actor.id, track.get(actor.id, f"other{actor.id}"), category, size, middle))
     parked: list[tuple[tuple[float, ...], str, tuple[Array, tuple[float, float, float]]]] = []
     for category in ("car", "truck", "bus", "motorcycle", "bicycle"):
         things = session.world.get_environment_objects(getattr(carla.CityObjectLabel, category.capitalize()))
         for middle, size in (_read_box(thing.bounding_box, frame, category) for thing in things):
             parked.append((tuple(middle[:3, 3].tolist()), category, (middle, size)))
     parked.sort(key=lambda each: each[:2])  # their numbers may differ when the map is loaded anew
-    bodies += [Body(0, f"parked{i}", kind, size, middle) for i, (_, kind, (middle, size)) in enumerate(parked)]
+    bodies += [TrackedBody(0, f"parked{i}", kind, size, middle) for i, (_, kind, (middle, size)) in enumerate(parked)]
     return bodies
 
 
-def read_state(snapshot: "carla.WorldSnapshot", bodies: list[Body], frame: MapFrame) -> State:
+def read_state(snapshot: "carla.WorldSnapshot", bodies: list[TrackedBody], frame: MapFrame) -> State:
     """Return the bodies that a snapshot has, and the parked ones, with their boxes and motion."""
     present, middles, velocity, acceleration = [], [], [], []
     for body in bodies:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from flcav.carla.frames import MapFrame, mirror, mirror_spin, to_rotation
 from flcav.carla.server import wire
 from flcav.carla.server.blueprints import FLOAT, TRIGGER
-from flcav.carla.server.sensors import Clock
+from flcav.carla.server.sensors import SensorClock
 from flcav.carla.server.sight import Sensor
 from flcav.carla.server.wire import AckermannControl, BoundingBox, Transform, VehicleControl
 from flcav.geometry import Array, rotations
@@ -44,7 +44,7 @@ class Counters:
         return self.stream
 
 
-class Place(NamedTuple):
+class ActorPose(NamedTuple):
     """Where an actor is, and how it moves."""
 
     pose: Array  # (4, 4) world from body
@@ -54,7 +54,7 @@ class Place(NamedTuple):
 
 
 @dataclass
-class Actor:
+class ServedActor:
     """An actor, as clients know it."""
 
     id: int
@@ -69,7 +69,7 @@ class Actor:
     mount: Array | None = None  # (4, 4) parent from actor, of one that is attached
     stream: int = 0  # of a sensor
     sensor: Sensor | None = None
-    clock: Clock | None = None
+    clock: SensorClock | None = None
     light: int | None = None  # row of its approach, of a traffic light
     sign: str = ""  # its id in the map, of a traffic sign
     box: BoundingBox | None = None  # of a traffic light or sign
@@ -105,10 +105,10 @@ class Actor:
         middle = (0.0, 0.0, height / 2 - self.lift)
         return BoundingBox(middle, (length / 2, width / 2, height / 2), actor_id=self.id)
 
-    def record(self, port: int) -> wire.Actor:
+    def record(self, port: int) -> wire.ActorRecord:
         """Return it as clients get it; `port` is that of the streams."""
         token = wire.pack_token(self.stream, port) if self.stream else b""
-        return wire.Actor(self.id, self.parent, self.description, self.bounding_box(), self.tags(), token)
+        return wire.ActorRecord(self.id, self.parent, self.description, self.bounding_box(), self.tags(), token)
 
     def tags(self) -> bytes:
         """Return CARLA's semantic tags."""
@@ -121,7 +121,7 @@ class Actor:
         names = {"van": "car", "prop": "static"}
         return bytes([SEMANTICS[names.get(self.category, self.category)]])
 
-    def take(self, place: Place) -> None:
+    def take(self, place: ActorPose) -> None:
         """Take a place; the origin of a walker is its middle, `lift` above its feet."""
         self.pose, self.motion = place.pose, place.motion
         raised = self.lift * self.pose[:3, 2]
@@ -130,7 +130,7 @@ class Actor:
         self.transform = Transform((x + dx, y + dy, z + dz), place.rotation)
 
 
-def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
+def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[ActorPose]:
     """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
     trace = snapshot.trace
     tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
@@ -146,7 +146,7 @@ def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[Place]:
         mirror(trace.acceleration[0, :count]),
     )
     rows = zip(*((map(tuple, column.tolist())) for column in columns))
-    return [Place(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
+    return [ActorPose(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
 
 
 PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
@@ -162,7 +162,7 @@ def choose_gear(control: VehicleControl, speed_mps: float) -> int:
     return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
 
 
-def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
+def find_grip(box: ServedActor, point: NDArray[np.float64]) -> float | None:
     """Return the share of a dry road's friction in a box of friction; None where `point` (3,) is not in the box."""
     told = {each.id: float(each.value) for each in box.description.attributes if each.type == FLOAT}
     half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]
@@ -170,7 +170,7 @@ def find_grip(box: Actor, point: NDArray[np.float64]) -> float | None:
     return min(told["friction"], 1.0) if inside.all() else None
 
 
-def list_grips(actors: Collection[Actor], bodies: Iterable[Body]) -> list[Grip]:
+def list_grips(actors: Collection[ServedActor], bodies: Iterable[Body]) -> list[Grip]:
     """Return how the tyres of vehicles hold, by the last box of friction that each is in, where that has changed."""
     known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
     boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []
@@ -209,7 +209,7 @@ GEARS = [[4.0, 0.5, 0.65], [2.0, 0.5, 0.65]]  # ratio, shares of the speed at wh
 STEERING = [[0.0, 1.0], [20.0, 0.9], [120.0, 0.7]]  # share of the angle over the speed [km/h]
 
 
-def describe_physics(vehicle: Actor, world: LiveWorld) -> list[Any]:
+def describe_physics(vehicle: ServedActor, world: LiveWorld) -> list[Any]:
     """Return a vehicle's physics: those of its size, and CARLA's defaults for what plays no part here."""
     made = blueprint(vehicle.category, 0, vehicle.size)
     steer = float(np.degrees(made.steer_limit_rad))
@@ -227,7 +227,7 @@ def describe_physics(vehicle: Actor, world: LiveWorld) -> list[Any]:
     return [*engine, *gearbox, made.mass_kg, 0.3, [0.45, 0.0, -0.3], STEERING, wheels, True]
 
 
-def describe_telemetry(vehicle: Actor, speed_mps: float) -> list[Any]:
+def describe_telemetry(vehicle: ServedActor, speed_mps: float) -> list[Any]:
     """Return a vehicle's telemetry."""
     control = vehicle.control
     wheel = [3.5] + [0.0] * 10

@@ -1,7 +1,7 @@
 """The remote procedure calls of CARLA 0.9.16's clients.
 
 A method of `Calls` is the call of its name: its annotations are the types on the wire, and what it returns is the value
-of the reply. `Refused` is the reply's error.
+of the reply. `CallRefused` is the reply's error.
 """
 
 from collections.abc import Callable
@@ -13,11 +13,11 @@ import numpy as np
 
 from flcav.carla.frames import mirror, mirror_spin, to_vector
 from flcav.carla.server import wire
-from flcav.carla.server.actors import NOTHING, Actor, Counters, describe_physics, describe_telemetry
-from flcav.carla.server.blueprints import Quality, Refused, list_blueprints
+from flcav.carla.server.actors import NOTHING, Counters, ServedActor, describe_physics, describe_telemetry
+from flcav.carla.server.blueprints import CallRefused, Quality, list_blueprints
 from flcav.carla.server.episode import Episode
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.scenery import find_boxes, find_objects, project
+from flcav.carla.server.scenery import find_boxes, list_objects, project_ray
 from flcav.carla.server.wire import BoundingBox, Transform, Vector
 from flcav.config import InputError, shorten
 from flcav.world.commands import FreezeLights
@@ -39,7 +39,7 @@ class Calls:
         self._quality = quality
         self._counters = Counters()
         self._managers: dict[int, tuple[str, int]] = {}  # Traffic Managers of clients, by port
-        self.settings = wire.Settings()
+        self.settings = wire.EpisodeSettings()
         self.ticks = 0  # cues that are not yet served
         self.expected: set[int] = set()  # streams that a client is about to listen to
         self.episode = self._start(name)
@@ -79,7 +79,7 @@ class Calls:
         """Return the token of a stream."""
         streams = {actor.stream for actor in self.episode.actors.values()} | {self.episode.stream}
         if stream not in streams:
-            raise Refused(f"no sensor sends on stream {shorten(str(stream))}")
+            raise CallRefused(f"no sensor sends on stream {shorten(str(stream))}")
         self.expected.add(stream)
         return [wire.pack_token(stream, self._port + 1)]
 
@@ -98,7 +98,7 @@ class Calls:
     def request_file(self, name: str) -> bytes:
         """Return such a file."""
         if name != self._mesh_name():
-            raise Refused(f"no file {shorten(name)} on this server")
+            raise CallRefused(f"no file {shorten(name)} on this server")
         return self.episode.served.mesh
 
     def _mesh_name(self) -> str:
@@ -120,18 +120,18 @@ class Calls:
         try:
             episode = self._start(wanted)
         except InputError as error:
-            raise Refused(str(error)) from None
+            raise CallRefused(str(error)) from None
         self.episode.close()
         self.episode, self.ticks = episode, 0
         if reset:
-            self.settings = wire.Settings()
+            self.settings = wire.EpisodeSettings()
 
     def copy_opendrive_to_file(self, text: str, parameters: wire.Packed) -> None:
         """Take the text of a map that is to be loaded next."""
         try:
             self.maps.receive(text)
         except InputError as error:
-            raise Refused(f"this OpenDRIVE map cannot be driven: {error}") from None
+            raise CallRefused(f"this OpenDRIVE map cannot be driven: {error}") from None
 
     def load_map_layer(self, layers: int) -> None:
         """Show layers of the map: all always show."""
@@ -143,11 +143,11 @@ class Calls:
         """Return the settings."""
         return self.settings.packed()
 
-    def set_episode_settings(self, settings: wire.Settings) -> int:
+    def set_episode_settings(self, settings: wire.EpisodeSettings) -> int:
         """Change the settings; return the frame."""
         low, high = DT_RANGE_S
         if settings.fixed_dt_s is not None and settings.fixed_dt_s and not low <= settings.fixed_dt_s <= high:
-            raise Refused(f"fixed_delta_seconds = {settings.fixed_dt_s:g}: must be within {low} and {high}")
+            raise CallRefused(f"fixed_delta_seconds = {settings.fixed_dt_s:g}: must be within {low} and {high}")
         self.settings = settings._replace(fixed_dt_s=settings.fixed_dt_s or None)
         return self._counters.frame
 
@@ -171,7 +171,7 @@ class Calls:
         known = self.episode.actors
         return [self._record(known[number]) for number in numbers if number in known]
 
-    def _record(self, actor: Actor) -> wire.Actor:
+    def _record(self, actor: ServedActor) -> wire.ActorRecord:
         return actor.record(self._port + 1)
 
     def spawn_actor(self, description: wire.Description, transform: Transform) -> wire.Packed:
@@ -262,11 +262,11 @@ class Calls:
         x, y, z = torque
         self.add_actor_angular_impulse(actor, (x * self.dt_s, y * self.dt_s, z * self.dt_s))
 
-    def _turn(self, body: Actor, yaw_rate: float) -> None:
+    def _turn(self, body: ServedActor, yaw_rate: float) -> None:
         velocity, _ = self.episode.motion(body)
         self.episode.push(body, velocity, yaw_rate)
 
-    def _mass(self, body: Actor) -> float:
+    def _mass(self, body: ServedActor) -> float:
         return self.episode.world.bodies.find(body.name).blueprint.mass_kg
 
     def set_actor_simulate_physics(self, actor: int, on: bool) -> None:
@@ -280,7 +280,7 @@ class Calls:
     def set_actor_collisions(self, actor: int, on: bool) -> None:
         """Switch collisions on; off is not served, but for walkers, for whom their AI asks: they go on colliding."""
         if not on and self.episode.find(actor).kind != "walker":
-            raise Refused("set_collisions(False) is not served: actors always collide")
+            raise CallRefused("set_collisions(False) is not served: actors always collide")
 
     def set_actor_dead(self, actor: int) -> None:
         """Let an actor stop for good."""
@@ -323,7 +323,7 @@ class Calls:
 
     def apply_ackermann_controller_settings(self, actor: int, settings: wire.Packed) -> None:
         """Set the gains of CARLA's Ackermann controller, which is not served."""
-        raise Refused("apply_ackermann_controller_settings is not served: the controller here has no gains")
+        raise CallRefused("apply_ackermann_controller_settings is not served: the controller here has no gains")
 
     def apply_control_to_walker(self, actor: int, control: wire.WalkerControl) -> None:
         """Set a walker's control."""
@@ -362,7 +362,7 @@ class Calls:
 
     def open_vehicle_door(self, actor: int, door: int) -> None:
         """Open a door, which vehicles here do not have."""
-        raise Refused("open_door is not served: vehicles here have no doors that open")
+        raise CallRefused("open_door is not served: vehicles here have no doors that open")
 
     def close_vehicle_door(self, actor: int, door: int) -> None:
         """Close a door."""
@@ -370,7 +370,7 @@ class Calls:
 
     def set_wheel_steer_direction(self, actor: int, wheel: int, angle_deg: float) -> None:
         """Turn a wheel for show, which is not served."""
-        raise Refused("set_wheel_steer_direction is not served: wheels follow the steering")
+        raise CallRefused("set_wheel_steer_direction is not served: wheels follow the steering")
 
     def get_wheel_steer_angle(self, actor: int, wheel: int) -> float:
         """Return the angle of a wheel [deg]."""
@@ -385,7 +385,7 @@ class Calls:
     def _light(self, actor: int) -> int:
         row = self.episode.find(actor).light
         if row is None:
-            raise Refused(f"actor {actor} is no traffic light")
+            raise CallRefused(f"actor {actor} is no traffic light")
         return row
 
     def set_traffic_light_state(self, actor: int, state: int) -> None:
@@ -468,7 +468,7 @@ class Calls:
 
     def set_imui_gravity(self, value: float) -> None:
         """Set the acceleration that an IMU measures at rest, which is not served."""
-        raise Refused("set_imui_sensor_gravity is not served: gravity is 9.81 m/s^2")
+        raise CallRefused("set_imui_sensor_gravity is not served: gravity is 9.81 m/s^2")
 
     def get_all_level_BBs(self, tag: int) -> wire.Packed:
         """Return the boxes of the town's things with a semantic tag."""
@@ -476,27 +476,27 @@ class Calls:
 
     def get_environment_objects(self, tag: int) -> wire.Packed:
         """Return the town's things with a semantic tag."""
-        return find_objects(self.episode, tag)
+        return list_objects(self.episode, tag)
 
     def enable_environment_objects(self, numbers: wire.Packed, on: bool) -> None:
         """Show things of the town; hiding them is not served."""
         if not on:
-            raise Refused("enable_environment_objects(False) is not served: the town's things stay")
+            raise CallRefused("enable_environment_objects(False) is not served: the town's things stay")
 
     def get_names_of_all_objects(self) -> wire.Packed:
         """Return the names of the town's things."""
-        return [row[3] for row in find_objects(self.episode, 0xFF)]
+        return [row[3] for row in list_objects(self.episode, 0xFF)]
 
     def project_point(self, location: Vector, direction: Vector, distance: float) -> wire.Packed:
         """Return where a ray meets the town, as an optional labelled point."""
-        found = project(self.episode, location, direction, distance)
+        found = project_ray(self.episode, location, direction, distance)
         return [True, found[0]] if found else [False, [NOTHING, 0]]
 
     def cast_ray(self, start: Vector, end: Vector) -> wire.Packed:
         """Return where a ray meets the town, as labelled points."""
         way = np.subtract(end, start)
         length = float(np.linalg.norm(way))
-        return project(self.episode, start, tuple(way.tolist()), length) if length else []
+        return project_ray(self.episode, start, tuple(way.tolist()), length) if length else []
 
     def query_lights_state(self, client: wire.Packed) -> wire.Packed:
         """Return the lights of CARLA's light manager: none."""
@@ -526,15 +526,15 @@ class Calls:
 
     def set_bones_transform(self, actor: int, bones: wire.Packed) -> None:
         """Set a walker's bones, which is not served."""
-        raise Refused("set_bones is not served: walkers here have no bones")
+        raise CallRefused("set_bones is not served: walkers here have no bones")
 
     def blend_pose(self, actor: int, share: float) -> None:
         """Blend a walker's pose, which is not served."""
-        raise Refused("blend_pose is not served: walkers here have no bones")
+        raise CallRefused("blend_pose is not served: walkers here have no bones")
 
     def enable_sensor_for_ros(self, sensor: wire.Packed) -> None:
         """Publish a sensor on ROS 2, which is not served."""
-        raise Refused("enable_for_ros is not served")
+        raise CallRefused("enable_for_ros is not served")
 
     def disable_sensor_for_ros(self, sensor: wire.Packed) -> None:
         """Do not publish a sensor on ROS 2."""
@@ -566,10 +566,10 @@ class Calls:
             if name == "spawn":
                 return wire.succeed(self._spawn(*_read_spawn(list(fields))))
             if name == "console_command":
-                raise Refused("console commands are not served")
+                raise CallRefused("console commands are not served")
             invoke(self, name, tuple(fields))
             return wire.succeed(fields[0])
-        except (Refused, InputError, wire.WireError) as error:
+        except (CallRefused, InputError, wire.WireError) as error:
             return wire.fail(str(error))
 
     def _spawn(
@@ -592,16 +592,16 @@ def _read_spawn(fields: list[Any]) -> tuple[wire.Description, Transform, int | N
 
 @lru_cache(maxsize=256)
 def _signature(name: str) -> tuple[Callable[..., Any], tuple[Any, ...], int]:
-    """Return the method of a call, the types of its arguments, and how many it needs; `Refused` where there is none."""
+    """Return a call's method, the types of its arguments, and how many it needs; raises `CallRefused` for no call."""
     method = getattr(Calls, name, None)
     if name.startswith("_") or not callable(method) or "return" not in (hints := get_type_hints(method)):
-        raise Refused(f"{shorten(name)} is not served here")
+        raise CallRefused(f"{shorten(name)} is not served here")
     kinds = tuple(kind for argument, kind in hints.items() if argument != "return")
     return method, kinds, len(kinds) - len(method.__defaults__ or ())
 
 
 def invoke(calls: Calls, name: str, arguments: tuple[wire.Packed, ...]) -> wire.Packed:
-    """Carry out the call of a name; raises `Refused`, `InputError` or `WireError` where that cannot be."""
+    """Carry out the call of a name; raises `CallRefused`, `InputError` or `WireError` where that cannot be."""
     method, kinds, least = _signature(name)
     if not least <= len(arguments) <= len(kinds):
         raise wire.WireError(

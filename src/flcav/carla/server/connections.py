@@ -119,7 +119,7 @@ class Connections:
                 await self.await_readers()
                 unsent = sum(map(_unsent, self._active)) + len(payload)
             if writer in self._active:  # it was not dropped meanwhile
-                send(writer, payload)
+                send_payload(writer, payload)
                 self.note_active(writer)
 
     async def close(self) -> None:
@@ -134,7 +134,7 @@ def _unsent(writer: asyncio.StreamWriter) -> int:
     return writer.transport.get_write_buffer_size()
 
 
-def send(writer: asyncio.StreamWriter, payload: bytes) -> None:
+def send_payload(writer: asyncio.StreamWriter, payload: bytes) -> None:
     """Send a payload of a stream."""
     write(writer, struct.pack("<I", len(payload)) + payload)
 

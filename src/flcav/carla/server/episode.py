@@ -16,20 +16,28 @@ from flcav.carla.server import wire
 from flcav.carla.server.actors import (
     STANDING,
     WAITING,
-    Actor,
     Counters,
+    ServedActor,
     choose_gear,
     list_grips,
     list_places,
     steer_towards,
 )
-from flcav.carla.server.blueprints import TRUE, Blueprint, Quality, Refused, check, find_paint, list_blueprints
-from flcav.carla.server.lights import Lights, find_approaches, find_limits, list_signals, list_signs
+from flcav.carla.server.blueprints import (
+    TRUE,
+    CallRefused,
+    CarlaBlueprint,
+    Quality,
+    check_description,
+    list_blueprints,
+    read_paint,
+)
+from flcav.carla.server.lights import LightActors, find_approaches, find_limits, list_signals, list_signs
 from flcav.carla.server.maps import ServedMap
 from flcav.carla.server.recorder import Recorder
 from flcav.carla.server.sensors import (
     KINDS,
-    Clock,
+    SensorClock,
     describe_thing,
     find_collisions,
     find_obstacle,
@@ -37,7 +45,7 @@ from flcav.carla.server.sensors import (
     sense_instance,
     sense_rgb,
 )
-from flcav.carla.server.sight import Scenes, Sensor, Sight
+from flcav.carla.server.sight import Scenes, Sensor, TownSight
 from flcav.carla.server.weather import to_weather
 from flcav.carla.server.wire import Transform
 from flcav.geometry import Array
@@ -95,11 +103,11 @@ class Episode:
         self.world = LiveWorld(served.town, Settings(seed=seed, traffic=traffic, leans=True, remembers=False))
         self.weather = wire.WeatherParameters(cloudiness=10.0, sun_azimuth_angle=160.0, sun_altitude_angle=45.0)
         signals = list_signals(served)
-        self.lights, self.signs = Lights(find_approaches(served, signals)), find_limits(signals)
-        self.actors: dict[int, Actor] = {}
+        self.lights, self.signs = LightActors(find_approaches(served, signals)), find_limits(signals)
+        self.actors: dict[int, ServedActor] = {}
         self.tick, self.time_s = 0, 0.0
         self._begun_s = time.monotonic()
-        self._bodies: dict[str, Actor] = {}  # by name in the live world
+        self._bodies: dict[str, ServedActor] = {}  # by name in the live world
         self._scenes = Scenes(served.town)
         self.recorder = Recorder()
         self._spawned = 0
@@ -153,18 +161,18 @@ class Episode:
 
     # ---- actors
 
-    def find(self, number: int, *kinds: str) -> Actor:
-        """Return an actor; raises `Refused` where there is none of this number, or where it is of another kind."""
+    def find(self, number: int, *kinds: str) -> ServedActor:
+        """Return an actor; raises `CallRefused` where there is none of this number, or where it is of another kind."""
         actor = self.actors.get(number)
         if actor is None:
-            raise Refused(f"actor {number} not found")
+            raise CallRefused(f"actor {number} not found")
         if kinds and actor.kind not in kinds:
-            raise Refused(f"actor {number} is no {' or '.join(kinds)}, but a {actor.description.id}")
+            raise CallRefused(f"actor {number} is no {' or '.join(kinds)}, but a {actor.description.id}")
         return actor
 
-    def spawn(self, description: wire.Description, transform: Transform, parent: int | None = None) -> Actor:
-        """Return a new actor, attached to a parent where one is given; raises `Refused` where that cannot be."""
-        blueprint, description = check(description, self._quality)
+    def spawn(self, description: wire.Description, transform: Transform, parent: int | None = None) -> ServedActor:
+        """Return a new actor, attached to a parent where one is given; raises `CallRefused` where that cannot be."""
+        blueprint, description = check_description(description, self._quality)
         carrier = self.find(parent) if parent else None
         if carrier is not None:
             pose = carrier.pose @ from_mount(*transform)
@@ -173,7 +181,7 @@ class Episode:
         if blueprint.category:
             return self._spawn_body(blueprint, description, pose, parent or 0)
         if blueprint.kind == "controller" and (carrier is None or carrier.kind != "walker"):
-            raise Refused(f"{description.id} needs a walker as its parent")
+            raise CallRefused(f"{description.id} needs a walker as its parent")
         actor = self._add(description, pose)
         if carrier is None:
             actor.transform = transform
@@ -183,18 +191,20 @@ class Episode:
             values = {each.id: each.value for each in description.attributes}
             name = carrier.name if carrier is not None else ""
             actor.sensor = Sensor(description.id, values, self._spawned, pose, name)
-            actor.clock = Clock(float(values.get("sensor_tick", 0.0)))
+            actor.clock = SensorClock(float(values.get("sensor_tick", 0.0)))
             actor.stream = self.counters.next_stream()
         return actor
 
-    def _add(self, description: wire.Description, pose: Array) -> Actor:
+    def _add(self, description: wire.Description, pose: Array) -> ServedActor:
         self._spawned += 1
         transform = Transform(*self.served.frame.to_transform(pose))
-        actor = Actor(self.counters.next_actor(), description, transform, pose)
+        actor = ServedActor(self.counters.next_actor(), description, transform, pose)
         self.actors[actor.id] = actor
         return actor
 
-    def _spawn_body(self, blueprint: Blueprint, description: wire.Description, pose: Array, parent: int) -> Actor:
+    def _spawn_body(
+        self, blueprint: CarlaBlueprint, description: wire.Description, pose: Array, parent: int
+    ) -> ServedActor:
         x, y, z = pose[:3, 3].tolist()
         lift = blueprint.size[2] / 2 if blueprint.category == "pedestrian" else 0.0
         name = f"c{self._spawned + 1}"
@@ -203,10 +213,10 @@ class Episode:
         try:
             self.world.apply(command)
         except Obstructed:
-            raise Refused("Spawn failed because of collision at spawn position") from None
+            raise CallRefused("Spawn failed because of collision at spawn position") from None
         actor = self._add(description, pose)
         actor.name, actor.category, actor.size = name, blueprint.category, blueprint.size
-        actor.parent, actor.paint = parent, find_paint(description)
+        actor.parent, actor.paint = parent, read_paint(description)
         actor.sticky = all(each.id != "sticky_control" or each.value.lower() in TRUE for each in description.attributes)
         self._bodies[name] = actor
         snapshot = self.world.snapshot
@@ -214,10 +224,10 @@ class Episode:
         actor.take(list_places(snapshot, self.served.frame, row + 1)[row])
         return actor
 
-    def destroy(self, actor: Actor) -> None:
+    def destroy(self, actor: ServedActor) -> None:
         """Remove an actor; sensors that it carries stay where they are."""
         if actor is self.spectator or actor.kind == "traffic":
-            raise Refused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
+            raise CallRefused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
         del self.actors[actor.id]
         if actor.name:
             del self._bodies[actor.name]
@@ -226,17 +236,17 @@ class Episode:
             if child.parent == actor.id:
                 child.parent, child.mount = 0, None
 
-    def is_own(self, actor: Actor) -> bool:
+    def is_own(self, actor: ServedActor) -> bool:
         """Return whether a client spawned the actor's body."""
         return actor.name.startswith("c")
 
-    def body(self, number: int, *kinds: str) -> Actor:
-        """Return an actor that has a body, which clients move from now on; raises `Refused` for others."""
+    def body(self, number: int, *kinds: str) -> ServedActor:
+        """Return an actor that has a body, which clients move from now on; raises `CallRefused` for others."""
         actor = self.find(number, *kinds)
         self._take_over(actor)
         return actor
 
-    def _take_over(self, actor: Actor) -> None:
+    def _take_over(self, actor: ServedActor) -> None:
         """Take an actor out of SUMO's traffic, if it is in it: it goes on as it moves, and clients drive it."""
         if not actor.name or self.is_own(actor):
             return
@@ -255,7 +265,7 @@ class Episode:
 
     # ---- motion
 
-    def place(self, actor: Actor, transform: Transform) -> None:
+    def place(self, actor: ServedActor, transform: Transform) -> None:
         """Move an actor to another pose."""
         self._take_over(actor)
         pose = self.served.frame.from_transform(*transform)
@@ -272,7 +282,7 @@ class Episode:
             pitch, yaw, roll = np.radians(transform.rotation).tolist()
             self.world.apply(commands.Place(actor.name, x, y, -yaw, z - actor.lift, -pitch, roll))
 
-    def drive(self, actor: Actor, control: wire.VehicleControl) -> None:
+    def drive(self, actor: ServedActor, control: wire.VehicleControl) -> None:
         """Set a vehicle's pedals and steering wheel."""
         actor.control, actor.told = control, True
         self.world.apply(
@@ -288,7 +298,7 @@ class Episode:
             )
         )
 
-    def walk(self, actor: Actor, control: wire.WalkerControl) -> None:
+    def walk(self, actor: ServedActor, control: wire.WalkerControl) -> None:
         """Set a walker's direction and speed; it walks by them also where its AI had switched its physics off."""
         if not actor.simulated:
             self.simulate(actor, physics=True)
@@ -298,22 +308,22 @@ class Episode:
         if control.speed > 0 and (x or y):
             self._turn(actor, float(np.arctan2(y, x)))
 
-    def _turn(self, actor: Actor, yaw: float) -> None:
+    def _turn(self, actor: ServedActor, yaw: float) -> None:
         x, y, z = actor.pose[:3, 3].tolist()
         self.world.apply(commands.Place(actor.name, x, y, yaw, z - actor.lift))
 
-    def motion(self, actor: Actor) -> tuple[Array, float]:
+    def motion(self, actor: ServedActor) -> tuple[Array, float]:
         """Return the velocity (3,) [m/s], in the town's frame, and the yaw rate [rad/s] that an actor has by now."""
         bodies = self.world.bodies
         row = bodies.row(actor.name)
         return bodies.velocity[row].copy(), float(bodies.yaw_rate[row])
 
-    def push(self, actor: Actor, velocity: Array, yaw_rate: float | None = None) -> None:
+    def push(self, actor: ServedActor, velocity: Array, yaw_rate: float | None = None) -> None:
         """Give an actor another velocity (3,) [m/s] in the town's frame."""
         x, y, z = velocity.tolist()
         self.world.apply(Push(actor.name, (x, y, z), yaw_rate))
 
-    def simulate(self, actor: Actor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
+    def simulate(self, actor: ServedActor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
         """Switch an actor's physics or weight on or off."""
         actor.simulated = actor.simulated if physics is None else physics
         actor.falling = actor.falling if gravity is None else gravity
@@ -349,12 +359,12 @@ class Episode:
                 actor.limit_kmh = limit
         self.recorder.add(snapshot)
 
-    def steering(self, actor: Actor) -> tuple[float, float]:
+    def steering(self, actor: ServedActor) -> tuple[float, float]:
         """Return the greatest steering angle [rad] and the wheelbase [m] of a vehicle."""
         made = self.world.bodies.find(actor.name).blueprint
         return made.steer_limit_rad, made.wheelbase_m
 
-    def speed(self, actor: Actor) -> float:
+    def speed(self, actor: ServedActor) -> float:
         """Return the speed of an actor along its heading [m/s]."""
         return float(mirror(np.array(actor.motion[0])) @ actor.pose[:3, 0])
 
@@ -379,7 +389,7 @@ class Episode:
                     actor.sensor.pose, actor.sensor.velocity = actor.pose, mirror(velocity)
                     actor.sensor.spin, actor.sensor.acceleration = mirror_spin(np.radians(spin)), mirror(acceleration)
 
-    def _meet(self, snapshot: Snapshot, row: int) -> Actor:
+    def _meet(self, snapshot: Snapshot, row: int) -> ServedActor:
         """Return the actor of one of SUMO's traffic, which has come into the town."""
         category = str(snapshot.trace.category[row])
         blueprint = list_blueprints()[TRAFFIC_OF[category]]
@@ -405,7 +415,7 @@ class Episode:
         ]
         return header + wire.pack_world(self.id, time.time(), dt_s, rows)
 
-    def _find_lights(self, vehicles: list[Actor]) -> list[int]:
+    def _find_lights(self, vehicles: list[ServedActor]) -> list[int]:
         """Return the rows of the lights at which vehicles stand; -1: none."""
         if not vehicles:
             return []
@@ -415,7 +425,7 @@ class Episode:
         yaw = np.arctan2(poses[:, 1, 0], poses[:, 0, 0])
         return self.lights.find_at(fronts, yaw).tolist()
 
-    def _union(self, actor: Actor, states: dict[int, int]) -> bytes:
+    def _union(self, actor: ServedActor, states: dict[int, int]) -> bytes:
         if actor.kind == "vehicle":
             row = states[actor.id]
             light = self.lights.state[row] if row >= 0 else 2
@@ -438,7 +448,7 @@ class Episode:
 
     def measure(self, dt_s: float, is_heard: Callable[[int], bool]) -> Iterator[Measurement]:
         """Yield what each sensor that is due and heard sends, in the order in which they were spawned."""
-        looks: dict[str, Callable[[], Sight]] = {}
+        looks: dict[str, Callable[[], TownSight]] = {}
         collisions = find_collisions(self.world.snapshot.collisions, self._describe)
         for actor in list(self.actors.values()):
             if (sensor := actor.sensor) is None or actor.clock is None or not is_heard(actor.stream):
@@ -462,21 +472,21 @@ class Episode:
             elif found := find_obstacle(look(), sensor, self._describe(sensor.carrier), self._describe):
                 yield Measurement(actor.stream, header, found)
 
-    def _describe(self, name: str) -> wire.Actor:
+    def _describe(self, name: str) -> wire.ActorRecord:
         """Return the record of an actor, or of a thing of the town, such as "building:3", by its name in the world."""
         if name in self._bodies:
             return self._bodies[name].record(self.port)
         return describe_thing("vehicle" if name.startswith(PARKED) else name.partition(":")[0])
 
-    def look(self, scene: str) -> Callable[[], Sight]:
+    def look(self, scene: str) -> Callable[[], TownSight]:
         """Return how to look at the town as it is now, once or more often, later too, with the scene of that name."""
         trace, weather, tick = self.world.snapshot.trace, to_weather(self.weather), self.tick
         numbers = [self._bodies[name].id if name in self._bodies else 0 for name in trace.actor.tolist()]
 
         @cache
-        def sight() -> Sight:
+        def sight() -> TownSight:
             at = self._follow_with(scene, trace)
-            return Sight(at, weather, self.served.frame, self.seed, tick, np.array(numbers, np.uint32))
+            return TownSight(at, weather, self.served.frame, self.seed, tick, np.array(numbers, np.uint32))
 
         return sight
 
@@ -489,5 +499,5 @@ class Episode:
         return self._scenes.follow(name, trace, paints)
 
 
-def _measure(sense: Callable[[Sight, Sensor], bytes], look: Callable[[], Sight], sensor: Sensor) -> bytes:
+def _measure(sense: Callable[[TownSight, Sensor], bytes], look: Callable[[], TownSight], sensor: Sensor) -> bytes:
     return sense(look(), sensor)

@@ -146,7 +146,7 @@ def _measure_off(head: Array, stop: Array, signal: MapSignal) -> float:
 
 
 @dataclass(frozen=True)
-class Limits:
+class SpeedLimits:
     """The N speed-limit signs of a map."""
 
     place: Array  # (N, 3) x, y [m], and the direction [rad] of those for whom the sign is
@@ -164,7 +164,7 @@ class Limits:
         return float(self.kmh[passed[along[passed].argmin()]]) if len(passed) else None
 
 
-def find_limits(signals: Sequence[MapSignal]) -> Limits:
+def find_limits(signals: Sequence[MapSignal]) -> SpeedLimits:
     """Return the speed-limit signs among a map's signals; one that is for both directions stands twice."""
     place, kmh = [np.zeros((0, 3))], []
     for _, row, at, _ in signals:
@@ -173,7 +173,7 @@ def find_limits(signals: Sequence[MapSignal]) -> Limits:
         turns = _list_turns(row)
         place += [at[None] + (0.0, 0.0, turn) for turn in turns]
         kmh += [3.6 * limit] * len(turns)
-    return Limits(np.concatenate(place), np.round(np.array(kmh, np.float64), 1))
+    return SpeedLimits(np.concatenate(place), np.round(np.array(kmh, np.float64), 1))
 
 
 def _list_turns(signal: ElementTree.Element) -> tuple[float, ...]:
@@ -220,7 +220,7 @@ def _project(lane: Lane, place: Array) -> Array:
 
 
 @dataclass
-class Lights:
+class LightActors:
     """The lights of a live world, as clients see and set them."""
 
     approaches: list[Approach]

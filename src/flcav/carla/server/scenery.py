@@ -23,7 +23,7 @@ def find_boxes(episode: "Episode", tag: int) -> list[BoundingBox]:
     return [box for number, box, _ in _list_things(episode) if tag in (number, ANY)]
 
 
-def find_objects(episode: "Episode", tag: int) -> list[list[Any]]:
+def list_objects(episode: "Episode", tag: int) -> list[list[Any]]:
     """Return the town's things with a tag: transform, box, number, name and tag."""
     return [
         [[box.location, box.rotation], box, row, name, number]
@@ -63,7 +63,7 @@ def _list_things(episode: "Episode") -> list[tuple[int, BoundingBox, str]]:
     return found
 
 
-def project(episode: "Episode", location: Vector, direction: Vector, distance: float) -> list[list[Any]]:
+def project_ray(episode: "Episode", location: Vector, direction: Vector, distance: float) -> list[list[Any]]:
     """Return location and tag of the first thing that a ray from `location` meets within `distance` [m], if any."""
     way = mirror(np.array(direction))
     length = float(np.linalg.norm(way))

@@ -9,19 +9,19 @@ from PIL import Image
 from PIL.Image import Resampling
 
 from flcav.carla.frames import mirror, mirror_spin
-from flcav.carla.server.sight import THREADS, Sensor, Sight, lens_of
+from flcav.carla.server.sight import THREADS, Sensor, TownSight, lens_of
 from flcav.carla.server.wire import (
     SEMANTIC_POINT,
-    Actor,
+    ActorRecord,
     BoundingBox,
     Description,
-    Obstacle,
+    ObstacleEvent,
     Stream,
     pack_image,
+    pack_lidar,
     pack_record,
-    pack_sweep,
 )
-from flcav.carla.server.wire import Collision as CollisionRecord
+from flcav.carla.server.wire import CollisionEvent as CollisionRecord
 from flcav.geometry import inverse, unit_vectors, yaw_of
 from flcav.machine.compiled import compiled
 from flcav.sensors.frame import SEMANTICS
@@ -35,7 +35,7 @@ FAR_M = 1000.0
 DEPTH_STEPS = 2**24 - 1
 
 
-def sense_rgb(sight: Sight, sensor: Sensor) -> bytes:
+def sense_rgb(sight: TownSight, sensor: Sensor) -> bytes:
     """Return a colour image."""
     rgb, lens = sight.photograph(sensor).rgb, lens_of(sensor)
     if rgb.shape[:2] != (lens.height, lens.width):  # of low quality
@@ -45,7 +45,7 @@ def sense_rgb(sight: Sight, sensor: Sensor) -> bytes:
     return _pack_picture(sensor, image)
 
 
-def sense_depth(sight: Sight, sensor: Sensor) -> bytes:
+def sense_depth(sight: TownSight, sensor: Sensor) -> bytes:
     """Return a depth image."""
     lens = lens_of(sensor)
     rays = compute_pixel_rays(lens)
@@ -56,13 +56,13 @@ def sense_depth(sight: Sight, sensor: Sensor) -> bytes:
     return _pack_picture(sensor, image)
 
 
-def sense_semantic(sight: Sight, sensor: Sensor) -> bytes:
+def sense_semantic(sight: TownSight, sensor: Sensor) -> bytes:
     """Return an image of semantic tags."""
     tags, instance = sight.label(sensor)
     return _pack_picture(sensor, _draw_labels(tags, instance, np.zeros(len(sight.actors), np.uint32)))
 
 
-def sense_instance(sight: Sight, sensor: Sensor) -> bytes:
+def sense_instance(sight: TownSight, sensor: Sensor) -> bytes:
     """Return an image of semantic tags and actors."""
     return _pack_picture(sensor, _draw_labels(*sight.label(sensor), sight.actors))
 
@@ -107,7 +107,7 @@ def _write_labels(tags, instance, numbers, image):
 GRAVITY = np.array((0.0, 0.0, 9.81))  # CARLA's [m/s^2]
 
 
-def sense_gnss(sight: Sight, sensor: Sensor) -> bytes:
+def sense_gnss(sight: TownSight, sensor: Sensor) -> bytes:
     """Return latitude [deg], longitude [deg] and altitude [m].
 
     As `Map.transform_to_geolocation` of CARLA 0.9.16 does, it takes CARLA's y for north, though the map's is mirrored.
@@ -123,7 +123,7 @@ def sense_gnss(sight: Sight, sensor: Sensor) -> bytes:
     return pack_record((place + noise).tolist())
 
 
-def sense_imu(sight: Sight, sensor: Sensor) -> bytes:
+def sense_imu(sight: TownSight, sensor: Sensor) -> bytes:
     """Return specific force [m/s^2], angular velocity [rad/s] in the sensor's frame, and compass [rad] from north."""
     turn = sensor.pose[:3, :3].T
     rng = sight.draw(sensor)
@@ -141,7 +141,7 @@ def sense_imu(sight: Sight, sensor: Sensor) -> bytes:
 MOST_RAYS = 4_000_000  # of one sweep
 
 
-def sense_lidar(sight: Sight, sensor: Sensor) -> bytes:
+def sense_lidar(sight: TownSight, sensor: Sensor) -> bytes:
     """Return the sweep of a LiDAR: x, y, z [m] and intensity."""
     directions, channels = _fire(sensor)
     hits = sight.cast(sensor, directions, sensor.number_of("range"))
@@ -159,7 +159,7 @@ def sense_lidar(sight: Sight, sensor: Sensor) -> bytes:
     return _pack_returns(sensor, channels, rays, points.astype("<f4"))
 
 
-def sense_semantic_lidar(sight: Sight, sensor: Sensor) -> bytes:
+def sense_semantic_lidar(sight: TownSight, sensor: Sensor) -> bytes:
     """Return the sweep of a semantic LiDAR: x, y, z [m], cosine of incidence, actor and tag."""
     directions, channels = _fire(sensor)
     hits = sight.cast(sensor, directions, sensor.number_of("range"))
@@ -172,7 +172,7 @@ def sense_semantic_lidar(sight: Sight, sensor: Sensor) -> bytes:
     return _pack_returns(sensor, channels, rays, points)
 
 
-def sense_radar(sight: Sight, sensor: Sensor) -> bytes:
+def sense_radar(sight: TownSight, sensor: Sensor) -> bytes:
     """Return the detections of a radar: range rate [m/s], azimuth, altitude [rad] and depth [m]."""
     rng = sight.draw(sensor)
     count = min(max(1, round(sensor.number_of("points_per_second") * sensor.elapsed_s)), MOST_RAYS)
@@ -209,7 +209,7 @@ def _count_columns(sensor: Sensor, channels: int) -> int:
     return min(max(1, wanted), MOST_RAYS // channels)
 
 
-def _incidence(sight: Sight, sensor: Sensor, directions: NDArray[np.float32], met: Hits) -> NDArray[np.float32]:
+def _incidence(sight: TownSight, sensor: Sensor, directions: NDArray[np.float32], met: Hits) -> NDArray[np.float32]:
     """Return the cosine of the angle of incidence of each hit."""
     surfaces = sight.scene.surfaces
     normal = surfaces.normal[surfaces.first[met.instance] + met.face]
@@ -219,14 +219,14 @@ def _incidence(sight: Sight, sensor: Sensor, directions: NDArray[np.float32], me
 
 def _pack_returns(sensor: Sensor, channels: int, rays: NDArray[np.int64], points: NDArray) -> bytes:
     per_channel = np.bincount(rays // _count_columns(sensor, channels), minlength=channels)
-    return pack_sweep(float(np.radians(sensor.azimuth_deg)), per_channel, points)
+    return pack_lidar(float(np.radians(sensor.azimuth_deg)), per_channel, points)
 
 
 class Kind(NamedTuple):
     """How a kind of sensor measures."""
 
     stream: Stream
-    measure: Callable[[Sight, Sensor], bytes] | None  # None: it sends what happens, not what it sees
+    measure: Callable[[TownSight, Sensor], bytes] | None  # None: it sends what happens, not what it sees
     rays: bool = False  # it casts rays, which takes its time
     late: bool = False  # it draws an image, which takes longer
 
@@ -248,7 +248,7 @@ KINDS: dict[str, Kind] = {
 EARLY_S = 1e-6  # rounding of times
 
 
-class Clock:
+class SensorClock:
     """When a sensor measures: at its first tick, and then every `sensor_tick`, or every tick where that is 0."""
 
     def __init__(self, tick_s: float) -> None:
@@ -287,14 +287,14 @@ TAG_OF = {  # kind of a thing -> its semantic class
 }
 
 
-def describe_thing(kind: str) -> Actor:
+def describe_thing(kind: str) -> ActorRecord:
     """Return the record of a thing of the town, such as a building, by CARLA's name of its class."""
     kind = TAG_OF.get(kind, kind).replace("_", "")
     nowhere = BoundingBox((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    return Actor(0, 0, Description(0, f"static.{kind}", ()), nowhere, b"", b"")
+    return ActorRecord(0, 0, Description(0, f"static.{kind}", ()), nowhere, b"", b"")
 
 
-def find_collisions(collisions: Sequence[Collision], describe: Callable[[str], Actor]) -> dict[str, list[bytes]]:
+def find_collisions(collisions: Sequence[Collision], describe: Callable[[str], ActorRecord]) -> dict[str, list[bytes]]:
     """Return what collision sensors on each actor send, by its name; `describe` gives the record of a name."""
     found: dict[str, list[bytes]] = {}
     for each in collisions:
@@ -306,7 +306,7 @@ def find_collisions(collisions: Sequence[Collision], describe: Callable[[str], A
     return found
 
 
-def _sweep_actors(sight: Sight, sensor: Sensor) -> tuple[float, str] | None:
+def _sweep_actors(sight: TownSight, sensor: Sensor) -> tuple[float, str] | None:
     """Return distance [m] and name of the first vehicle or walker whose box, grown by the radius, the ray ahead meets.
 
     Parked vehicles, props and the town neither count nor hide what is behind them.
@@ -328,11 +328,13 @@ def _sweep_actors(sight: Sight, sensor: Sensor) -> tuple[float, str] | None:
     return best
 
 
-def find_obstacle(sight: Sight, sensor: Sensor, carrier: Actor, describe: Callable[[str], Actor]) -> bytes | None:
+def find_obstacle(
+    sight: TownSight, sensor: Sensor, carrier: ActorRecord, describe: Callable[[str], ActorRecord]
+) -> bytes | None:
     """Return what an obstacle sensor on `carrier` sends: what is nearest ahead of it within its radius, or None."""
     if sensor.attributes["only_dynamics"].lower() in ("true", "1"):
         met = _sweep_actors(sight, sensor)
-        return None if met is None else pack_record(Obstacle(carrier, describe(met[1]), met[0]))
+        return None if met is None else pack_record(ObstacleEvent(carrier, describe(met[1]), met[0]))
     trace = sight.scene.trace
     rows = np.flatnonzero(trace.actor == sensor.carrier)
     hidden = int(rows[0]) if len(rows) else None
@@ -354,4 +356,4 @@ def find_obstacle(sight: Sight, sensor: Sensor, carrier: Actor, describe: Callab
             best = distance, f"{TAG_NAMES.get(tag, 'unknown')}:"
         else:
             best = distance, str(trace.actor[instance - 1])
-    return None if best is None else pack_record(Obstacle(carrier, describe(best[1]), best[0]))
+    return None if best is None else pack_record(ObstacleEvent(carrier, describe(best[1]), best[0]))

@@ -23,9 +23,9 @@ from collections.abc import Callable
 from contextlib import suppress
 
 from flcav.carla.server import wire
-from flcav.carla.server.blueprints import Refused
+from flcav.carla.server.blueprints import CallRefused
 from flcav.carla.server.calls import Calls, invoke
-from flcav.carla.server.connections import Connections, Unpacker, send, write
+from flcav.carla.server.connections import Connections, Unpacker, send_payload, write
 from flcav.carla.server.episode import Episode, Measurement
 from flcav.config import InputError
 
@@ -52,7 +52,7 @@ CHUNK = 1 << 16
 log = logging.getLogger("flcav.carla")
 
 
-class Server:
+class CarlaServer:
     """Serves the clients of one `Calls`."""
 
     def __init__(self, calls: Calls) -> None:
@@ -74,7 +74,7 @@ class Server:
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
         """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
         connected = self._serve_calls, self._serve_stream
-        servers = [await asyncio.start_server(serve, sock=door) for serve, door in zip(connected, doors, strict=True)]
+        servers = [await asyncio.start_server(each, sock=door) for each, door in zip(connected, doors, strict=True)]
         await asyncio.wait({self._prepare()}, timeout=PREPARING_S)
         ready()
         try:
@@ -280,7 +280,7 @@ class Server:
         log.debug("%s %.200s", call.method, call.arguments)
         try:
             value = invoke(self._calls, call.method, call.arguments)
-        except (Refused, InputError, wire.WireError) as error:
+        except (CallRefused, InputError, wire.WireError) as error:
             self._links.tell(call.method, str(error))
             return [] if call.method == "apply_batch" else wire.fail(str(error))
         except Exception as error:  # a server that fails one call serves the others
@@ -307,7 +307,7 @@ class Server:
                 self._worlds.add(stream)
                 for loader in list(self._held):
                     self._release(loader)
-                send(writer, self._state or self._calls.episode.describe_world(0.0))
+                send_payload(writer, self._state or self._calls.episode.describe_world(0.0))
             while await reader.read(1024):
                 pass
         except (asyncio.IncompleteReadError, ConnectionError, TimeoutError):
@@ -336,7 +336,7 @@ def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
     return doors[0], doors[1]
 
 
-def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
+def serve_clients(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
     """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`.
 
     Raises `KeyboardInterrupt` once it has ended after Ctrl-C.
@@ -363,7 +363,7 @@ def serve(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Calla
 
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, end)
-        await Server(calls).run(doors, ready)
+        await CarlaServer(calls).run(doors, ready)
 
     with suppress(asyncio.CancelledError):
         asyncio.run(run())

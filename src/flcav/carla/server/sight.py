@@ -59,7 +59,7 @@ def _drawn_lens(sensor: Sensor) -> Lens:
 
 
 @dataclass
-class Sight:
+class TownSight:
     """The town at one tick, as all its sensors see it."""
 
     scene: Scene  # at this tick

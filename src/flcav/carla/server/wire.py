@@ -110,7 +110,7 @@ class Definition(NamedTuple):
     attributes: tuple[Variation, ...]
 
 
-class Actor(NamedTuple):
+class ActorRecord(NamedTuple):
     """An actor."""
 
     id: int
@@ -121,7 +121,7 @@ class Actor(NamedTuple):
     token: bytes  # of a sensor's stream; empty without one
 
 
-class Settings(NamedTuple):
+class EpisodeSettings(NamedTuple):
     """The settings of an episode."""
 
     synchronous: bool = False
@@ -191,19 +191,19 @@ class WalkerControl(NamedTuple):
     jump: bool = False
 
 
-class Collision(NamedTuple):
+class CollisionEvent(NamedTuple):
     """What a collision sensor sends."""
 
-    actor: Actor
-    other: Actor
+    actor: ActorRecord
+    other: ActorRecord
     impulse: Vector  # [N s]
 
 
-class Obstacle(NamedTuple):
+class ObstacleEvent(NamedTuple):
     """What an obstacle sensor sends."""
 
-    actor: Actor
-    other: Actor
+    actor: ActorRecord
+    other: ActorRecord
     distance: float  # [m]
 
 
@@ -245,7 +245,7 @@ class Call(NamedTuple):
     arguments: tuple[Any, ...]
 
 
-def pack(value: Any) -> bytes:
+def pack_value(value: Any) -> bytes:
     """Return a value as MessagePack."""
     packed = msgpack.packb(value, unicode_errors="surrogateescape")
     assert packed is not None, "it returns bytes; its types say that it may not"
@@ -277,7 +277,7 @@ def fail(message: str) -> list[Any]:
 
 def pack_reply(number: int, response: Any) -> bytes:
     """Return the bytes of a reply."""
-    return pack([1, number, None, response])
+    return pack_value([1, number, None, response])
 
 
 def read(kind: Any, value: Any) -> Any:
@@ -403,11 +403,11 @@ def pack_image(width: int, height: int, fov_deg: float, bgra: NDArray[np.uint8])
     return struct.pack("<IIf", width, height, fov_deg) + bgra.tobytes()
 
 
-def pack_sweep(angle_rad: float, per_channel: NDArray[np.integer], points: NDArray[Any]) -> bytes:
+def pack_lidar(angle_rad: float, per_channel: NDArray[np.integer], points: NDArray[Any]) -> bytes:
     """Return the body of a sweep: points channel after channel, as rows of float32 or of `SEMANTIC_POINT`."""
     return struct.pack("<fI", angle_rad, len(per_channel)) + per_channel.astype("<u4").tobytes() + points.tobytes()
 
 
 def pack_record(record: Any) -> bytes:
     """Return the body of what is sent as MessagePack: GNSS, IMU, collisions and obstacles."""
-    return pack(record)
+    return pack_value(record)

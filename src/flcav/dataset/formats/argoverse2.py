@@ -29,11 +29,11 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     difference_tracks,
+    link_pictures,
     name_folders,
     name_place,
     name_some,
     pinhole,
-    read_pictures,
     view_boxes,
 )
 from flcav.dataset.frame_checks import LONGEST_SPIN_S
@@ -81,7 +81,7 @@ class Log(NamedTuple):
     dark: tuple[str, ...]  # sweeps without a picture of a camera that has others
 
 
-class Labels(NamedTuple):
+class LogLabels(NamedTuple):
     """The A annotations of a log."""
 
     sweep: NDArray[np.int64]  # (A,) time [ns]
@@ -169,7 +169,7 @@ class Argoverse2Source(LogSource):
                     view_boxes(boxes, pictures),
                     velocity=labels.velocity[own] if labels else None,
                 ),
-                images=read_pictures(files),
+                images=link_pictures(files),
                 agent_at_trigger={name: city_from_then @ EGO_FROM_AGENT for name, city_from_then in then.items()},
                 files=files,
             )
@@ -278,7 +278,7 @@ def _read_lenses(folder: Path) -> dict[str, Lens]:
     return lenses
 
 
-def _read_labels(folder: Path, poses: Poses) -> Labels:
+def _read_labels(folder: Path, poses: Poses) -> LogLabels:
     """Return the annotations of a log, of its sweeps that are not here, too: velocities are differences of them."""
     path, sides = folder / "annotations.feather", ("length_m", "width_m", "height_m")
     table = _read_feather(path, ("timestamp_ns", "track_uuid", "category", *sides, *PLACED))
@@ -293,7 +293,7 @@ def _read_labels(folder: Path, poses: Poses) -> Labels:
         rotation[own] = city_from_ego[:3, :3] @ in_ego[own, :3, :3]
     label = np.array([CATEGORIES.get(name, name) for name in table["category"].to_pylist()], np.str_)
     boxes = turned_boxes(center, size, rotation, label)
-    return Labels(sweep, track, boxes, difference_tracks(track, (sweep - sweep[:1]) / 1e9, center))
+    return LogLabels(sweep, track, boxes, difference_tracks(track, (sweep - sweep[:1]) / 1e9, center))
 
 
 def _transforms(table: pa.Table, path: Path) -> Array:

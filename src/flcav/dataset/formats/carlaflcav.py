@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, check_is_file
-from flcav.dataset.formats.carlaflcav_labels import Labels, read_labels
+from flcav.dataset.formats.carlaflcav_labels import ActorLabels, read_labels
 from flcav.dataset.formats.reading import (
     FARTHEST,
     AgentNames,
@@ -55,7 +55,7 @@ RADAR = 7  # numbers of a detection
 NUMBER = re.compile(r"\d+$")  # of a folder, in the order of the recorder's settings
 
 
-class Sensor(NamedTuple):
+class RecordedSensor(NamedTuple):
     """A LiDAR, or a camera with its lens."""
 
     files: Mapping[int, Path]  # by tick
@@ -63,12 +63,12 @@ class Sensor(NamedTuple):
     lens: Lens | None
 
 
-class Rig(NamedTuple):
+class RecordedAgent(NamedTuple):
     """An agent of a recording, the ticks that it has a frame of, and its sensors."""
 
     agent: str
     ticks: Collection[int]
-    sensors: Mapping[str, Sensor]
+    sensors: Mapping[str, RecordedSensor]
     calibration: Calibration
     anchor: str  # sensor that the agent's poses follow from
     vehicle: Poses  # empty of a post
@@ -118,7 +118,7 @@ class CarlaFlcavSource(LogSource):
                     yield frame
         self._note()
 
-    def _open(self, scene: str, names: AgentNames) -> list[Rig]:
+    def _open(self, scene: str, names: AgentNames) -> list[RecordedAgent]:
         """Return the agents of a recording that have frames, its vehicles and posts numbered in order."""
         folders = [path for path in self.folders[scene].iterdir() if path.is_dir() and not path.match(WORLD)]
         number, rigs = Counter[str](), []
@@ -140,7 +140,7 @@ class CarlaFlcavSource(LogSource):
                 rigs.append(rig)
         return rigs
 
-    def _read_sensor(self, scene: str, folder: Path) -> Sensor | None:
+    def _read_sensor(self, scene: str, folder: Path) -> RecordedSensor | None:
         """Return the sensor of a folder; None of one that a dataset has no place for, which is counted."""
         pictures, clouds = (_list_files(folder, ending) for ending in ("png", "npy"))
         if not pictures and not clouds:
@@ -151,7 +151,7 @@ class CarlaFlcavSource(LogSource):
             self._counts[kind] += 1
             return None
         lens = _read_lens(folder / CAMERA) if pictures else None
-        return Sensor(pictures or clouds, self._read_poses(scene, folder / POSES), lens)
+        return RecordedSensor(pictures or clouds, self._read_poses(scene, folder / POSES), lens)
 
     def _read_poses(self, scene: str, path: Path) -> Poses:
         """Return the (4, 4) poses in a table, by tick; keeps the ticks' times."""
@@ -170,7 +170,7 @@ class CarlaFlcavSource(LogSource):
         placed[:, :3, 3] = np.stack([table[axis] for axis in "xyz"], axis=1)
         return dict(zip(ticks, placed))
 
-    def _read_labels(self, scene: str, tick: int) -> Labels:
+    def _read_labels(self, scene: str, tick: int) -> ActorLabels:
         labels = read_labels(self._labels[scene][tick])
         self._counts["flat"] += int((labels.size <= 0).any(axis=1).sum())
         return labels
@@ -195,8 +195,8 @@ IMPORT = ImportFormat(CarlaFlcavSource, (WORLD, f"*/{WORLD}"))
 
 
 def _assemble(
-    agent: str, vehicle: Poses, sensors: Mapping[str, Sensor], labelled: Collection[int], names: AgentNames
-) -> Rig | None:
+    agent: str, vehicle: Poses, sensors: Mapping[str, RecordedSensor], labelled: Collection[int], names: AgentNames
+) -> RecordedAgent | None:
     """Return an agent with its mounts by its first frame; None where it has none.
 
     A frame has labels, the vehicle's pose, and points of all LiDARs, or a picture of the first camera where there are
@@ -226,7 +226,7 @@ def _assemble(
     )
     own = (*((name, mount.tobytes()) for name, mount in mounts.items()), *cameras.items())
     kept = {name: sensors[name] for name in mounts}
-    return Rig(names.of(agent, own), frozenset(ticks), kept, calibration, anchor, vehicle)
+    return RecordedAgent(names.of(agent, own), frozenset(ticks), kept, calibration, anchor, vehicle)
 
 
 def _round_mount(mount: Array) -> Array:
@@ -234,7 +234,7 @@ def _round_mount(mount: Array) -> Array:
     return pose(*np.round(mount[:3, 3], METRES), *np.radians(degrees)) + 0.0  # no -0.0
 
 
-def _difference(labels: Mapping[int, Labels], time_s: Mapping[int, float]) -> dict[int, Array]:
+def _difference(labels: Mapping[int, ActorLabels], time_s: Mapping[int, float]) -> dict[int, Array]:
     """Return tick -> (M, 3) velocities of the labels: see `difference_tracks`."""
     ends = np.cumsum([len(own.track) for own in labels.values()])
     moved = difference_tracks(
@@ -245,7 +245,9 @@ def _difference(labels: Mapping[int, Labels], time_s: Mapping[int, float]) -> di
     return dict(zip(labels, np.split(moved, ends[:-1])))
 
 
-def _read_frame(scene: str, spin: int, time_s: float, rig: Rig, tick: int, labels: Labels, velocity: Array) -> Frame:
+def _read_frame(
+    scene: str, spin: int, time_s: float, rig: RecordedAgent, tick: int, labels: ActorLabels, velocity: Array
+) -> Frame:
     mounts = rig.calibration.agent_from_sensor
     world_from_agent = rig.sensors[rig.anchor].poses[tick] @ inverse(mounts[rig.anchor])
     taken = (labels.size > 0).all(axis=1)

@@ -5,7 +5,7 @@ A pickle is a program: unpickling runs it, and it may call anything that can be 
 records takes. It is safe for these reasons:
 
 - *Nothing is imported or called.* A class is no object of Python but its name, one of RECORDS; any other name is
-  refused. Creating a record gives an inert `Record`, and its state is put into a dictionary, never into attributes.
+  refused. Creating a record gives an inert `PickledRecord`, and its state becomes a dictionary, never attributes.
 - *Every other operation is refused*: those that call (REDUCE, INST, OBJ, NEWOBJ_EX), the extension registry, persistent
   ids, buffers, and whatever a later protocol may add.
 - *Memory and time are bounded.* A file has at most MOST_BYTES, each operation adds at most one small value and copies
@@ -40,7 +40,7 @@ RECORDS: Mapping[tuple[str, str], str] = {  # module and name of the recorder's 
 CATEGORIES = {"vehicle": "car", "pedestrian": "pedestrian"}
 
 
-class Labels(NamedTuple):
+class ActorLabels(NamedTuple):
     """The M labels of an instant, in the recorder's right-handed world."""
 
     track: NDArray[np.str_]  # (M,) CARLA's numbers of the actors
@@ -58,17 +58,17 @@ class Class:
 
 
 @dataclass
-class Record:
+class PickledRecord:
     """A record of a pickle: inert, its state is data."""
 
     kind: str
     state: dict[str, "Value"] = field(default_factory=dict)
 
 
-Value = int | float | str | Class | Record | tuple[()] | list["Value"] | dict[str, "Value"] | None
+Value = int | float | str | Class | PickledRecord | tuple[()] | list["Value"] | dict[str, "Value"] | None
 
 
-def read_labels(path: Path) -> Labels:
+def read_labels(path: Path) -> ActorLabels:
     """Return the labels in a file of the recorder's; raises `InputError` where it is missing or holds anything else."""
     check_is_file(path)
     with path.open("rb") as file:
@@ -87,7 +87,7 @@ def read_labels(path: Path) -> Labels:
         raise InputError(f"{path}: not labels of CarlaFLCAV ({said})") from None
     track, category, actor, box, size = zip(*rows) if rows else ((),) * 5
     count = len(rows)
-    return Labels(
+    return ActorLabels(
         np.array(track, np.str_).reshape(count),
         np.array(category, np.str_).reshape(count),
         np.array(actor, np.float64).reshape(count, 4, 4),
@@ -96,7 +96,7 @@ def read_labels(path: Path) -> Labels:
     )
 
 
-def _decode_label(label: Record) -> tuple[str, str, Array, Array, Array]:
+def _decode_label(label: PickledRecord) -> tuple[str, str, Array, Array, Array]:
     """Return track, category, `world_from_actor`, `world_from_box` and size of a label."""
     number, kind = label.state["carla_id"], label.state["label_type"]
     if not isinstance(number, int) or not isinstance(kind, str) or kind not in CATEGORIES:
@@ -107,24 +107,24 @@ def _decode_label(label: Record) -> tuple[str, str, Array, Array, Array]:
     return str(number), CATEGORIES[kind], world_from_actor, world_from_actor @ _read_pose(box), size
 
 
-def _read_pose(record: Record) -> Array:
+def _read_pose(record: PickledRecord) -> Array:
     """Return the (4, 4) pose of a record with a location [m] and a rotation [degrees]."""
     place = _read_numbers(_find_record(record, "location", "vector"), "xyz")
     turn = _read_numbers(_find_record(record, "rotation", "rotation"), ("yaw", "pitch", "roll"))
     return pose(*place, *np.radians(turn))
 
 
-def _find_record(record: Record, name: str, kind: str) -> Record:
+def _find_record(record: PickledRecord, name: str, kind: str) -> PickledRecord:
     return _check_record(record.state[name], kind)
 
 
-def _check_record(value: Value, kind: str) -> Record:
-    if not isinstance(value, Record) or value.kind != kind:
+def _check_record(value: Value, kind: str) -> PickledRecord:
+    if not isinstance(value, PickledRecord) or value.kind != kind:
         raise ValueError(f"it has something else in the place of a {kind}")
     return value
 
 
-def _read_numbers(record: Record, names: Iterable[str]) -> list[float]:
+def _read_numbers(record: PickledRecord, names: Iterable[str]) -> list[float]:
     values = [record.state[name] for name in names]
     numbers = [float(value) for value in values if isinstance(value, int | float) and abs(value) < FARTHEST]
     if len(numbers) != len(values):
@@ -167,10 +167,10 @@ def _evaluate(data: bytes) -> Value:
                 arguments, own = stack.pop(), stack.pop()
                 if not isinstance(own, Class) or arguments != ():
                     raise ValueError("a record made of more than its class")
-                stack.append(Record(own.kind))
+                stack.append(PickledRecord(own.kind))
             case "BUILD":
                 state, record = stack.pop(), stack[-1]
-                if not isinstance(record, Record) or not isinstance(state, dict):
+                if not isinstance(record, PickledRecord) or not isinstance(state, dict):
                     raise ValueError("a state of other than a record")
                 record.state = state
             case "SETITEM" | "SETITEMS":

@@ -113,6 +113,26 @@ DATA = re.compile(rb"^DATA (\w+)\r?\n", re.MULTILINE)  # last line of the header
 PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
+def encode_pcd(rows: NDArray[np.void]) -> bytes:
+    """Return a binary PCD file, version 0.7, of a structured array: a field for each of its fields."""
+    fields = {name: rows.dtype[name] for name in rows.dtype.names or ()}
+    letters = {kind: letter for letter, kind in PCD_TYPES.items()}
+    header = (
+        "# .PCD v0.7 - Point Cloud Data file format",
+        "VERSION 0.7",
+        "FIELDS " + " ".join(fields),
+        "SIZE " + " ".join(str(field.itemsize) for field in fields.values()),
+        "TYPE " + " ".join(letters[field.kind] for field in fields.values()),
+        "COUNT " + " ".join("1" for _ in fields),
+        f"WIDTH {len(rows)}",
+        "HEIGHT 1",
+        "VIEWPOINT 0 0 0 1 0 0 0",
+        f"POINTS {len(rows)}",
+        "DATA binary\n",
+    )
+    return "\n".join(header).encode() + rows.tobytes()
+
+
 def is_pcd(data: bytes) -> bool:
     """Return whether the bytes begin as a PCD file does."""
     return re.match(rb"(#[^\n]*\n)*VERSION ", data) is not None

@@ -144,7 +144,7 @@ class JsonMessage(NamedTuple):
     values: Mapping[str, Json]
 
 
-class Place(TypedDict):
+class MessageStamp(TypedDict):
     """Timestamp and coordinate frame of a measurement: fields of most of Foxglove's messages."""
 
     timestamp: Timestamp
@@ -166,7 +166,7 @@ def make_messages(frame: Frame) -> Iterator[Logged]:
     def looks_s(sensor: str) -> float:
         return spin_s + true.offset_ms.get(sensor, 0.0) / 1000
 
-    def place(sensor: str) -> Place:
+    def place(sensor: str) -> MessageStamp:
         return {"timestamp": _stamp(looks_s(sensor)), "frame_id": f"{frame.agent}/{sensor}"}
 
     mounts = [(frame.agent, f"{frame.agent}/{name}", mount) for name, mount in true.agent_from_sensor.items()]
@@ -207,14 +207,14 @@ def radar_points(echoes: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.concatenate((echoes[:, :1] * compute_echo_directions(echoes), echoes), axis=1).astype(np.float32)
 
 
-def _cloud(points: NDArray[np.float32], names: tuple[str, ...], place: Place) -> PointCloud:
+def _cloud(points: NDArray[np.float32], names: tuple[str, ...], place: MessageStamp) -> PointCloud:
     number = PackedElementField.FLOAT32
     fields = [PackedElementField(name=name, offset=4 * i, type=number) for i, name in enumerate(names)]
     data = np.ascontiguousarray(points, dtype="<f4").tobytes()
     return PointCloud(**place, pose=pose_message(np.eye(4)), point_stride=4 * len(names), fields=fields, data=data)
 
 
-def _calibration(frame: Frame, camera: str, picture: NDArray, place: Place) -> CameraCalibration:
+def _calibration(frame: Frame, camera: str, picture: NDArray, place: MessageStamp) -> CameraCalibration:
     intrinsics = frame.calibration.intrinsics[camera]
     return CameraCalibration(
         **place,
@@ -228,7 +228,7 @@ def _calibration(frame: Frame, camera: str, picture: NDArray, place: Place) -> C
     )
 
 
-def _thermal(picture: NDArray[np.uint16], place: Place) -> RawImage:
+def _thermal(picture: NDArray[np.uint16], place: MessageStamp) -> RawImage:
     height, width = picture.shape
     data = np.ascontiguousarray(picture, dtype="<u2").tobytes()
     return RawImage(**place, width=width, height=height, encoding="mono16", step=2 * width, data=data)

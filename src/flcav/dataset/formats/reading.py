@@ -286,7 +286,7 @@ def measure_picture(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: not an image, or a truncated one") from None
 
 
-def read_pictures(paths: Mapping[str, Path]) -> Mapping[str, CameraImage]:
+def link_pictures(paths: Mapping[str, Path]) -> Mapping[str, CameraImage]:
     """Return camera -> image, each read on first access."""
     return LazyMapping(list(paths), lambda name: CameraImage(read_image(paths[name], np.uint8, channels=3)))
 

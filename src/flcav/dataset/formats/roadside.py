@@ -51,7 +51,7 @@ OCCLUSION = (0.0, 0.3, 0.75)  # share that stands for DAIR-V2X's levels 0 not, 1
 STAMP = re.compile(r"(\d+)_(\d{9})_")  # seconds and nanoseconds in the names of TUMTraf's files
 
 
-class Sweep(NamedTuple):
+class RoadsideSweep(NamedTuple):
     """A sweep of a roadside LiDAR, its labels, and where it belongs in a dataset."""
 
     cloud: Path
@@ -90,7 +90,7 @@ class RoadsideSource(LogSource):
         """Yield the sweeps of a scene; raises `InputError` where a file is missing, truncated or malformed."""
         calibration, here = Calibration({LIDAR: np.eye(4)}), np.eye(4)
         for sweep in self._sweeps[scene]:
-            points, found = read_sweep(sweep.cloud), self._read_labels(sweep.label)
+            points, found = read_roadside_sweep(sweep.cloud), self._read_labels(sweep.label)
             check_sizes(found.boxes.size, sweep.label)
             yield Frame(
                 scene=scene,
@@ -105,7 +105,7 @@ class RoadsideSource(LogSource):
             )
 
     @abstractmethod
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
         """Return the labelled sweeps by scene, and the names of those without labels."""
 
     @abstractmethod
@@ -118,10 +118,10 @@ class DairSource(RoadsideSource):
 
     FORMAT = "dair-v2x"
 
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
         about, labels = _read_infos(folder / "data_info.json"), folder / "label" / "virtuallidar"
         places = {place: number for number, place in enumerate(sorted({row.place for row in about.values()} | {""}))}
-        scenes: dict[str, list[Sweep]] = {}
+        scenes: dict[str, list[RoadsideSweep]] = {}
         bare = list[str]()
         for cloud in sorted((folder / "velodyne").glob("*.pcd")):
             label, own = labels / f"{cloud.stem}.json", about.get(cloud.stem, Info("", "", 0.0))
@@ -129,7 +129,7 @@ class DairSource(RoadsideSource):
                 bare.append(cloud.name)
                 continue
             scene = f"dair-{own.sequence or cloud.stem}"
-            scenes.setdefault(scene, []).append(Sweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
+            scenes.setdefault(scene, []).append(RoadsideSweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
         return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
 
     def _read_labels(self, path: Path) -> Labelled:
@@ -157,9 +157,9 @@ class TumTrafSource(RoadsideSource):
 
     FORMAT = "tumtraf"
 
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
         roots = [folder] if (folder / "point_clouds").is_dir() else sorted(folder.iterdir())
-        scenes: dict[str, list[Sweep]] = {}
+        scenes: dict[str, list[RoadsideSweep]] = {}
         bare = list[str]()
         for root in (each for each in roots if (each / "point_clouds").is_dir()):
             for number, lidar in enumerate(sorted(path for path in (root / "point_clouds").iterdir() if path.is_dir())):
@@ -170,7 +170,7 @@ class TumTrafSource(RoadsideSource):
                     if not label.is_file():
                         bare.append(cloud.name)
                         continue
-                    sweep = Sweep(cloud, label, f"pole{number}", 0, time_s)
+                    sweep = RoadsideSweep(cloud, label, f"pole{number}", 0, time_s)
                     scenes.setdefault(root.resolve().name, []).append(sweep)
         return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
 
@@ -195,7 +195,7 @@ class TumTrafSource(RoadsideSource):
         return Labelled(tuple(track), boxes, np.full(len(boxes), np.nan))
 
 
-def read_sweep(path: Path) -> NDArray[np.float32]:
+def read_roadside_sweep(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x, y, z [m], intensity [0, 1] of a PCD file; points that are not finite are left out.
 
     Intensities may reach 255, or 65535. Raises `InputError` for other files.
@@ -246,7 +246,7 @@ def _read_infos(path: Path) -> Mapping[str, Info]:
         raise InputError(f"{path}: not the list of sweeps of DAIR-V2X") from None
 
 
-def _number(sweeps: Sequence[Sweep]) -> list[Sweep]:
+def _number(sweeps: Sequence[RoadsideSweep]) -> list[RoadsideSweep]:
     """Return a scene's sweeps with their spins, each LiDAR's in the order of time, and times since the first."""
     first, spins, numbered = min(sweep.time_s for sweep in sweeps), dict[str, int](), []
     for sweep in sorted(sweeps, key=lambda each: (each.time_s, each.cloud)):
@@ -256,11 +256,11 @@ def _number(sweeps: Sequence[Sweep]) -> list[Sweep]:
     return numbered
 
 
-def _describe_lacking(bare: Sequence[str], scenes: Mapping[str, Sequence[Sweep]]) -> Iterator[str]:
+def _describe_lacking(bare: Sequence[str], scenes: Mapping[str, Sequence[RoadsideSweep]]) -> Iterator[str]:
     """Yield sentences on sweeps without labels, and on those of one LiDAR and scene with one time."""
     if bare:
         yield f"left out {plural(len(bare), 'sweep')} without labels: {name_some(bare)}"
-    found: dict[tuple[str, str, float], list[Sweep]] = {}
+    found: dict[tuple[str, str, float], list[RoadsideSweep]] = {}
     for scene, sweep in ((scene, each) for scene, own in scenes.items() for each in own):
         found.setdefault((scene, sweep.pole, sweep.time_s), []).append(sweep)
     if twins := [own for own in found.values() if len(own) > 1]:

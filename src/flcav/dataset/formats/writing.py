@@ -68,13 +68,19 @@ class ExportFormat(NamedTuple):
     options: tuple[str, ...] = ()  # fields of `ExportOptions`
 
 
+def write_file(path: Path, data: bytes | str) -> None:
+    """Write a file of an export, text as UTF-8, and the folders that it is in."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(data.encode() if isinstance(data, str) else data)
+
+
 def read_frame(dataset: Dataset, i: int, options: ExportOptions) -> Frame:
     """Return frame `i` with the calibration that `options` ask for, true or assumed, as its `calibration`."""
     frame = dataset.frame(i)
     return frame if options.calibration == "true" else replace(frame, calibration=frame.assumed)
 
 
-def count_points_in_boxes(frame: Frame, sensor: str, points: NDArray[np.floating]) -> NDArray[np.int64]:
+def count_readable_points(frame: Frame, sensor: str, points: NDArray[np.floating]) -> NDArray[np.int64]:
     """Return (M,) numbers of the (N, >= 3) `points` [m] of a LiDAR or radar that lie in the box of each annotation.
 
     Readers of an export count in this way. `annotations.points` differ: they count points on the actor itself, which
@@ -111,7 +117,7 @@ def lacks_points(min_points: int) -> str:
     return f"fewer than {plural(min_points, 'LiDAR point')} in the box (--min-points)"
 
 
-def find_visible(frame: Frame, camera: str, labels: str) -> dict[int, str]:
+def find_visible_objects(frame: Frame, camera: str, labels: str) -> dict[int, str]:
     """Return row -> class of the signs or actors (`labels`) that show in an image, those without a 2D label too."""
     truth = frame.annotations
     if labels == "actors":
@@ -122,7 +128,7 @@ def find_visible(frame: Frame, camera: str, labels: str) -> dict[int, str]:
 
 def count_unlabelled(frame: Frame, camera: str, labels: str, min_pixels: int) -> Counter[LeftOut]:
     """Return the signs or actors (`labels`) that show in an image and that `select_rectangles` leaves out."""
-    visible = find_visible(frame, camera, labels)
+    visible = find_visible_objects(frame, camera, labels)
     known = select_rectangles(frame, camera, labels, min_pixels=1)
     unknown = visible.keys() - set(known.row.tolist())
     left_out = Counter(LeftOut(labels, "there is no class for them", visible[row]) for row in sorted(unknown))

@@ -8,16 +8,17 @@ at a time.
 
 import contextlib
 import hashlib
+import itertools
 import json
 import os
 import re
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -27,7 +28,7 @@ from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, NAVIGATION, TOWN,
 from flcav.dataset.navigation_logs import save_logs
 from flcav.dataset.payloads import PICTURES, POINTS, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
-from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_rows
 from flcav.machine.actors import actor_pool
 from flcav.machine.processes import process_pool, start_server
 from flcav.sensors.frame import LONGEST_NAME, Frame, LinkedFrame
@@ -46,13 +47,13 @@ OWN_NAMES = {TRACES, NAVIGATION, TOWN, MANIFEST, CALIBRATION, HEADER, JOINED, *m
 AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
-class Traffic(NamedTuple):
+class SceneTraffic(NamedTuple):
     """The job that simulates the traffic of a scene, which its parts replay."""
 
     scene: str
 
 
-class Part(NamedTuple):
+class ScenePart(NamedTuple):
     """The job that records `frames` consecutive frames of a scene, from number `first` on."""
 
     scene: str
@@ -65,7 +66,7 @@ class Part(NamedTuple):
         return work / self.scene / f"{self.number:05d}"
 
 
-Job = Traffic | Part
+Job = SceneTraffic | ScenePart
 
 
 def check_scenes(scenes: Sequence[str]) -> None:
@@ -77,21 +78,23 @@ def check_scenes(scenes: Sequence[str]) -> None:
         raise ValueError(f"two scenes are called '{max(scenes, key=list(scenes).count)}'")
 
 
-def split_scene(source: Source, scene: str) -> list[Part]:
+def split_scene(source: Source, scene: str) -> list[ScenePart]:
     """Return the parts of a scene: of PART_FRAMES each for a `Replayable` source, else one of all frames."""
     count = source.frame_count(scene)
     step = PART_FRAMES if isinstance(source, Replayable) else max(count, 1)
-    return [Part(scene, number, min(step, count - first), first) for number, first in enumerate(range(0, count, step))]
+    return [
+        ScenePart(scene, number, min(step, count - first), first) for number, first in enumerate(range(0, count, step))
+    ]
 
 
-def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], None]) -> None:
+def perform_job(source: Source, task: Job, work: Path, wrote_frame: Callable[[], None]) -> None:
     """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
 
     Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
     replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts; and the
     ValueError `InputError` where an image that is linked to is truncated.
     """
-    if isinstance(task, Traffic):
+    if isinstance(task, SceneTraffic):
         trace = source.trace(task.scene)
         if trace is None:
             raise ValueError(f"{task.scene}: the source can replay this scene but has no traffic of it")
@@ -114,7 +117,7 @@ def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], Non
     flush_all([part.parent])
 
 
-def _frames(source: Source, task: Part, work: Path) -> Iterator[Frame]:
+def _frames(source: Source, task: ScenePart, work: Path) -> Iterator[Frame]:
     if not isinstance(source, Replayable):
         return source.frames(task.scene)
     trace = Trace.load(work / task.scene / TRAFFIC)
@@ -157,9 +160,9 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
             raise ValueError(f"{frame.key}: the sensors of {frame.agent} moved on their mounts within a dataset")
         wrote_frame()
     for name, rows in tables.items():
-        write_table(build_table(name, rows), part / table_path(name))
+        write_rows(build_table(name, rows), part / table_path(name))
     listing = pa.table(dict(zip(FILES_SCHEMA.names, zip(*files) if files else ([], [], []))), schema=FILES_SCHEMA)
-    write_table(listing, part / table_path(FILES))
+    write_rows(listing, part / table_path(FILES))
     write_bytes(part / CALIBRATION, json.dumps(calibrations).encode())
 
 
@@ -176,24 +179,35 @@ def _check_names(frame: Frame, scene: str) -> None:
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
 
 
-class Engine(Protocol):
+class Engine:
     """An executor of jobs, in any order, `slots` at a time."""
 
-    slots: int
+    def __init__(self, slots: int, start: Callable[[Job], Future[None]], wrote: Callable[[int], None]) -> None:
+        """`start` begins a job; `wrote` is called with the number of frames of the parts that are completed."""
+        self.slots, self._start, self._wrote = slots, start, wrote
+        self._tasks: dict[Future[None], Job] = {}
+        self._count = 0
 
     def submit(self, task: Job) -> None:
         """Enqueue a job."""
-        ...
+        self._tasks[self._start(task)] = task
 
-    def wait(self) -> Iterable[Job]:
+    def wait(self) -> list[Job]:
         """Block until a submitted job is done; return those done since the last call, at least one.
 
         Raises the exception of a failed job, and OSError where a worker was killed.
         """
-        ...
+        done: set[Future[None]] = set()
+        while not done:
+            done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            self._count += sum(task.frames for each in done if isinstance(task := self._tasks[each], ScenePart))
+            self._wrote(self._count)
+        for future in done:
+            future.result()
+        return [self._tasks.pop(future) for future in done]
 
 
-def find_pending(source: Source, scene: str, work: Path) -> list[Part]:
+def find_pending(source: Source, scene: str, work: Path) -> list[ScenePart]:
     """Return the parts of a scene that are not completed yet."""
     return [part for part in split_scene(source, scene) if not part.folder(work).is_dir()]
 
@@ -208,12 +222,12 @@ def record_scenes(source: Source, engine: Engine, work: Path) -> None:
             if not ready:
                 scene = scenes.popleft()
                 known = not isinstance(source, Replayable) or (work / scene / TRAFFIC).is_file()
-                ready.extend(find_pending(source, scene, work) if known else [Traffic(scene)])
+                ready.extend(find_pending(source, scene, work) if known else [SceneTraffic(scene)])
             engine.submit(ready.popleft())
             busy += 1
         for task in engine.wait():
             busy -= 1
-            if isinstance(task, Traffic):
+            if isinstance(task, SceneTraffic):
                 ready.extend(find_pending(source, task.scene, work))
 
 
@@ -230,12 +244,20 @@ def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int]
     `Isolated`; others are child processes of one thread each, which end with this one, even if it is killed.
     """
     if jobs == 1 and not isinstance(source, Isolated):
-        yield _InProcessEngine(source, work, wrote)
+        count = itertools.count(1)
+
+        def run(task: Job) -> Future[None]:
+            perform_job(source, task, work, lambda: wrote(next(count)))
+            done: Future[None] = Future()
+            done.set_result(None)
+            return done
+
+        yield Engine(1, run, lambda _: None)
         return
     written = start_server().Value("q", 0)
     with process_pool(jobs, _begin, source, work, written) as pool:
         try:
-            yield _PoolEngine(jobs, lambda task: pool.submit(_perform, task), lambda _: wrote(written.value))
+            yield Engine(jobs, lambda task: pool.submit(_perform, task), lambda _: wrote(written.value))
         except BrokenProcessPool:
             if isinstance(source, Isolated):
                 raise OSError(source.explain_end()) from None
@@ -251,52 +273,7 @@ def start_actors(source: Source, work: Path, jobs: int, wrote: Callable[[int], N
     completed. Raises `InputError` where Ray is not installed.
     """
     with actor_pool(jobs, _Recorder, source, work.absolute()) as pool:
-        yield _PoolEngine(jobs, lambda task: pool.lend(lambda actor: actor.call(_Recorder.perform, task)), wrote)
-
-
-class _InProcessEngine:
-    """An engine that performs jobs in sequence in this process."""
-
-    slots = 1
-
-    def __init__(self, source: Source, work: Path, wrote: Callable[[int], None]) -> None:
-        self._source, self._work, self._wrote = source, work, wrote
-        self._tasks: deque[Job] = deque()
-        self._count = 0
-
-    def submit(self, task: Job) -> None:
-        self._tasks.append(task)
-
-    def wait(self) -> list[Job]:
-        task = self._tasks.popleft()
-        perform(self._source, task, self._work, self._count_frame)
-        return [task]
-
-    def _count_frame(self) -> None:
-        self._count += 1
-        self._wrote(self._count)
-
-
-class _PoolEngine:
-    """An engine on a pool of workers; calls `wrote` with the frames of the parts that are completed."""
-
-    def __init__(self, slots: int, start: Callable[[Job], Future[None]], wrote: Callable[[int], None]) -> None:
-        self.slots, self._start, self._wrote = slots, start, wrote
-        self._tasks: dict[Future[None], Job] = {}
-        self._count = 0
-
-    def submit(self, task: Job) -> None:
-        self._tasks[self._start(task)] = task
-
-    def wait(self) -> list[Job]:
-        done: set[Future[None]] = set()
-        while not done:
-            done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
-            self._count += sum(task.frames for each in done if isinstance(task := self._tasks[each], Part))
-            self._wrote(self._count)
-        for future in done:
-            future.result()
-        return [self._tasks.pop(future) for future in done]
+        yield Engine(jobs, lambda task: pool.lend(lambda actor: actor.call(_Recorder.perform, task)), wrote)
 
 
 def _begin(*job: Any) -> None:
@@ -315,7 +292,7 @@ def _perform(task: Job) -> None:
         with written.get_lock():
             written.value += 1
 
-    perform(source, task, work, count_frame)
+    perform_job(source, task, work, count_frame)
 
 
 class _Recorder:
@@ -329,4 +306,4 @@ class _Recorder:
             raise OSError(
                 f"{self._work}: not seen from {os.uname().nodename}; record into storage that all nodes share"
             )
-        perform(self._source, task, self._work, lambda: None)
+        perform_job(self._source, task, self._work, lambda: None)

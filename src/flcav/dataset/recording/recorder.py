@@ -46,7 +46,7 @@ from flcav.dataset.recording.jobs import (
     start_actors,
     start_processes,
 )
-from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, list_files, read_table, write_table
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, list_files, read_table, write_rows
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
 from flcav.sources.embedded import EmbeddedSource
@@ -110,7 +110,7 @@ def record(
                     drop_unbegun(out)
                     raise
                 _assemble(source, out, header)
-            if damaged := find_damage(out):
+            if damaged := find_damaged_files(out):
                 more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
                 progress(0, 1, f"{out / min(damaged)} {DAMAGED}{more}, recorded anew")
                 mend(source, out, damaged, write)
@@ -254,7 +254,7 @@ def _write_town(source: Source, work: Path, out: Path) -> bool:
 def _list(files: Mapping[str, Path], folder: Path) -> None:
     """Write the listing of `files`, path in the dataset -> file, into `folder`."""
     rows = [(name, path.stat().st_size, sha256(path)) for name, path in files.items()]
-    write_table(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
+    write_rows(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
 
 
 def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
@@ -306,7 +306,7 @@ def open_source(recipe: Recipe, beside: Path | None = None) -> Source:
     return EmbeddedSource(recipe, beside)
 
 
-def find_damage(out: Path) -> set[str]:
+def find_damaged_files(out: Path) -> set[str]:
     """Return the files of the dataset in `out`, all but its tables, that are missing or of another size."""
     manifest = read_manifest(out)
     listed = list_files(out, manifest)

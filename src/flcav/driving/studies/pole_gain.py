@@ -10,11 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.driving.loop import LOOP, Loop, drive
-from flcav.driving.measures import Drive
+from flcav.driving.loop import LOOP, Loop, drive_scenario
+from flcav.driving.measures import DriveResult
 from flcav.driving.networks import NetworkPerception
 from flcav.driving.road import SPIN_S, RoadUnits
-from flcav.driving.scenarios import Scenario, Staged
+from flcav.driving.scenarios import DrivingScenario, StagedScenario
 from flcav.driving.seen import EGO, EYE_M, FIELD_M, Seen, share_seen
 from flcav.driving.studies.importance import paired_difference
 from flcav.geometry import Array, Boxes, rotate
@@ -133,7 +133,7 @@ class FusionTally:
 class Cooperative:
     """Cooperative perception by vehicle and roadside units; the detections of both are compared with the truth."""
 
-    def __init__(self, staged: Staged, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
+    def __init__(self, staged: StagedScenario, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
         self._units = RoadUnits(staged.town, poles, seed)
         self._networks = NetworkPerception(staged, seed, road=self._units)
         self._scenario, self._tally, self._looked_s = staged.scenario.name, tally, -SPIN_S
@@ -198,15 +198,15 @@ def measure_precision(tally: FusionTally) -> Precision | None:
 
 
 @dataclass(frozen=True)
-class PoleGain(Record):
+class ClosedLoopGain(Record):
     """Gain of roadside sensors in closed loop, over the same drives with and without them."""
 
     poles: tuple[int, ...]
     hidden: Hidden
     precision: Precision | None  # None where there are no cars
     latency_s: float | None  # mean age of a message on arrival; None where none arrived
-    without: tuple[Drive, ...]
-    with_poles: tuple[Drive, ...]
+    without: tuple[DriveResult, ...]
+    with_poles: tuple[DriveResult, ...]
 
     def lines(self) -> list[str]:
         """Return the gain in words."""
@@ -232,19 +232,21 @@ class PoleGain(Record):
 
 
 def measure_pole_gain(
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[DrivingScenario],
     seeds: Sequence[int],
     poles: Sequence[int],
     loop: Loop = LOOP,
     progress: Report = ignore_progress,
-) -> PoleGain:
+) -> ClosedLoopGain:
     """Return the benefit of roadside units on poles of the scenarios' town; raises `InputError` for an unknown pole."""
-    tally, without, with_poles = FusionTally(), list[Drive](), list[Drive]()
+    tally, without, with_poles = FusionTally(), list[DriveResult](), list[DriveResult]()
     pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
     for done, (scenario, seed) in enumerate(pairs, start=1):
-        without.append(drive(scenario, seed, NetworkPerception, loop))
-        with_poles.append(drive(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop))
+        without.append(drive_scenario(scenario, seed, NetworkPerception, loop))
+        with_poles.append(
+            drive_scenario(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop)
+        )
         progress(done, len(pairs), scenario.name)
     late = float(np.mean(tally.latency_s)) if tally.latency_s else None
     hidden, precision = summarise_hidden(tally.hidden), measure_precision(tally)
-    return PoleGain(tuple(poles), hidden, precision, late, tuple(without), tuple(with_poles))
+    return ClosedLoopGain(tuple(poles), hidden, precision, late, tuple(without), tuple(with_poles))

@@ -14,7 +14,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.fusion.labels import label_sample
 from flcav.perception.errors import MISS, PerceptionError
 from flcav.perception.objects.model import Second
@@ -57,7 +57,7 @@ def count_added_labels(
     The network's detections that score `threshold` or more are the vehicles' own. poles: places (3,) of those whose
     sweeps are in the split, world [m].
     """
-    keys, relief = split.data.keys, Ground(split.data).relief
+    keys, relief = split.data.keys, DatasetGround(split.data).relief
     own = {i: detect_in(network, [split.data.frame(i)], score_threshold=threshold)[0] for i in frames}
     added = {}
     for pole, place in poles.items():

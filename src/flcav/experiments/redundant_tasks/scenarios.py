@@ -18,7 +18,7 @@ from flcav.federation.rounds import Schedule, federate
 from flcav.federation.runtimes.metered import Account
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
-from flcav.odd.measure import measure
+from flcav.odd.measure import measure_domain
 from flcav.odd.scenario_tasks import Complexity, count_tasks, generate_tasks
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import Second, pillars_config
@@ -107,7 +107,7 @@ def split_tasks(by_rule: Sequence[int]) -> dict[str, tuple[int, ...]]:
 
 def find_frames(data: Dataset, kind: str) -> NDArray[np.int64]:
     """Return the numbers of the frames at places of a kind."""
-    measured = measure(data)
+    measured = measure_domain(data)
     return np.array(measured.frames)[measured.columns["junction"] == kind]
 
 

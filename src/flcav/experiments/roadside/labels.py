@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from flcav.config import parse_config
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.fusion.detector import load_road_network
@@ -125,7 +125,7 @@ def _spin(split: Frames, i: int) -> Spin:
 def _label(split: Frames, i: int, views: Views, config: SecondConfig) -> Boxes:
     """Return the labels by road sensors alone of a vehicle's frame, in its network's frame and range."""
     frame, told = split.data.frame(i), [*views.get(_spin(split, i), {}).values()]
-    sample = label_sample(frame, Boxes.empty(), told, config, choose_lidar(frame), Ground(split.data).relief)
+    sample = label_sample(frame, Boxes.empty(), told, config, choose_lidar(frame), DatasetGround(split.data).relief)
     return sample.boxes[in_range(sample.boxes, config)]
 
 

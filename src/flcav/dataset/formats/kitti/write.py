@@ -19,7 +19,7 @@ from flcav.dataset.formats.writing import (
     ExportOptions,
     LeftOut,
     check_rectified,
-    count_points_in_boxes,
+    count_readable_points,
     count_unwritten,
     find_front_camera,
     lacks_points,
@@ -27,6 +27,7 @@ from flcav.dataset.formats.writing import (
     read_frame,
     select_objects,
     split_scenes,
+    write_file,
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
@@ -102,8 +103,8 @@ def _write_frame(
             lidar_from_imu=inverse(mounts[lidar]) @ mounts.get(next(iter(frame.imu), ""), np.eye(4)),
         ),
     )
-    _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
-    _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
+    write_file(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
+    write_file(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
     return len(objects), len(regions), left_out + count_unwritten("KITTI", frame, {lidar, camera})
 
 
@@ -129,7 +130,7 @@ def format_label_lines(
     rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)
-    points, shows = count_points_in_boxes(frame, lidar, frame.lidar[lidar]), views.pixels > 0
+    points, shows = count_readable_points(frame, lidar, frame.lidar[lidar]), views.pixels > 0
     reasons = {
         "outside the image": ~within | (bottom[:, 2] <= 0),
         lacks_points(min_points): points < min_points,
@@ -181,9 +182,4 @@ def format_calibration(
 
 
 def _write_lines(path: Path, lines: list[str]) -> None:
-    _write(path, "".join(f"{line}\n" for line in lines).encode())
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    write_file(path, "".join(f"{line}\n" for line in lines))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
 from flcav.config import InputError, Json, read_file
-from flcav.dataset.formats.clouds import BRIGHTEST
+from flcav.dataset.formats.clouds import BRIGHTEST, encode_pcd
 from flcav.dataset.formats.reading import check_cloud
 from flcav.sensors.radar.radar import compute_echo_directions
 from flcav.world.map.town import Town
@@ -41,7 +41,7 @@ def encode_lidar(points: NDArray[np.float32], elevations: NDArray[np.float64]) -
     return np.column_stack((-y, x, z, intensity * 255, ring)).astype("<f4").tobytes()
 
 
-def read_lidar(path: Path) -> NDArray[np.float32]:
+def read_nuscenes_points(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a file of `encode_lidar`.
 
     Raises `InputError` where it is missing, truncated, or has a point that is not finite or an intensity out of range.
@@ -78,22 +78,7 @@ def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> 
         rows["dyn_prop"] = np.where(np.abs(over_ground) > MOVING_M_S, MOVING, STATIONARY)
         rows["is_quality_valid"] = 1
     rows["ambig_state"], rows["pdh0"] = UNAMBIGUOUS, CERTAIN
-    kinds = {"f": "F", "i": "I"}
-    fields = [RADAR[name] for name in RADAR.names or ()]
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
-        "FIELDS " + " ".join(RADAR.names or ()),
-        "SIZE " + " ".join(str(field.itemsize) for field in fields),
-        "TYPE " + " ".join(kinds[field.kind] for field in fields),
-        "COUNT " + " ".join("1" for _ in fields),
-        f"WIDTH {len(rows)}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {len(rows)}",
-        "DATA binary\n",
-    )
-    return "\n".join(header).encode() + rows.tobytes() + b"\n"  # the devkit wants a byte after the last point
+    return encode_pcd(rows) + b"\n"  # the devkit wants a byte after the last point
 
 
 def decode_radar(rows: NDArray[np.void]) -> NDArray[np.float32]:

@@ -16,8 +16,8 @@ from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, path_within, read_json, shorten
 from flcav.dataset.formats.clouds import read_pcd
-from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, VERSION, decode_radar, read_lidar
-from flcav.dataset.formats.nuscenes.tables import COLUMNS, References, Row, read_table, stream_table
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, VERSION, decode_radar, read_nuscenes_points
+from flcav.dataset.formats.nuscenes.tables import COLUMNS, References, Row, read_rows_by_token, stream_table
 from flcav.dataset.formats.reading import (
     AgentNames,
     ImportFormat,
@@ -28,8 +28,8 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     difference_tracks,
+    link_pictures,
     pinhole,
-    read_pictures,
     view_boxes,
 )
 from flcav.geometry import Array, inverse, turned_boxes
@@ -83,7 +83,7 @@ class NuscenesSource(LogSource):
         self.folder, self.split = folder, split
         self._tables = _find_tables(folder)
         self._root = self._tables.parent
-        table = {name: read_table(self._tables, name) for name in SMALL}
+        table = {name: read_rows_by_token(self._tables, name) for name in SMALL}
         self._references = References()
         for _ in self._references.check_links(table["sample"].values(), "sample", self._tables / "sample.json"):
             pass
@@ -110,7 +110,7 @@ class NuscenesSource(LogSource):
                     f"sample, beside {shorten(one['filename'])}"
                 )
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
-        self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
+        self._pose = read_rows_by_token(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         if first_lost is not None and not self._spins:
@@ -276,7 +276,7 @@ class NuscenesSource(LogSource):
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
-        clouds = {name: read_lidar(path[name]) for name in ranging}
+        clouds = {name: read_nuscenes_points(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
         own = self._notes[spin.sample]
         boxes = self._boxes[own]
@@ -306,7 +306,7 @@ class NuscenesSource(LogSource):
                 velocity=self._velocity[own],
                 occlusion=self._occlusion[own],
             ),
-            images=read_pictures(files),
+            images=link_pictures(files),
             radar=radar,
             agent_at_trigger={name: then for name, then in poses.items() if not np.array_equal(then, poses[TOP])},
             files=files,

@@ -104,7 +104,7 @@ def keep_all(_row: Row) -> bool:
     return True
 
 
-def read_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> dict[str, Row]:
+def read_rows_by_token(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> dict[str, Row]:
     """Return token -> row of a table, the rows that are `kept`.
 
     Raises `InputError` as `stream_table`, and where two rows have one token.

@@ -37,7 +37,7 @@ from flcav.dataset.formats.writing import (
     agent_velocities,
     assign_channels,
     check_rectified,
-    count_points_in_boxes,
+    count_readable_points,
     count_unwritten,
     missing_data_error,
     optical_yaw,
@@ -45,6 +45,7 @@ from flcav.dataset.formats.writing import (
     read_frame,
     select_objects,
     split_scenes,
+    write_file,
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
@@ -73,7 +74,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
             selected = dataset.select(agents=[agent], scenes=[scene])
             counts["scenes"] += 1
             elevations = _elevations(dataset, agent)
-            drive = Drive(counts["scenes"], scene, agent, location, out, global_from_world, elevations)
+            drive = NuscenesScene(counts["scenes"], scene, agent, location, out, global_from_world, elevations)
             splits[f"flcav_{split}"].append(drive.name)
             for i in selected:
                 frame = read_frame(dataset, i, options)
@@ -96,9 +97,7 @@ def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progres
         }
     ]
     for name, rows in {**tables, "splits": splits}.items():
-        path = out / VERSION / f"{name}.json"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(rows, indent=0, allow_nan=False), encoding="utf-8")
+        write_file(out / VERSION / f"{name}.json", json.dumps(rows, indent=0, allow_nan=False))
     (out / "sweeps").mkdir()
     return exported
 
@@ -123,7 +122,6 @@ def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
 
 def _write_map(dataset: Dataset, path: Path) -> Array:
     """Write the map, all zero where the dataset's town is unknown; return the (4, 4) `global_from_world`."""
-    path.parent.mkdir(parents=True)
     town = dataset.town()
     if town is None:
         positions = np.array([dataset.world_from_agent(i)[:2, 3] for i in range(len(dataset))])
@@ -132,7 +130,7 @@ def _write_map(dataset: Dataset, path: Path) -> Array:
         mask = np.zeros((height, width), np.uint8)
     else:
         low, mask = np.array(town.bounds[:2]), map_mask(town)
-    path.write_bytes(encode_png(mask))
+    write_file(path, encode_png(mask))
     return pose(-low[0], -low[1])
 
 
@@ -141,7 +139,7 @@ UNDATED = "1970-01-01"  # date of capture: simulated time has none
 
 
 @dataclass
-class Drive:
+class NuscenesScene:
     """A nuScenes scene that collects table rows while frames are added, and writes their files."""
 
     number: int  # of the scene, from 1
@@ -198,8 +196,7 @@ class Drive:
         true = frame.calibration
         stamp = self._micros(frame.time_s + true.offset_ms.get(name, 0.0) / 1000)
         path = f"samples/{channel}/{self.name}__{channel}__{stamp}.{suffix}"
-        (self.out / path).parent.mkdir(parents=True, exist_ok=True)
-        (self.out / path).write_bytes(data)
+        write_file(self.out / path, data)
         ego_from_sensor = true.agent_from_sensor[name]
         if channel.startswith("LIDAR"):
             ego_from_sensor = ego_from_sensor @ OURS_FROM_LIDAR
@@ -237,10 +234,10 @@ class Drive:
     def _add_annotations(self, frame: Frame) -> None:
         truth, boxes = frame.annotations, frame.annotations.boxes
         top, cloud = next(iter(frame.lidar.items()))
-        lidar = count_points_in_boxes(frame, top, cloud)
+        lidar = count_readable_points(frame, top, cloud)
         radar = np.zeros_like(lidar)
         for name, echoes in frame.radar.items():
-            radar += count_points_in_boxes(frame, name, echoes[:, :1] * compute_echo_directions(echoes))
+            radar += count_readable_points(frame, name, echoes[:, :1] * compute_echo_directions(echoes))
         center = transform_points(self.global_from_world, boxes.center)
         labelled, left_out = select_objects("nuScenes", boxes.label, CATEGORIES, {})  # imported datasets have others
         self.left_out.update(left_out)

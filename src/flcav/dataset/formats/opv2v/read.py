@@ -32,12 +32,12 @@ from flcav.dataset.formats.reading import (
     check_rotation,
     check_sizes,
     choose_split,
+    link_pictures,
     measure_picture,
     name_folders,
     name_place,
     name_some,
     pinhole,
-    read_pictures,
     view_boxes,
 )
 from flcav.geometry import Array, Boxes, heading_vectors, inverse, turned_boxes, wrap_angle
@@ -308,7 +308,7 @@ class Opv2vSource(LogSource):
                 view_boxes(boxes, pictures),
                 velocity=velocity,
             ),
-            images=read_pictures(files),
+            images=link_pictures(files),
             agent_at_trigger={name: world @ inverse(mounts[name]) for name, world in placed.items()},
             files=files,
         )

@@ -13,6 +13,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from flcav.carla.frames import MIRROR, MapFrame
+from flcav.dataset.formats.clouds import encode_pcd
 from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
@@ -21,7 +22,7 @@ from flcav.dataset.formats.writing import (
     agent_velocities,
     assign_channels,
     check_rectified,
-    count_points_in_boxes,
+    count_readable_points,
     count_unwritten,
     lacks_points,
     missing_data_error,
@@ -29,6 +30,7 @@ from flcav.dataset.formats.writing import (
     read_frame,
     select_objects,
     split_with_validation,
+    write_file,
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
@@ -95,7 +97,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
             exported.left_out.update(count_unwritten("OPV2V", frame, written))
             counts.update(frames=1, objects=len(vehicles))
         protocol = {"recipe": dataset.manifest.recipe, "numbers": numbers}
-        (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
+        write_file(folder / "data_protocol.yaml", yaml.safe_dump(protocol, sort_keys=False))
         counts["scenarios"] += 1
     return exported
 
@@ -151,16 +153,15 @@ def from_carla(values: ArrayLike) -> Array:
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
     """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
-    folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
-    (folder / f"{time}.pcd").write_bytes(encode_pcd(points))
+    write_file(folder / f"{time}.pcd", encode_cloud(points))
     world_from_lidar = frame.world_from_sensor(lidar)
     mounts = frame.calibration.agent_from_sensor
     cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
-        (folder / f"{time}_{camera}.png").write_bytes(encode_png(frame.images[name].rgb))
+        write_file(folder / f"{time}_{camera}.png", encode_png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {
             "cords": carla_pose(world_from_camera),
@@ -176,7 +177,7 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], 
         "true_ego_pos": list(ego),
         "vehicles": vehicles,
     }
-    (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
+    write_file(folder / f"{time}.yaml", yaml.dump(about, Dumper=FAST_DUMPER))
     return {lidar, *cameras}
 
 
@@ -188,7 +189,7 @@ def _vehicles(
     Other actors are counted by reason.
     """
     truth, boxes = frame.annotations, frame.annotations.boxes
-    few = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) < min_points
+    few = count_readable_points(frame, *next(iter(frame.lidar.items()))) < min_points
     labelled, left_out = select_objects("OPV2V", boxes.label, VEHICLES, {lacks_points(min_points): few})
     vehicles: dict[int, Opv2vVehicle] = {}
     for i in np.flatnonzero(labelled):
@@ -206,17 +207,12 @@ def _vehicles(
     return vehicles, left_out
 
 
-def encode_pcd(points: NDArray[np.float32]) -> bytes:
-    """Return a binary PCD v0.7 file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
+def encode_cloud(points: NDArray[np.float32]) -> bytes:
+    """Return a PCD file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
 
     The intensity is the red channel of the colour, as in OPV2V.
     """
-    red = np.clip(np.rint(points[:, 3] * 255), 0, 255).astype("<u4") << 16
-    rows = np.column_stack((points[:, :3] * np.array([1, -1, 1], np.float32), red.view("<f4"))).astype(
-        "<f4", copy=False
-    )
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\n"
-        f"COUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
-    )
-    return header.encode() + rows.tobytes()
+    rows = np.empty(len(points), [(name, "<f4") for name in ("x", "y", "z", "rgb")])
+    rows["x"], rows["y"], rows["z"] = points[:, 0], -points[:, 1], points[:, 2]
+    rows["rgb"] = (np.clip(np.rint(points[:, 3] * 255), 0, 255).astype("<u4") << 16).view("<f4")
+    return encode_pcd(rows)
