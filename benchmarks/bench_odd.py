@@ -86,8 +86,9 @@ def main() -> None:
         sampled = {}
         for method in METHODS:
             begun = time.process_time()
-            drawn = sample_domain(Space(urban, sceneries), RECIPES, method)
-            write_recipes(drawn, sceneries, Path(scratch) / method, 0, lambda *_: None)
+            space = Space(urban, sceneries)
+            drawn = sample_domain(space, RECIPES, method)
+            write_recipes(drawn, space.sceneries, Path(scratch) / method, 0, lambda *_: None)
             sampled[method] = {"cpu_s": round(time.process_time() - begun, 2), "pairwise": round(drawn.pairwise, 3)}
     rate, slow = 1e3 * len(every) / ours, 1e3 * READ / reference
     result = {

@@ -201,6 +201,8 @@ def cover(
     from flcav.interface import progress
     from flcav.odd.coverage import cover_domain
     from flcav.odd.domain import read_domain
+    from flcav.perception.networks import resolve_network
+    from flcav.perception.objects.task import OBJECTS
     from flcav.storage.files import check_writable
 
     axes = parse_axes(by)
@@ -214,10 +216,8 @@ def cover(
             data,
             out,
             axes,
-            detect=detect,
-            weights=weights,
+            network=resolve_network(OBJECTS, weights, device.value) if detect else None,
             range_m=range_m,
-            device=device.value,
             progress=report,
         )
     if as_json:

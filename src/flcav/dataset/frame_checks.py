@@ -1,6 +1,7 @@
-"""Checks of one frame: ranges of values, complete LiDAR sweeps, points in boxes, agreement with the traffic.
+"""Checks of one frame and of its agent's calibration; each yields one sentence per problem.
 
-Each check yields one sentence per problem.
+Checked are ranges of values, whole LiDAR sweeps, points in boxes, agreement with the traffic, images with their 2D
+annotations, and mounts of sensors.
 """
 
 import math

@@ -1,4 +1,4 @@
-"""Navigation logs of a scene as a Parquet file: one row per vehicle, its samples as lists."""
+"""Navigation logs of a scene as a Parquet file, one row per vehicle with its samples as lists, and their check."""
 
 import json
 from collections.abc import Iterator, Mapping

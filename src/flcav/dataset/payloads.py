@@ -2,6 +2,9 @@
 
 All encodings are lossless but that of depth, which rounds the mantissa to DEPTH_BITS. They were chosen by size and CPU
 time, see `benchmarks/bench_recording.py`.
+
+Pictures are upright everywhere in flcav, as the orientation in their EXIF data says (JEITA CP-3451, tag 274): a phone
+stores the rows of its sensor and how it was held.
 """
 
 import io

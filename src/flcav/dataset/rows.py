@@ -1,4 +1,4 @@
-"""Encoding of frames as table rows; `flcav.dataset.frames` is the inverse."""
+"""Frames as rows of the dataset's tables: `encode_frame` writes them, the functions `decode_*` read them."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -22,7 +22,7 @@ from flcav.dataset.tables import (
     VISIBLE_COLUMNS,
     WEATHER_COLUMNS,
 )
-from flcav.geometry import Boxes
+from flcav.geometry import Array, Boxes
 from flcav.sensors.frame import Annotations, Frame, SignViews, Views
 from flcav.world.weather import Weather
 
@@ -225,7 +225,7 @@ def decode_annotations(
     )
 
 
-def decode_vectors(rows: pa.Table, columns: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def decode_vectors(rows: pa.Table, columns: Sequence[str]) -> dict[str, Array]:
     """Return sensor -> (C,) values of its row in the C `columns`."""
     return dict(zip(rows["sensor"].to_pylist(), _values_of(rows, columns)))
 
@@ -244,7 +244,7 @@ def _decode_points(rows: pa.Table, count: int) -> NDArray[np.int64]:
     return points
 
 
-def _decode_tilt(rows: pa.Table, count: int) -> NDArray[np.float64] | None:
+def _decode_tilt(rows: pa.Table, count: int) -> Array | None:
     """Return pitch and roll (count, 2) of the boxes; None where no box is tilted."""
     if not len(rows):
         return None
@@ -304,5 +304,5 @@ def _text(rows: pa.Table, name: str) -> NDArray[np.str_]:
     return np.array(rows[name].to_pylist(), dtype=np.str_)
 
 
-def _values_of(rows: pa.Table, names: Sequence[str]) -> NDArray[np.float64]:
+def _values_of(rows: pa.Table, names: Sequence[str]) -> Array:
     return np.stack([rows[name].to_numpy() for name in names], axis=1)

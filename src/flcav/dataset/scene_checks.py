@@ -1,4 +1,4 @@
-"""Checks over several frames: blocked LiDARs, boxes without points, actors whose motion contradicts their velocity."""
+"""Checks over several frames: blocked LiDARs, empty boxes, motion against velocity, and sweeps that are there twice."""
 
 import contextlib
 from collections import Counter, defaultdict
@@ -14,7 +14,7 @@ from flcav.config import InputError
 from flcav.dataset.layout import FILES, payload_path, read_manifest, table_path
 from flcav.dataset.payloads import POINTS
 from flcav.dataset.tables import read_table
-from flcav.geometry import Boxes, count_points_in_boxes, inverse
+from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
@@ -148,7 +148,7 @@ def _are_in_view(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]
     level, away = np.hypot(x, y), np.hypot(*boxes.center[:, :2].T)
     sectors = round(360 / SECTOR_DEG)
 
-    def sector(ahead: NDArray[np.float64], left: NDArray[np.float64]) -> NDArray[np.int64]:
+    def sector(ahead: Array, left: Array) -> NDArray[np.int64]:
         return np.floor(np.degrees(np.arctan2(left, ahead)) / SECTOR_DEG).astype(np.int64) % sectors
 
     reach = np.zeros(sectors)

@@ -40,6 +40,7 @@ from flcav.dataset.navigation_logs import load_logs
 from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
 from flcav.dataset.rows import decode_annotations, decode_vectors, decode_weather
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, TILTS, read_table
+from flcav.geometry import Array
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.map.town import PACKAGED, Town, load_town
@@ -171,7 +172,7 @@ class Dataset:
                 _raise_first(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
         return frame
 
-    def world_from_agent(self, i: int) -> NDArray[np.float64]:
+    def world_from_agent(self, i: int) -> Array:
         """Return the (4, 4) pose of the agent in frame `i`, as `frame(i)` has it, without reading measurements."""
         return np.array(self._tables["poses"]["world_from_agent"][i].as_py()).reshape(4, 4)
 

@@ -1,7 +1,13 @@
-"""The corridor of a route: where and when predicted footprints lie in the way of a vehicle that follows it.
+"""A driver: follows a route, keeps its distance, stops at red, and brakes for what is predicted to be in its way.
 
-Distances along the route are from the vehicle's middle. A footprint is taken for `PARTS` points along each of its
-sides, which are nearer to each other than the corridor is wide for vehicles of up to 12 m.
+The corridor of the route tells where and when predicted footprints are in the way. Distances along it are from the
+vehicle's middle. A footprint is taken for `PARTS` points along each of its sides, which are nearer to each other than
+the corridor is wide for vehicles of up to 12 m.
+
+Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
+nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
+corridor at the time at which the vehicle would be there. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
+with all it has. Steering is pure pursuit (Coulter, CMU-RI-TR-92-01, 1992).
 """
 
 from dataclasses import dataclass

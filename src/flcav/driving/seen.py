@@ -1,7 +1,15 @@
-"""Perceived surroundings of the vehicle: road users with predicted paths, lights, and the factor of the weather.
+"""The surroundings that a driver perceives: the record, ground truth as a perception, and tasks that are left out.
 
-All tasks of perception end here: `objects` in the boxes, `trajectory` in the paths, `signs` in the lights, `weather` in
-the speed. World frame: ENU, metres, radians, seconds.
+All tasks of perception end in `Seen`: `objects` in the boxes, `trajectory` in the paths, `signs` in the lights,
+`weather` in the speed. World frame: ENU, metres, radians, seconds.
+
+A task is left out by one of two couplings. In the *bare* one nobody is seen without `objects`, everybody is taken to
+stand without `trajectory`, no light is known without `signs`, and without `weather` the driver keeps to the limit in
+any. In the *cautious* one the driver knows what is missing: it drives slower, and tracks keep their velocity. How much
+the ranking of tasks depends on this choice is what the two show.
+
+The true perception knows positions and velocities. What road users are going to do nobody knows in a live world, so
+that their paths are predicted with constant speed and turn rate here, too.
 """
 
 from collections.abc import Collection, Mapping
@@ -146,7 +154,7 @@ def find_around(snapshot: Snapshot, reach_m: float) -> NDArray[np.int64]:
     return np.flatnonzero(away <= reach_m)
 
 
-def read_actors(snapshot: Snapshot, rows: NDArray[np.int64]) -> tuple[Boxes, NDArray[np.float64], NDArray[np.float64]]:
+def read_actors(snapshot: Snapshot, rows: NDArray[np.int64]) -> tuple[Boxes, Array, Array]:
     """Return boxes (labels are categories), velocities (N, 2) [m/s] and yaw rates (N,) [rad/s] of some actors."""
     trace = snapshot.trace
     size = trace.size[rows]

@@ -1,4 +1,4 @@
-"""Coverage of a domain by recordings: openodd-py's coverage documents, their report, its HTML matrix, and COD tables.
+"""Coverage of a domain by recordings, and where in it a detector errs: openodd-py's documents, report and HTML matrix.
 
 A run is the drive of one vehicle through one scene. A COD, the current operational domain, is OpenODD's table of what
 was observed (ASAM OpenODD 1.0, section 8.3).
@@ -18,7 +18,6 @@ from flcav.odd.cells import CellErrors, Trial, cells_of, find_failures, full_nam
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements, measure_domain
 from flcav.perception.agents import choose_frames
-from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.outcomes import join_outcomes
 from flcav.perception.objects.task import OBJECTS
@@ -172,20 +171,18 @@ def cover_domain(
     out: Path,
     by: tuple[str, str],
     *,
-    detect: bool = False,
-    weights: Path | None = None,
+    network: Second | None = None,
     range_m: float = 40.0,
-    device: str = "auto",
     progress: Report = ignore_progress,
 ) -> DomainCoverage:
     """Return how much of a domain recordings cover; writes coverage.json, matrix.html and runs/*.json to `out`.
 
-    Covered are the attributes that the domain tests, and those of `by`. With `detect` the detector of objects runs on
-    the vehicles' frames that fit it: AP, errors and failures by cell of the attributes `by`, over all recordings.
+    Covered are the attributes that the domain tests, and those of `by`. A detector of objects, `network`, runs on the
+    vehicles' frames that fit it: AP, errors and failures by cell of the attributes `by`, over all recordings, and the
+    pole whose sensor of `range_m` covers most errors.
     """
     domain.require_bound()
     axes = [full_name(domain, name) for name in by]
-    network = resolve_network(OBJECTS, weights, device) if detect else None
     documents: dict[str, Document] = {}
     tested: list[Trial] = []
     outcomes: list[Outcomes] = []

@@ -1,6 +1,7 @@
-"""Judgement of frames by a domain, three-valued: inside, outside, or unknown where the verdict rests on missing values.
+"""Judgement of frames by a domain, and how far towns and recordings realise it, attribute by attribute.
 
-OpenODD 1.0 counts what rests on missing values as inside; here it never is.
+A judgement is three-valued: inside, outside, or unknown where it rests on missing values. OpenODD 1.0 counts what rests
+on missing values as inside; here it never is.
 """
 
 from collections import Counter

@@ -1,4 +1,12 @@
-"""Measurement of a domain's attributes in a recording, by its ground truth: whole columns at once, no sweep is read."""
+"""Measurement of a domain's attributes in a recording: by its ground truth, and as a vehicle perceives them.
+
+By ground truth whole columns are measured at once, and no sweep is read.
+
+As perceived, the weather network names the class of each picture. Of rain, sight, clouds and sun it says that they are
+in the region of that class; where a limit of the domain lies within the region, the value is missing: the class does
+not decide. Detections to all sides are tracked: pedestrians, and vehicles that move, are the road users around. Scenery
+is the map's at the vehicle's pose, and its speed that of its odometry: both as recorded.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

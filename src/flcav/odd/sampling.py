@@ -4,6 +4,8 @@ Three ways to draw: openodd-py's sampler, least covered buckets first; Latin hyp
 (`scipy.stats.qmc`; Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995). A point of the unit cube has one
 axis per attribute that recipes set, one for the corner case and one for the place among those of its kind. An axis goes
 over the buckets inside the domain, equally, and within a bucket uniformly; sight on a logarithmic scale.
+
+A sample becomes the recipe of a recording, with its corner case where and when it is to happen.
 """
 
 import math
@@ -102,7 +104,7 @@ class Space:
 
     def __init__(self, domain: Domain, sceneries: Sequence[Scenery]) -> None:
         domain.require_bound()
-        self.domain = domain
+        self.domain, self.sceneries = domain, {scenery.town.name: scenery for scenery in sceneries}
         self.places: dict[str, list[tuple[ScenarioPlace, dict[str, Value]]]] = {}
         for place, row in find_inside_places(domain, sceneries):
             if cases_at(place):
@@ -324,7 +326,7 @@ def make_recipe(sample: SampledScenario, scenery: Scenery, seed: int, split: str
 
 def write_recipes(
     drawn: Sampled,
-    sceneries: Sequence[Scenery],
+    sceneries: Mapping[str, Scenery],
     out: Path,
     seed: int,
     also: Callable[[SampledScenario, Recipe, Path], None],
@@ -337,8 +339,7 @@ def write_recipes(
     """
     if out.exists() and any(out.glob("*.yaml")):
         raise InputError(f"{out}: has recipes already; name another folder")
-    by_name = {scenery.town.name: scenery for scenery in sceneries}
-    values = [make_recipe(each, by_name[each.place.town], seed + number) for number, each in enumerate(drawn.samples)]
+    values = [make_recipe(each, sceneries[each.place.town], seed + number) for number, each in enumerate(drawn.samples)]
     recipes = [parse_recipe(each, f"sample {number}") for number, each in enumerate(values, start=1)]
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / f"{number:0{len(str(len(values)))}}.yaml" for number in range(1, len(values) + 1)]

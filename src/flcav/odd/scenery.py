@@ -20,7 +20,7 @@ from flcav.geometry import Array
 from flcav.world.map.roads import Connection, RoadNet, read_net
 from flcav.world.map.town import Town
 
-Column = NDArray[np.float64] | NDArray[np.str_]  # NaN and "" are missing
+Column = Array | NDArray[np.str_]  # NaN and "" are missing
 
 NEAR_M = 15.0  # a frame this near to the area of a junction is at it; so with parking spaces
 LANE_M = 12.0  # from a place to the middle of the lane that it is on, at most

@@ -4,6 +4,10 @@ A naive Bayes model has the rate of failures in each bucket of each axis of a fr
 the town; a rate is drawn from its Beta posterior (Thompson sampling: Russo et al., "A tutorial on Thompson sampling",
 2018), so that what is little known is tried. Of a few Sobol points that scenario is taken whose cells without a failure
 so far promise most, and of its traffic those frames. The plain draws it is compared with have as many of both.
+
+A failure is a missed object of many LiDAR returns in the vehicle's path (`cells.locate_failure`). Two are distinct
+where they are in different cells of a grid that is fixed before any search: by place, class, weather, road users
+around, distance and occlusion.
 """
 
 import hashlib
@@ -20,7 +24,6 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.odd.cells import PATH_AHEAD_M, PATH_ASIDE_M, locate_failure
 from flcav.odd.measure import AROUND_M, PARKED
 from flcav.odd.sampling import HARDLY, MOST_TRIES, SampledScenario, Space, draw_sample_points, make_recipe
-from flcav.odd.scenery import Scenery
 from flcav.perception.objects.errors import find_errors
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
@@ -222,7 +225,6 @@ class FailureModel:
 
 def search_failures(
     space: Space,
-    sceneries: Sequence[Scenery],
     network: Second,
     scenarios: int,
     seed: int,
@@ -236,7 +238,7 @@ def search_failures(
     corner case plays; "path" takes frames of them at random, but with somebody in the path. Scenario n has seed + n.
     With `kept`, a file of JSON lines, scenarios in it are not tested again.
     """
-    by_name, model = {scenery.town.name: scenery for scenery in sceneries}, FailureModel()
+    model = FailureModel()
     points, detector, kind = _realise(space, scenarios, seed), _hash_weights(network), tuple[TriedFrame, ...]
     known = {key: from_json(kind, held, str(kept)) for key, held in read_kept(kept, "tested").items()}
     done: list[Searched] = []
@@ -247,7 +249,7 @@ def search_failures(
         key = hash_request([detector, rule, seed, number, sample.as_json()])
         tested = known.get(key)
         if tested is None:
-            values = make_recipe(sample, by_name[sample.place.town], seed + number)
+            values = make_recipe(sample, space.sceneries[sample.place.town], seed + number)
             source = EmbeddedSource(parse_recipe(values, f"sample {number}"))
             trace = source.trace(source.scenes()[0])
             every = list_candidates(sample, trace, source.recipe.cavs)

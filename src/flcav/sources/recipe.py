@@ -1,4 +1,4 @@
-"""Recording recipes: validated YAML files that say what a dataset contains."""
+"""Recording recipes: validated YAML files that say what a dataset contains, and how its frames divide into scenes."""
 
 import os
 from collections.abc import Mapping
@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from flcav.config import Config, InputError, Json, parse_config, read_yaml, shorten
+from flcav.geometry import Array
 from flcav.interface.wording import suggest
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.frame import LONGEST_NAME, format_key
@@ -174,7 +175,7 @@ class Recipe(Config):
         away = np.abs(self._steps()[middle] - self._steps()[spin])
         return middle[away <= round(self.window_s / STEP_S)]
 
-    def times_s(self, warmup_steps: int) -> NDArray[np.float64]:
+    def times_s(self, warmup_steps: int) -> Array:
         """Return (spins,) the times of the spins [s] after a warm-up of `warmup_steps` steps of STEP_S."""
         return np.round((warmup_steps + self._steps()) * np.float64(STEP_S), 1)
 
@@ -290,8 +291,8 @@ def load_recipe(path: Path | str) -> Recipe:
     return recipe.model_copy(update={"town": str(folder)})
 
 
-class Division:
-    """The scenes of a recipe in a town, and their numbers of frames: of all agents at all spins of a scene."""
+class DividedSource:
+    """A source whose scenes are those of a recipe in a town: each has the frames of all agents at all its spins."""
 
     def __init__(self, recipe: Recipe, town: str, agents: tuple[str, ...]) -> None:
         """Raises `InputError` where nobody observes, or the town's name is too long for the names of frames."""
@@ -299,7 +300,7 @@ class Division:
             raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
         self._name = f"{town}-{recipe.seed}"
         self._per_scene = recipe.spins * len(agents)
-        self.frames = recipe.frames or recipe.scenes * self._per_scene
+        self.frame_total = recipe.frames or recipe.scenes * self._per_scene
         longest = max((format_key(self.scenes()[-1], recipe.spins - 1, one) for one in agents), key=len)
         if len(longest) > LONGEST_NAME:
             raise InputError(
@@ -309,8 +310,11 @@ class Division:
 
     def scenes(self) -> list[str]:
         """Return the names of the scenes, `<town>-<seed>-<number>`."""
-        return [f"{self._name}-{scene:03d}" for scene in range(-(-self.frames // self._per_scene))]
+        return [f"{self._name}-{scene:03d}" for scene in range(-(-self.frame_total // self._per_scene))]
 
     def frame_count(self, scene: str) -> int:
-        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames."""
-        return min(self._per_scene, self.frames - self.scenes().index(scene) * self._per_scene)
+        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames.
+
+        With `window_range_m` it is the largest number: how many are recorded depends on the traffic.
+        """
+        return min(self._per_scene, self.frame_total - self.scenes().index(scene) * self._per_scene)

@@ -8,7 +8,7 @@ import shapely
 from shapely.geometry import Polygon, box
 
 from flcav.carla.frames import MapFrame
-from flcav.carla.server.navmesh import (
+from flcav.carla.server.maps import (
     Area,
     build_navigation_mesh,
     find_neighbours,

@@ -133,7 +133,7 @@ class Plant:
 
 
 def search(space: Space, ring: Scenery, rule: str, seed: int = 3, scenarios: int = 40, kept: Path | None = None):
-    return search_failures(space, [ring], NETWORK, scenarios, seed, rule, kept)
+    return search_failures(space, NETWORK, scenarios, seed, rule, kept)
 
 
 def test_a_search_finds_what_is_planted(space: Space, ring: Scenery, monkeypatch: pytest.MonkeyPatch):

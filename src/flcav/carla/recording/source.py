@@ -43,7 +43,7 @@ from flcav.sensors.frame import Calibration, CameraImage, Frame
 from flcav.sensors.navigation import draw_fix_errors, draw_imu_errors
 from flcav.sensors.rig import CAMERA_RANGE_M, Rig
 from flcav.sources.embedded import check_mounts, read_town_files
-from flcav.sources.recipe import STEP_S, CarlaRecipe, Division
+from flcav.sources.recipe import STEP_S, CarlaRecipe, DividedSource
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.parameters import GeoReference
@@ -70,7 +70,7 @@ class Agent:
     feeds: Mapping[str, Feed]
 
 
-class CarlaSource:
+class CarlaSource(DividedSource):
     """The frames of a recipe from a CARLA server: each scene is its map loaded anew, with traffic of its own."""
 
     def __init__(self, recipe: CarlaRecipe, beside: Path | None = None) -> None:
@@ -89,7 +89,7 @@ class CarlaSource:
         self.frame = MapFrame() if source is None else MapFrame(source.offset_m)
         self.poles = self._find_poles()
         self.agents = [f"cav{i}" for i in range(recipe.cavs)] + list(self.poles)
-        self._division = Division(recipe, name, tuple(self.agents))
+        super().__init__(recipe, name, tuple(self.agents))
         check_mounts("vehicle_rig", recipe.vehicle_rig, "a vehicle", 0.0)
         for pole, world_from_pole in self.poles.items():
             x, y, z = world_from_pole[:3, 3].tolist()
@@ -110,18 +110,10 @@ class CarlaSource:
             "map": self.map,
             "carla": version("carla"),
             "scenes": len(self.scenes()),
-            "frames": self._division.frames,
+            "frames": self.frame_total,
             "poles": [int(pole.removeprefix("pole")) for pole in self.poles],
             "labels": ["objects"],
         }
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, `<town>-<seed>-<number>`."""
-        return self._division.scenes()
-
-    def frame_count(self, scene: str) -> int:
-        """Return the number of frames of a scene."""
-        return self._division.frame_count(scene)
 
     def trace(self, scene: str) -> None:
         """Return None: the traffic is known at the frames alone."""

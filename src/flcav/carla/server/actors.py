@@ -1,11 +1,10 @@
-"""The actors that clients know, beside the bodies of the live world."""
+"""The actors that clients know, each with its body in the live world, and how vehicles among them are driven."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame, mirror, mirror_spin, to_rotation
 from flcav.carla.server import wire
@@ -162,7 +161,7 @@ def choose_gear(control: VehicleControl, speed_mps: float) -> int:
     return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
 
 
-def find_grip(box: ServedActor, point: NDArray[np.float64]) -> float | None:
+def find_grip(box: ServedActor, point: Array) -> float | None:
     """Return the share of a dry road's friction in a box of friction; None where `point` (3,) is not in the box."""
     told = {each.id: float(each.value) for each in box.description.attributes if each.type == FLOAT}
     half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]

@@ -1,4 +1,16 @@
-"""The sensors that are served, and when each is due."""
+"""The sensors of CARLA's clients: when each is due, and the bytes that it sends then.
+
+Cameras send images of blue, green, red and alpha, row after row from the top. Depth is coded in 24 bits from red to
+blue, of 1000 m, along the optical axis. The semantic tag is red; an instance image adds the two lower bytes of the
+actor's number as green and blue.
+
+LiDARs and the radar send points in the sensor's left-handed frame. A LiDAR fires points_per_second over its channels,
+from the highest, evenly over the angle that it turns by in the time since its last sweep. Its intensity is
+exp(-a distance), and it loses returns as in `flcav.sensors.lidar.beams`. The radar's rays are random within its field
+of view; each gives the range rate of what it meets.
+
+GNSS, IMU, and the events of collision and obstacle sensors are MessagePack records.
+"""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple

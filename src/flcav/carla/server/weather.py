@@ -1,4 +1,4 @@
-"""CARLA's weather as the town's: percentages become rain rates, visibilities and the wetness of the road."""
+"""Weather of CARLA as the town's, and back: percentages are rain rates, visibilities and the wetness of the road."""
 
 from typing import TYPE_CHECKING
 

@@ -29,6 +29,7 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     difference_tracks,
+    group_classes,
     link_pictures,
     name_folders,
     name_place,
@@ -42,21 +43,15 @@ from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import Lens
 
-CATEGORIES = {  # a bicycle of flcav's has a rider; Argoverse 2's without one keeps its name, as do all other classes
-    "REGULAR_VEHICLE": "car",
-    "LARGE_VEHICLE": "truck",
-    "BOX_TRUCK": "truck",
-    "TRUCK": "truck",
-    "TRUCK_CAB": "truck",
-    "VEHICULAR_TRAILER": "truck",
-    "BUS": "bus",
-    "SCHOOL_BUS": "bus",
-    "ARTICULATED_BUS": "bus",
-    "PEDESTRIAN": "pedestrian",
-    "OFFICIAL_SIGNALER": "pedestrian",
-    "BICYCLIST": "bicycle",
-    "MOTORCYCLIST": "motorcycle",
-}
+# A bicycle of flcav's has a rider; Argoverse 2's without one keeps its name, as do all other classes.
+CATEGORIES = group_classes(
+    car="REGULAR_VEHICLE",
+    truck="LARGE_VEHICLE BOX_TRUCK TRUCK TRUCK_CAB VEHICULAR_TRAILER",
+    bus="BUS SCHOOL_BUS ARTICULATED_BUS",
+    pedestrian="PEDESTRIAN OFFICIAL_SIGNALER",
+    bicycle="BICYCLIST",
+    motorcycle="MOTORCYCLIST",
+)
 SPLITS = ("train", "val", "test")  # folders of logs
 AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
 BEAMS = 64  # of both LiDARs: the lasers 0 to 63 of a sweep

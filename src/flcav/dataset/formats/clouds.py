@@ -1,8 +1,8 @@
-"""Layouts of point clouds that are bare numbers: which one a file has, told by ranges of its numbers.
+"""Files of point clouds: which layout bare numbers have, and PCD files (Point Cloud Library, version 0.7).
 
-KITTI's files are rows of x, y, z [m] and intensity 0 to 1, nuScenes' of x, y, z [m], intensity 0 to 255 and ring, all
-little-endian float32. Neither has a header. Read with another number of columns or another type, coordinates get into
-the column of intensities, or numbers become huge, tiny or no numbers.
+A file of bare numbers is told by their ranges. KITTI's files are rows of x, y, z [m] and intensity 0 to 1, nuScenes' of
+x, y, z [m], intensity 0 to 255 and ring, all little-endian float32. Neither has a header. Read with another number of
+columns or another type, coordinates get into the column of intensities, or numbers become huge, tiny or no numbers.
 """
 
 import re

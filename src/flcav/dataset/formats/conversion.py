@@ -1,4 +1,4 @@
-"""Import of datasets of other formats, by reading them as a source of frames and recording that."""
+"""Import of datasets of other formats, read as a source of frames and recorded; export into a folder, whole or not."""
 
 import contextlib
 import shutil

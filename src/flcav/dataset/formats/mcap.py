@@ -47,6 +47,7 @@ from flcav.dataset.formats.writing import (
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
+from flcav.geometry import Array
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.radar.radar import compute_echo_directions
@@ -106,7 +107,7 @@ def image_annotations(frame: Frame, camera: str, stamp: Timestamp) -> ImageAnnot
     return ImageAnnotations(timestamp=stamp, points=rectangles)
 
 
-def pose_message(matrix: NDArray[np.float64]) -> Pose:
+def pose_message(matrix: Array) -> Pose:
     """Return a rigid (4, 4) transform as a pose message: position and unit quaternion."""
     w, x, y, z = quaternion(matrix)
     px, py, pz = matrix[:3, 3].tolist()
@@ -114,7 +115,7 @@ def pose_message(matrix: NDArray[np.float64]) -> Pose:
 
 
 def _rectangle(
-    box: NDArray[np.float64], colour: tuple[float, float, float], about: dict[str, str], stamp: Timestamp
+    box: Array, colour: tuple[float, float, float], about: dict[str, str], stamp: Timestamp
 ) -> PointsAnnotation:
     left, top, right, bottom = (box + 0.5).tolist()  # a frame's pixel coordinates are 0 at the centre of the first
     corners = ((left, top), (right, top), (right, bottom), (left, bottom))
@@ -234,7 +235,7 @@ def _thermal(picture: NDArray[np.uint16], place: MessageStamp) -> RawImage:
     return RawImage(**place, width=width, height=height, encoding="mono16", step=2 * width, data=data)
 
 
-def _transforms(tree: list[tuple[str, str, NDArray[np.float64]]], time_s: float) -> FrameTransforms:
+def _transforms(tree: list[tuple[str, str, Array]], time_s: float) -> FrameTransforms:
     """Return one message of the transforms in `tree`: triples of parent, child and (4, 4) parent_from_child."""
     return FrameTransforms(
         transforms=[

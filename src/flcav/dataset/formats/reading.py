@@ -258,6 +258,11 @@ class PosePairs:
         return (f"{told}, first in {self._first}",) if self._apart else ()
 
 
+def group_classes(**theirs: str) -> dict[str, str]:
+    """Return a format's class -> category of flcav's, from category -> the format's classes, with spaces between."""
+    return {name: category for category, names in theirs.items() for name in names.split()}
+
+
 def name_some(names: Collection[str]) -> str:
     """Return the first NAMED of several names, and how many others there are."""
     shown = ", ".join(list(names)[:NAMED])

@@ -28,6 +28,7 @@ from flcav.dataset.formats.reading import (
     check_headings,
     check_sizes,
     choose_split,
+    group_classes,
     name_some,
 )
 from flcav.geometry import Array, Boxes, turned_boxes, wrap_angle
@@ -35,18 +36,16 @@ from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, Frame
 
 LIDAR = "lidar"
-CATEGORIES = {  # of both datasets, without regard to case; others keep their names
-    "car": "car",
-    "van": "van",
-    "truck": "truck",
-    "trailer": "truck",
-    "bus": "bus",
-    "pedestrian": "pedestrian",
-    "cyclist": "bicycle",
-    "bicycle": "bicycle",
-    "motorcyclist": "motorcycle",
-    "motorcycle": "motorcycle",
-}
+# Classes of both datasets, without regard to case; others keep their names.
+CATEGORIES = group_classes(
+    car="car",
+    van="van",
+    truck="truck trailer",
+    bus="bus",
+    pedestrian="pedestrian",
+    bicycle="cyclist bicycle",
+    motorcycle="motorcyclist motorcycle",
+)
 OCCLUSION = (0.0, 0.3, 0.75)  # share that stands for DAIR-V2X's levels 0 not, 1 partly and 2 largely occluded
 STAMP = re.compile(r"(\d+)_(\d{9})_")  # seconds and nanoseconds in the names of TUMTraf's files
 

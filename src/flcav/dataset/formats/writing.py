@@ -1,4 +1,4 @@
-"""Formats to write, the options and results of exports, and the split of scenes into train, val and test."""
+"""What writers of other formats share: options and results of exports, splits of scenes, channels of sensors."""
 
 import math
 from collections import Counter
@@ -17,7 +17,7 @@ from flcav.config import Config, InputError
 from flcav.dataset.formats.reading import difference_tracks
 from flcav.dataset.rectangles import select_rectangles
 from flcav.dataset.store import Dataset
-from flcav.geometry import points_in_boxes, transform_points, wrap_angle
+from flcav.geometry import Array, points_in_boxes, transform_points, wrap_angle
 from flcav.interface.progress import Report
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Frame
@@ -194,7 +194,7 @@ LEVEL_RAD = np.radians(2.0)  # largest tilt of a level camera
 AHEAD_RAD = np.radians(30.0)  # largest yaw of a camera that looks ahead
 
 
-def optical_yaw(agent_from_camera: NDArray[np.float64]) -> float:
+def optical_yaw(agent_from_camera: Array) -> float:
     """Return the yaw [rad] of a camera's optical axis (z of its optical frame), counter-clockwise from straight ahead.
 
     `agent_from_camera` is (4, 4).
@@ -202,12 +202,12 @@ def optical_yaw(agent_from_camera: NDArray[np.float64]) -> float:
     return float(np.arctan2(agent_from_camera[1, 2], agent_from_camera[0, 2]))
 
 
-def is_level(agent_from_camera: NDArray[np.float64]) -> bool:
+def is_level(agent_from_camera: Array) -> bool:
     """Return whether the y axis of a camera's optical frame points down, to LEVEL_RAD."""
     return bool(-agent_from_camera[2, 1] >= np.cos(LEVEL_RAD))
 
 
-def find_front_camera(agent_from_camera: Mapping[str, NDArray[np.float64]]) -> str | None:
+def find_front_camera(agent_from_camera: Mapping[str, Array]) -> str | None:
     """Return the name of the level camera with the least yaw, None if none is within AHEAD_RAD."""
     turned = {name: abs(optical_yaw(mount)) for name, mount in agent_from_camera.items() if is_level(mount)}
     name = min(turned, key=turned.__getitem__, default=None)
@@ -226,13 +226,13 @@ def assign_channels(yaw: Mapping[str, float], named: Mapping[str, float]) -> dic
     return {sensors[row]: known[column] for row, column in zip(rows, columns)}
 
 
-def quaternion(matrix: NDArray[np.float64]) -> list[float]:
+def quaternion(matrix: Array) -> list[float]:
     """Return the unit quaternion [w, x, y, z], w >= 0, of the rotation in a (3, 3) or (4, 4) transform."""
     x, y, z, w = Rotation.from_matrix(matrix[:3, :3]).as_quat(canonical=True).tolist()
     return [w, x, y, z]
 
 
-def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], NDArray[np.float64]]:
+def agent_velocities(dataset: Dataset, scene: str) -> dict[tuple[str, int], Array]:
     """Return (agent, spin) -> (3,) velocity, world frame [m/s]; zero for an agent outside the traffic, as a pole.
 
     In an imported dataset velocities are differences of an agent's poses, zero where there are none to be compared.

@@ -1,9 +1,9 @@
-"""The jobs of a recording: their division of the frames, how one is performed, and their scheduling.
+"""The jobs of a recording: division of the frames, how a job is performed, and engines that perform many at a time.
 
 A scene of a `Replayable` source is one job for its traffic and one for each part of its frames; any other scene is one
 job. A job writes below `work/SCENE`: the traffic, with navigation logs if there are any, or the folder of a part, which
 appears there when it is complete. A scene's traffic is scheduled before its parts, and only a few scenes are under way
-at a time.
+at a time. Jobs run in this process, in a pool of processes, or in actors on the machines of a Ray cluster.
 """
 
 import contextlib

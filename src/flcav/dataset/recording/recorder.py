@@ -3,6 +3,8 @@
 Parts of scenes are first written below the hidden folder `.recording`. When all are complete, their files are moved
 into the dataset, their tables are concatenated, and the manifest is written last. An interruption at any point loses
 only the parts that were under way. A part is on the disk before it counts as complete, and all before the manifest.
+
+A finished dataset of which files are missing or damaged is mended: the parts that they are of are recorded again.
 """
 
 import json

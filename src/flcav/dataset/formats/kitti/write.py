@@ -31,7 +31,7 @@ from flcav.dataset.formats.writing import (
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import inverse, transform_points, wrap_angle
+from flcav.geometry import Array, inverse, transform_points, wrap_angle
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 
@@ -149,13 +149,13 @@ def format_label_lines(
     return lines, regions, left_out
 
 
-def dont_care(rectangle: NDArray[np.float64]) -> str:
+def dont_care(rectangle: Array) -> str:
     """Return the label line of a DontCare region: (4,) left, top, right, bottom [px]."""
     left, top, right, bottom = (f"{number:.4f}" for number in rectangle)
     return f"DontCare -1 -1 -10 {left} {top} {right} {bottom} -1 -1 -1 -1000 -1000 -1000 -10"
 
 
-def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+def occlusion_levels(occlusion: Array, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return (M,) KITTI's occlusion levels: 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown.
 
     `occlusion` is (M,) in [0, 1] or NaN, `pixels` (M,) the visible ones.
@@ -164,9 +164,7 @@ def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) 
     return np.where((pixels != 0) & ~np.isnan(occlusion), level, UNKNOWN)
 
 
-def format_calibration(
-    intrinsics: NDArray[np.float64], camera_from_lidar: NDArray[np.float64], lidar_from_imu: NDArray[np.float64]
-) -> list[str]:
+def format_calibration(intrinsics: Array, camera_from_lidar: Array, lidar_from_imu: Array) -> list[str]:
     """Return the lines of a calibration file, in the order that readers expect.
 
     `intrinsics` is (3, 3), the transforms are (4, 4).

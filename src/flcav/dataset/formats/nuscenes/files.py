@@ -1,4 +1,4 @@
-"""nuScenes' file encodings of point clouds, radar sweeps and the map."""
+"""nuScenes' files: encodings of point clouds, radar sweeps and the map; classes, channels, tokens and constant rows."""
 
 from hashlib import sha256
 from pathlib import Path
@@ -10,6 +10,7 @@ from PIL import Image, ImageDraw
 from flcav.config import InputError, Json, read_file
 from flcav.dataset.formats.clouds import BRIGHTEST, encode_pcd
 from flcav.dataset.formats.reading import check_cloud
+from flcav.geometry import Array
 from flcav.sensors.radar.radar import compute_echo_directions
 from flcav.world.map.town import Town
 
@@ -27,7 +28,7 @@ MOVING_M_S = 0.5  # speed over ground from which a radar return counts as moving
 MOVING, STATIONARY, UNAMBIGUOUS, CERTAIN = 0, 1, 3, 1
 
 
-def encode_lidar(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> bytes:
+def encode_lidar(points: NDArray[np.float32], elevations: Array) -> bytes:
     """Return the bytes of (N, 5) float32 x, y, z [m] in nuScenes' LiDAR frame, intensity 0 to 255, ring.
 
     `points` is (N, 4) x, y, z, intensity [0, 1] in our LiDAR frame (x ahead, y left). The ring is the index of the
@@ -54,7 +55,7 @@ def read_nuscenes_points(path: Path) -> NDArray[np.float32]:
     return check_cloud(cloud, path)
 
 
-def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:
+def encode_radar(echoes: NDArray[np.float32], velocity: Array) -> bytes:
     """Return a binary PCD file of (N, 5) radar returns: range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
 
     `velocity` is the radar's own (3,) [m/s], in its frame. Only the radial velocity of a return is measured: `vx`, `vy`

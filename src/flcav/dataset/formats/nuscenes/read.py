@@ -28,6 +28,7 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     difference_tracks,
+    group_classes,
     link_pictures,
     pinhole,
     view_boxes,
@@ -37,28 +38,17 @@ from flcav.sensors.frame import Calibration, LinkedFrame
 
 SMALL = [name for name in COLUMNS if name not in ("sample_data", "ego_pose", "sample_annotation")]  # kept as they are
 
-CATEGORIES = {  # other classes keep their names, and so do cycles without a rider
-    "vehicle.car": "car",
-    "vehicle.emergency.police": "car",
-    "vehicle.truck": "truck",
-    "vehicle.trailer": "truck",
-    "vehicle.construction": "truck",
-    "vehicle.emergency.ambulance": "truck",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.bus.bendy": "bus",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-}
+# Other classes keep their names, and so do cycles without a rider.
+CATEGORIES = group_classes(
+    car="vehicle.car vehicle.emergency.police",
+    truck="vehicle.truck vehicle.trailer vehicle.construction vehicle.emergency.ambulance",
+    bus="vehicle.bus.rigid vehicle.bus.bendy",
+    pedestrian="human.pedestrian.adult human.pedestrian.child human.pedestrian.construction_worker "
+    "human.pedestrian.police_officer",
+)
 RIDDEN = {"vehicle.bicycle": "bicycle", "vehicle.motorcycle": "motorcycle"}
 RIDER = "cycle.with_rider"
-OCCLUSION = {
-    "1": 0.8,
-    "2": 0.5,
-    "3": 0.3,
-    "4": 0.1,
-}  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
+OCCLUSION = {"1": 0.8, "2": 0.5, "3": 0.3, "4": 0.1}  # middle of the level: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP, MOUNTED = "LIDAR_TOP", "calibrated_sensor.json"
 BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
 VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables

@@ -4,6 +4,9 @@ OPV2V has one class, vehicle, which is read as car; no times, but spins at 10 Hz
 heading. V2X-Real (Xiang et al., ECCV 2024) has its files, but raw point clouds, JPEG pictures and classes: its code
 takes clouds and poses as left-handed, too. Sensors' poses are those in the world: mounts are those of the agent's first
 frame.
+
+Both datasets were written by PyYAML's unsafe dumper, which names classes of Python. Of these only NumPy's scalars and
+arrays are read, by their bytes; nothing is imported or called.
 """
 
 import re
@@ -99,7 +102,7 @@ def _check_numbers(values: Any, *shape: int) -> None:
         raise ValueError(f"{shape[0]} numbers are wanted" if shape else "a number is wanted")
 
 
-def _read_pose(values: Any, name: str) -> NDArray[np.float64]:
+def _read_pose(values: Any, name: str) -> Array:
     """Return the (4, 4) `world_from_body` of a pose: x, y, z, roll, yaw, pitch, or a matrix in CARLA's frame."""
     matrix = np.shape(values) == (4, 4)
     try:
