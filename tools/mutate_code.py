@@ -42,13 +42,12 @@ PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
             "driving/measures.py",
             "driving/loop.py",
             "driving/driver.py",
-            "driving/driver.py",
             "driving/following.py",
         ],
         ["tests/unit/driving"],
     ),
     "odd": (
-        ["odd/judge.py", "odd/coverage.py", "odd/coverage.py", "odd/cells.py", "odd/measure.py"],
+        ["odd/judge.py", "odd/coverage.py", "odd/cells.py", "odd/measure.py"],
         ["tests/unit/odd"],
     ),
 }

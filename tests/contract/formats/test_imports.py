@@ -20,7 +20,7 @@ from flcav.dataset.formats.conversion import export, import_dataset
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
 from flcav.dataset.formats.kitti.read import KittiSource
 from flcav.dataset.formats.nuscenes.tables import COLUMNS
-from flcav.dataset.formats.opv2v.read import read_cloud
+from flcav.dataset.formats.opv2v.files import read_cloud
 from flcav.dataset.formats.writing import ExportOptions, split_scenes
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset

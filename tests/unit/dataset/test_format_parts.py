@@ -26,7 +26,8 @@ from flcav.dataset.formats.nuscenes.files import (
     token,
     visibility,
 )
-from flcav.dataset.formats.opv2v.write import agent_numbers, carla_pose, encode_cloud
+from flcav.dataset.formats.opv2v.files import carla_pose, encode_cloud
+from flcav.dataset.formats.opv2v.write import agent_numbers
 from flcav.dataset.formats.writing import assign_channels, find_front_camera, quaternion
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose

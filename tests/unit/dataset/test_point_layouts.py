@@ -15,7 +15,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.clouds import describe_numbers, has_kitti_layout, has_nuscenes_layout, read_pcd
 from flcav.dataset.formats.kitti import read_points
 from flcav.dataset.formats.nuscenes.files import encode_lidar
-from flcav.dataset.formats.opv2v.write import encode_cloud
+from flcav.dataset.formats.opv2v.files import encode_cloud
 from flcav.dataset.formats.sweeps import list_sweeps, read_cloud_file
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3].parent / "shared" / "data"))

@@ -10,10 +10,8 @@ from typing import Any, TypedDict
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike, NDArray
 
-from flcav.carla.frames import MIRROR, MapFrame
-from flcav.dataset.formats.clouds import encode_pcd
+from flcav.dataset.formats.opv2v.files import FOLDERS, KMH, MIRRORED, carla_pose, encode_cloud
 from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
@@ -34,12 +32,10 @@ from flcav.dataset.formats.writing import (
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import Array
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
 
-FOLDERS = {"train": "train", "val": "validate", "test": "test"}
 VEHICLES = ("car", "van", "truck", "bus")
 CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera0": 0.0,
@@ -48,8 +44,6 @@ CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera3": np.pi,
 }
 FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
-KMH = 3.6
-MIRRORED = np.diag((*MIRROR, 1.0))
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
@@ -129,27 +123,6 @@ def agent_numbers(agents: list[str]) -> dict[str, int]:
     }
 
 
-def carla_pose(world_from_body: Array) -> list[float]:
-    """Return OPV2V's [x, y, z [m], roll, yaw, pitch [degrees]], in CARLA's frame, of a (4, 4) `world_from_body`.
-
-    The body's axes are x ahead, y left, z up.
-    """
-    location, (pitch, yaw, roll) = MapFrame().to_transform(world_from_body)
-    return [*location, roll, yaw, pitch]
-
-
-def from_carla(values: ArrayLike) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
-
-    `values` may also be the (4, 4) matrix of that pose in CARLA's frame, OpenCOOD's `x_to_world`.
-    """
-    numbers = np.asarray(values, np.float64)
-    if numbers.shape == (4, 4):
-        return MIRRORED @ numbers @ MIRRORED
-    x, y, z, roll, yaw, pitch = numbers.tolist()
-    return MapFrame().from_transform((x, y, z), (pitch, yaw, roll))
-
-
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
     """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
@@ -205,14 +178,3 @@ def _vehicles(
             "speed": float(np.linalg.norm(truth.velocity[i]) * KMH),
         }
     return vehicles, left_out
-
-
-def encode_cloud(points: NDArray[np.float32]) -> bytes:
-    """Return a PCD file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
-
-    The intensity is the red channel of the colour, as in OPV2V.
-    """
-    rows = np.empty(len(points), [(name, "<f4") for name in ("x", "y", "z", "rgb")])
-    rows["x"], rows["y"], rows["z"] = points[:, 0], -points[:, 1], points[:, 2]
-    rows["rgb"] = (np.clip(np.rint(points[:, 3] * 255), 0, 255).astype("<u4") << 16).view("<f4")
-    return encode_pcd(rows)
