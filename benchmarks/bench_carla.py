@@ -22,17 +22,17 @@ from typing import Any
 
 from cpu_time import cpu_ms
 
-from flcav.sources.carla.server.calls import Calls
-from flcav.sources.carla.server.maps import Maps
-from flcav.sources.carla.server.sensing.cameras import sense_depth, sense_instance, sense_rgb, sense_semantic
-from flcav.sources.carla.server.sensing.sight import Sensor, Sight
+from flcav.carla.server.calls import Calls
+from flcav.carla.server.maps import Maps
+from flcav.carla.server.sensors import sense_depth, sense_instance, sense_rgb, sense_semantic
+from flcav.carla.server.sight import Sensor, TownSight
 
 DT_S = 0.05
 VEHICLES = 20
 PLACES = 6
 EYE_M = 1.3  # above a spawn point, which is above the road
 SIZES = ((640, 384), (800, 600), (1280, 720))
-IMAGES: dict[str, tuple[Callable[[Sight, Sensor], bytes], str]] = {
+IMAGES: dict[str, tuple[Callable[[TownSight, Sensor], bytes], str]] = {
     "rgb": (sense_rgb, "high"),
     "rgb, low": (sense_rgb, "low"),
     "depth": (sense_depth, "high"),

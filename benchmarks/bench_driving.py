@@ -10,11 +10,11 @@ import sys
 import time
 from collections.abc import Callable
 
-from flcav.driving.driver import decide
-from flcav.driving.errors import load_errors, sense_model
+from flcav.driving.driver import decide_controls
+from flcav.driving.errors import load_error_model, sense_model
 from flcav.driving.loop import Sensing, find_motion, sense_truth
 from flcav.driving.networks import sense_networks
-from flcav.driving.scenarios import DT_S, Staged, find_scenarios
+from flcav.driving.scenarios import DT_S, StagedScenario, find_scenarios
 from flcav.driving.seen import EGO, Perception, Seen
 from flcav.machine.threads import use_threads
 from flcav.sensors.observe import observe
@@ -29,7 +29,7 @@ GOALS = {"truth": 5.0, "truth and one LiDAR": 1.0}
 class Sweeping:
     """Ground truth beside a LiDAR that spins."""
 
-    def __init__(self, staged: Staged, seed: int) -> None:
+    def __init__(self, staged: StagedScenario, seed: int) -> None:
         self._truth, self._scene = sense_truth(staged, seed), Scene(staged.town, staged.world.snapshot.trace)
 
     def look(self, snapshot: Snapshot) -> Seen:
@@ -39,10 +39,10 @@ class Sweeping:
         return self._truth.look(snapshot)
 
 
-def start(sense: Callable[[Staged, int], Perception] | Sensing) -> Callable[[], None]:
+def start(sense: Callable[[StagedScenario, int], Perception] | Sensing) -> Callable[[], None]:
     """Return a function that drives one block of a drive."""
     (scenario,) = find_scenarios(["grid-none-clear"])
-    staged = Staged(scenario, 1)
+    staged = StagedScenario(scenario, 1)
     perception, along = sense(staged, 1), staged.start_m
     body = staged.world.bodies.find(EGO).blueprint
 
@@ -52,7 +52,7 @@ def start(sense: Callable[[Staged, int], Perception] | Sensing) -> Callable[[], 
             now = staged.world.snapshot
             own = find_motion(now, staged.route, along)
             along = own.along
-            staged.world.step({EGO: decide(staged.route, own, perception.look(now), body).controls})
+            staged.world.step({EGO: decide_controls(staged.route, own, perception.look(now), body).controls})
 
     return block
 
@@ -63,7 +63,7 @@ def main(seconds: float) -> None:
     blocks = {
         "truth": start(sense_truth),
         "truth and one LiDAR": start(Sweeping),
-        "model of errors": start(sense_model(load_errors())),
+        "model of errors": start(sense_model(load_error_model())),
         "networks": start(sense_networks),
     }
     wall, cpu = dict.fromkeys(blocks, float("inf")), dict.fromkeys(blocks, float("inf"))

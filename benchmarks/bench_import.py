@@ -22,7 +22,7 @@ import numpy as np
 from cpu_time import cpu_ms
 
 from flcav.config import InputError
-from flcav.dataset.formats.nuscenes.files import encode_radar, read_lidar
+from flcav.dataset.formats.nuscenes.files import encode_radar, read_nuscenes_points
 from flcav.dataset.formats.nuscenes.read import NuscenesSource
 from flcav.world.opendrive.importing import import_town
 
@@ -162,7 +162,7 @@ def main() -> None:
         megabytes = sum(path.stat().st_size for path in clouds) / 1e6
         source = NuscenesSource(short / KEYS)
         works = [
-            lambda: [read_lidar(path) for path in clouds],
+            lambda: [read_nuscenes_points(path) for path in clouds],
             lambda: [frame.key for frame in source.frames("scene-0001")],
             lambda: NuscenesSource(short / KEYS),
         ]

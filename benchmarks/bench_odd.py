@@ -16,10 +16,9 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain, read_domain
-from flcav.odd.judge import judge
-from flcav.odd.measure import AROUND_M, Measurements, describe_weather, measure, scenery_of
-from flcav.odd.recipes import write_recipes
-from flcav.odd.sampling import METHODS, Space, sample_domain
+from flcav.odd.judge import judge_frames
+from flcav.odd.measure import AROUND_M, Measurements, describe_weather, measure_domain, scenery_of
+from flcav.odd.sampling import METHODS, Space, sample_domain, write_recipes
 from flcav.odd.scenery import Scenery
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -55,7 +54,7 @@ def judge_one_by_one(domain: Domain, data: Dataset, scenery: Scenery, frames: ra
         columns = scenery.measure(place[None], np.array([yaw])) | describe_weather(sky)
         columns |= {"agents": np.array([((away <= AROUND_M) & moving).sum()]), "surface_type": np.array(["asphalt"])}
         columns |= {"ego_speed": np.zeros(1), "field_of_view": np.full(1, 360.0), "sensing_range": np.full(1, 100.0)}
-        verdicts += judge(domain, Measurements((i,), columns)).verdict.tolist()
+        verdicts += judge_frames(domain, Measurements((i,), columns)).verdict.tolist()
     return verdicts
 
 
@@ -71,12 +70,12 @@ def main() -> None:
         every, part = tuple(range(len(data))), range(READ)
 
         assert scenery is not None
-        verdicts = judge(urban, measure(data, every, scenery)).verdict.tolist()
+        verdicts = judge_frames(urban, measure_domain(data, every, scenery)).verdict.tolist()
         assert judge_one_by_one(urban, data, scenery, part) == verdicts[:READ]
 
         ours, reference = cpu_ms(
             [
-                lambda: judge(urban, measure(data, every, scenery)),
+                lambda: judge_frames(urban, measure_domain(data, every, scenery)),
                 lambda: judge_one_by_one(urban, data, scenery, part),
             ],
             repeats,
@@ -87,8 +86,9 @@ def main() -> None:
         sampled = {}
         for method in METHODS:
             begun = time.process_time()
-            drawn = sample_domain(Space(urban, sceneries), RECIPES, method)
-            write_recipes(drawn, sceneries, Path(scratch) / method, 0, lambda *_: None)
+            space = Space(urban, sceneries)
+            drawn = sample_domain(space, RECIPES, method)
+            write_recipes(drawn, space.sceneries, Path(scratch) / method, 0, lambda *_: None)
             sampled[method] = {"cpu_s": round(time.process_time() - begun, 2), "pairwise": round(drawn.pairwise, 3)}
     rate, slow = 1e3 * len(every) / ours, 1e3 * READ / reference
     result = {

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.dataset.payloads import encode_plane
-from flcav.dataset.recording.jobs import Part, Traffic, perform
+from flcav.dataset.recording.jobs import ScenePart, SceneTraffic, perform_job
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.sensors.lidar.lidar import build_ray_pattern
@@ -66,9 +66,11 @@ def whole_recording(repeats: int) -> dict[str, float]:
         plain, seeing = (EmbeddedSource(recipe(cameras)) for cameras in (False, True))
         name, works = plain.scenes()[0], []
         for source, work in ((plain, Path(folder) / "plain"), (seeing, Path(folder) / "seeing")):
-            perform(source, Traffic(name), work, _no_report)
-            parts = iter([Part(name, number, source.frame_count(name)) for number in range(repeats + 1)])
-            works.append(lambda source=source, work=work, parts=parts: perform(source, next(parts), work, _no_report))
+            perform_job(source, SceneTraffic(name), work, _no_report)
+            parts = iter([ScenePart(name, number, source.frame_count(name)) for number in range(repeats + 1)])
+            works.append(
+                lambda source=source, work=work, parts=parts: perform_job(source, next(parts), work, _no_report)
+            )
         trace = plain.trace(name)
         scene = Scene(plain.town, trace)
         bare, lidar, cameras = cpu_ms((lambda: _bare(scene, plain), *works), repeats)

@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 from typing import Any, get_args, get_origin, get_type_hints
 
-from flcav.sources.carla.server import wire
-from flcav.sources.carla.server.blueprints import list_blueprints
-from flcav.sources.carla.server.calls import Calls
+from flcav.carla.server import wire
+from flcav.carla.server.blueprints import list_blueprints
+from flcav.carla.server.calls import Calls
 
 SKIPPED = {"load_new_episode", "copy_opendrive_to_file"}  # they take seconds where they work: a few are enough
 FEW = 0.001  # share of them
@@ -95,7 +95,7 @@ def draw_message(rng: random.Random, methods: list[str]) -> bytes:
     method = rng.choice(methods)
     if method in SKIPPED and rng.random() > FEW:
         method = "apply_batch"
-    return wire.pack([0, rng.randrange(2**32), method, [[False], *draw_arguments(rng, method)]])
+    return wire.pack_value([0, rng.randrange(2**32), method, [[False], *draw_arguments(rng, method)]])
 
 
 def draw_noise(rng: random.Random, message: bytes) -> bytes:
@@ -112,7 +112,7 @@ def ask_version(port: int) -> bool:
     """Return whether the server answers."""
     try:
         with socket.create_connection(("127.0.0.1", port), timeout=60) as link:
-            link.sendall(wire.pack([0, 1, "version", [[False]]]))
+            link.sendall(wire.pack_value([0, 1, "version", [[False]]]))
             return wire.VERSION.encode() in link.recv(1000)
     except OSError:
         return False

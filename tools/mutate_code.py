@@ -39,13 +39,18 @@ PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
     "links": (["federation/links"], [FEDERATION]),
     "privacy": (["federation/privacy.py"], [FEDERATION]),
     "releases": (["releases"], ["tests/unit/releases"]),
-    "carla": (["sources/carla/server"], ["tests/unit/sources/carla_server", "tests/integration/test_carla_server.py"]),
+    "carla": (["carla/server"], ["tests/unit/carla", "tests/integration/test_carla_server.py"]),
     "driving": (
-        ["driving/measures.py", "driving/loop.py", "driving/driver.py", "driving/corridor.py", "driving/following.py"],
+        [
+            "driving/measures.py",
+            "driving/loop.py",
+            "driving/driver.py",
+            "driving/following.py",
+        ],
         ["tests/unit/driving"],
     ),
     "odd": (
-        ["odd/judge.py", "odd/coverage.py", "odd/covering.py", "odd/cells.py", "odd/measure.py"],
+        ["odd/judge.py", "odd/coverage.py", "odd/cells.py", "odd/measure.py"],
         ["tests/unit/odd"],
     ),
 }

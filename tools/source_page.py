@@ -14,10 +14,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from flcav.dataset.recording.recorder import record
+from flcav.dataset.recording.recorder import open_source, record
 from flcav.dataset.store import Dataset
 from flcav.report import style
-from flcav.sources.opening import open_source
 from flcav.sources.recipe import parse_recipe
 from flcav.storage.files import write_bytes
 from flcav.storage.markdown import format_table

@@ -100,9 +100,7 @@ def compare_searches(
                 progress(done + number, total, f"{name}: {note}")
 
             kept = out / f"{rule}-{seed}.jsonl"
-            searched[rule].append(
-                search_failures(space, sceneries, network, scenarios, APART * seed, rule, kept, report)
-            )
+            searched[rule].append(search_failures(space, network, scenarios, APART * seed, rule, kept, report))
             done += scenarios
     return summarise(searched)
 

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.experiments.experiment import Experiment, Options, Outcome, import_map, list_works, shrink_recipe
 from flcav.fusion.labels import label_sample
 from flcav.optimization.curves.held_out import rank_correlation
@@ -404,7 +404,7 @@ def count_added_labels(
     The network's detections that score `threshold` or more are the vehicles' own. poles: places (3,) of those whose
     sweeps are in the split, world [m].
     """
-    keys, relief = split.data.keys, Ground(split.data).relief
+    keys, relief = split.data.keys, DatasetGround(split.data).relief
     own = {i: detect_in(network, [split.data.frame(i)], score_threshold=threshold)[0] for i in frames}
     added = {}
     for pole, place in poles.items():

@@ -2,7 +2,7 @@
 
 Redundant are the tasks of a scenario beyond its first: other vehicles with the same labels and network. All splits have
 as many tasks, thus as many updates by radio. By complexity they are in proportion to the number that the rule of
-`flcav.odd.tasks` gives each scenario; reversed, the least complex has the most.
+`flcav.odd.scenario_tasks` gives each scenario; reversed, the least complex has the most.
 
 Expected, before any run: the most complex scenario gains .01 to .03 AP50 by its further tasks, and the least complex
 loses as much, so that the mean of the scenarios moves by less than .01 and five seeds do not tell it from none.

@@ -18,8 +18,8 @@ from flcav.federation.links.metered import Account
 from flcav.federation.loop import Schedule, federate
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
-from flcav.odd.measure import measure
-from flcav.odd.tasks import Complexity, count_tasks, generate_tasks
+from flcav.odd.measure import measure_domain
+from flcav.odd.scenario_tasks import Complexity, count_tasks, generate_tasks
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.model import Second, pillars_config
 from flcav.perception.objects.task import OBJECTS
@@ -65,7 +65,7 @@ class TriedScenario(Record):
     town: str
     kind: str  # of place
     complexity: Complexity
-    by_rule: int  # number of tasks by the rule of `flcav.odd.tasks`
+    by_rule: int  # number of tasks by the rule of `flcav.odd.scenario_tasks`
     tasks: Mapping[str, int]  # by split
     ap50: Mapping[str, float]  # by number of tasks; 0: the pretrained network
     up_mb: Mapping[str, float]  # uplink by number of tasks
@@ -107,7 +107,7 @@ def split_tasks(by_rule: Sequence[int]) -> dict[str, tuple[int, ...]]:
 
 def find_frames(data: Dataset, kind: str) -> NDArray[np.int64]:
     """Return the numbers of the frames at places of a kind."""
-    measured = measure(data)
+    measured = measure_domain(data)
     return np.array(measured.frames)[measured.columns["junction"] == kind]
 
 

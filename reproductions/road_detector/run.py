@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import parse_config
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.experiments.experiment import Experiment, Options, Outcome, import_map
@@ -133,7 +133,7 @@ def _spin(split: Frames, i: int) -> Spin:
 def _label(split: Frames, i: int, views: Views, config: SecondConfig) -> Boxes:
     """Return the labels by road sensors alone of a vehicle's frame, in its network's frame and range."""
     frame, told = split.data.frame(i), [*views.get(_spin(split, i), {}).values()]
-    sample = label_sample(frame, Boxes.empty(), told, config, choose_lidar(frame), Ground(split.data).relief)
+    sample = label_sample(frame, Boxes.empty(), told, config, choose_lidar(frame), DatasetGround(split.data).relief)
     return sample.boxes[in_range(sample.boxes, config)]
 
 

@@ -13,11 +13,11 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from flcav.driving.driver import Settings
-from flcav.driving.errors import ErrorModel, load_errors
-from flcav.driving.jobs import Job, Sensed, run_jobs
+from flcav.driving.driver import DriverSettings
+from flcav.driving.errors import ErrorModel, load_error_model
+from flcav.driving.jobs import DriveJob, Sensed, run_jobs
 from flcav.driving.loop import Loop
-from flcav.driving.measures import Drive
+from flcav.driving.measures import DriveResult
 from flcav.driving.scenarios import spread_scenarios
 from flcav.driving.studies.importance import paired_difference
 from flcav.experiments.experiment import Experiment, Options, Outcome
@@ -86,23 +86,23 @@ def compare_margins(
     scenarios: int = SCENARIOS,
 ) -> SafetyDistance:
     """Return the trade-off over the package's scenarios and `seeds` seeds; drives are kept in the folder `out`."""
-    model = load_errors()
+    model = load_error_model()
     settings = list_settings()
     drawn = range(FIRST_SEED, FIRST_SEED + seeds)
     pairs = [(scenario, seed) for scenario in spread_scenarios(scenarios) for seed in drawn]
-    tasks = [Job(*pair, loop=Loop(own, LASTS_S)) for own in settings.values() for pair in pairs]
+    tasks = [DriveJob(*pair, loop=Loop(own, LASTS_S)) for own in settings.values() for pair in pairs]
     drives = run_jobs(tasks, Sensed("model", model), jobs, progress, out / "drives.jsonl")
     by_name = {name: drives[i * len(pairs) : (i + 1) * len(pairs)] for i, name in enumerate(settings)}
     return summarise_margins(by_name, model)
 
 
-def list_settings() -> dict[str, Settings]:
+def list_settings() -> dict[str, DriverSettings]:
     """Return the margins that are compared, by name: fixed ones, and multiples of the standard deviation."""
-    fixed = {f"fixed {size:g} m": Settings(size) for size in FIXED_M}
-    return fixed | {f"{size:g} sigma": Settings(0.0, size) for size in SIGMAS}
+    fixed = {f"fixed {size:g} m": DriverSettings(size) for size in FIXED_M}
+    return fixed | {f"{size:g} sigma": DriverSettings(0.0, size) for size in SIGMAS}
 
 
-def summarise_margins(drives: Mapping[str, Sequence[Drive]], model: ErrorModel) -> SafetyDistance:
+def summarise_margins(drives: Mapping[str, Sequence[DriveResult]], model: ErrorModel) -> SafetyDistance:
     """Return the trade-off of the drives under each of `list_settings`, which are of the same scenarios and seeds."""
     settings = list_settings()
     results = tuple(summarise(name, settings[name], own) for name, own in drives.items())
@@ -120,7 +120,7 @@ def summarise_margins(drives: Mapping[str, Sequence[Drive]], model: ErrorModel) 
     )
 
 
-def summarise(name: str, settings: Settings, drives: Sequence[Drive]) -> MarginResult:
+def summarise(name: str, settings: DriverSettings, drives: Sequence[DriveResult]) -> MarginResult:
     """Return the measures of one setting."""
 
     def mean(field: str) -> float:

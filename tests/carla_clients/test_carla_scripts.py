@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
 

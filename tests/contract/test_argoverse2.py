@@ -13,9 +13,9 @@ from scipy.spatial.transform import Rotation
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.checks.copies import find_copies
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.formats.reading import difference_tracks
+from flcav.dataset.scene_checks import find_copies
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import find_leaks, validate
 from flcav.geometry import inverse, transform_points

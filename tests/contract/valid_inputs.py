@@ -15,8 +15,8 @@ from PIL import Image
 from task_drives import HEIGHT, WIDTH, Drives
 
 import flcav.world
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.conversion import export
+from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose

@@ -2,9 +2,9 @@
 
 from typing import Any
 
-from flcav.sources.carla.server import calls as carla_calls
-from flcav.sources.carla.server.blueprints import list_blueprints
-from flcav.sources.carla.server.calls import Calls
+from flcav.carla.server import calls as carla_calls
+from flcav.carla.server.blueprints import list_blueprints
+from flcav.carla.server.calls import Calls
 
 
 def invoke(calls: Calls, name: str, arguments: tuple[Any, ...]) -> Any:

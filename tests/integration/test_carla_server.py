@@ -13,8 +13,8 @@ import msgpack
 import pytest
 from waiting import LONGEST_S
 
+from flcav.carla.server import wire
 from flcav.cli.main import run
-from flcav.sources.carla.server import wire
 
 SESSION = Path(__file__).with_name("carla_session.py")
 SESSIONS = (
@@ -84,7 +84,7 @@ def _ask(port: int, message: bytes) -> bytes:
 
 def test_messages_that_no_client_sends_leave_the_server_up(port):
     rng = random.Random(0)
-    version = wire.pack([0, 1, "version", [[False]]])
+    version = wire.pack_value([0, 1, "version", [[False]]])
     for _ in range(200):
         mutated = bytearray(version)
         mutated[rng.randrange(len(mutated))] = rng.randrange(256)
@@ -99,7 +99,7 @@ def test_a_cue_is_answered_after_the_state_of_its_tick(port):
         unpacker = msgpack.Unpacker()
 
         def call(method, *arguments):
-            link.sendall(wire.pack([0, 1, method, [[False], *arguments]]))
+            link.sendall(wire.pack_value([0, 1, method, [[False], *arguments]]))
             while True:
                 unpacker.feed(link.recv(1 << 16))
                 for _, _, error, answer in unpacker:
@@ -107,7 +107,7 @@ def test_a_cue_is_answered_after_the_state_of_its_tick(port):
                     return answer[0][1]
 
         try:
-            call("set_episode_settings", wire.Settings(synchronous=True, fixed_dt_s=0.05).packed())
+            call("set_episode_settings", wire.EpisodeSettings(synchronous=True, fixed_dt_s=0.05).packed())
             _, (token,) = call("get_episode_info")
             stream.connect(("127.0.0.1", port + 1))
             stream.sendall(token[:4])
@@ -117,7 +117,7 @@ def test_a_cue_is_answered_after_the_state_of_its_tick(port):
                 state = stream.recv(1 << 20, socket.MSG_DONTWAIT)
                 assert int.from_bytes(state[12:20], "little") == frame
         finally:
-            call("set_episode_settings", wire.Settings().packed())
+            call("set_episode_settings", wire.EpisodeSettings().packed())
 
 
 @pytest.mark.parametrize(
@@ -135,8 +135,14 @@ def test_it_ends_without_a_word_about_its_clients_and_leaves_nothing(how, code, 
         with socket.create_connection(doors[0]) as link, socket.create_connection(doors[1]) as stream:
             stream.sendall(b"\x01\x00\x00\x00")
             stream.recv(1)
-            link.sendall(wire.pack([0, 1, "set_episode_settings", [[False], wire.Settings(synchronous=True).packed()]]))
-            link.sendall(wire.pack([0, 2, "tick_cue", [[False]]]) * 20_000)  # it makes about a thousand ticks a second
+            link.sendall(
+                wire.pack_value(
+                    [0, 1, "set_episode_settings", [[False], wire.EpisodeSettings(synchronous=True).packed()]]
+                )
+            )
+            link.sendall(
+                wire.pack_value([0, 2, "tick_cue", [[False]]]) * 20_000
+            )  # it makes about a thousand ticks a second
             server.send_signal(how)
             begun = time.monotonic()
             _, errors = server.communicate(timeout=LONGEST_S)

@@ -14,7 +14,7 @@ from test_record_sensors import resign
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.checks.frames import check_points
+from flcav.dataset.frame_checks import check_points
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
 from flcav.sensors.frame import Frame

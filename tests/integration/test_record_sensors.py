@@ -13,12 +13,12 @@ import pytest
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.formats.sweeps import read_sweep
+from flcav.dataset.formats.sweeps import read_cloud_file
 from flcav.dataset.layout import payload_path
 from flcav.dataset.payloads import POINTS
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.dataset.tables import FILES_SCHEMA, write_table
+from flcav.dataset.tables import FILES_SCHEMA, write_rows
 from flcav.dataset.validation import validate
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
@@ -75,7 +75,7 @@ def test_a_recorded_sweep_is_read_as_a_file(recorded: Path):
     for number in range(len(data)):
         for name in data.lidars(number):
             path = recorded / payload_path(name, data.name(number), POINTS)
-            np.testing.assert_array_equal(read_sweep(path), data.frame(number).lidar[name])
+            np.testing.assert_array_equal(read_cloud_file(path), data.frame(number).lidar[name])
 
 
 def resign(folder: Path) -> None:
@@ -83,7 +83,7 @@ def resign(folder: Path) -> None:
     files = pq.read_table(folder / "files.parquet").to_pylist()
     for entry in files:
         entry |= {"bytes": (folder / entry["path"]).stat().st_size, "sha256": sha256(folder / entry["path"])}
-    write_table(pa.Table.from_pylist(files, schema=FILES_SCHEMA), folder / "files.parquet")
+    write_rows(pa.Table.from_pylist(files, schema=FILES_SCHEMA), folder / "files.parquet")
     manifest = json.loads((folder / "manifest.json").read_text())
     for name, entry in manifest["tables"].items():
         entry |= {"bytes": (folder / name).stat().st_size, "sha256": sha256(folder / name)}
@@ -191,7 +191,7 @@ def test_a_wrong_cell(folder: Path, table: str, column: str, value: Any, message
     row = int(np.argmax(rows["pixels"].to_numpy())) if "pixels" in rows.column_names else 0
     cells[row] = value(cells[row]) if callable(value) else value
     at = rows.schema.get_field_index(column)
-    write_table(rows.set_column(at, rows.schema.field(column), pa.array(cells, rows.schema.field(column).type)), path)
+    write_rows(rows.set_column(at, rows.schema.field(column), pa.array(cells, rows.schema.field(column).type)), path)
     resign(folder)
     assert any(re.search(message, problem) for problem in validate(folder))
 
@@ -200,7 +200,7 @@ def test_a_sign_without_a_box_is_refused_by_whoever_reads_its_frame(folder: Path
     rows = pq.read_table(folder / "signs.parquet")
     at = rows.schema.get_field_index("x1")
     none = pa.array([float("nan")] * len(rows), rows.schema.field(at).type)
-    write_table(rows.set_column(at, rows.schema.field(at), none), folder / "signs.parquet")
+    write_rows(rows.set_column(at, rows.schema.field(at), none), folder / "signs.parquet")
     data = Dataset.open(folder)
     with pytest.raises(InputError, match="a sign whose box has no area"):
         data.frame(data.number(rows["frame"][0].as_py()))
@@ -211,7 +211,7 @@ def test_pixels_of_who_is_not_in_the_image(folder: Path):
     pixels = rows["pixels"].to_numpy()
     claimed = pa.array(np.where(pixels == 0, 10_000, pixels), rows.schema.field("pixels").type)
     at = rows.schema.get_field_index("pixels")
-    write_table(rows.set_column(at, rows.schema.field(at), claimed), folder / "views.parquet")
+    write_rows(rows.set_column(at, rows.schema.field(at), claimed), folder / "views.parquet")
     resign(folder)
     assert any("shows 0 pixels of" in problem for problem in validate(folder))
 

@@ -16,7 +16,7 @@ from flcav.config import InputError
 from flcav.dataset.layout import FrameKey, Manifest
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.dataset.tables import FILES_SCHEMA, write_table
+from flcav.dataset.tables import FILES_SCHEMA, write_rows
 from flcav.dataset.validation import check_order, find_leaks, validate
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
@@ -50,7 +50,7 @@ def resign(folder: Path, drop: str | None = None) -> None:
     for entry in files:
         path = folder / entry["path"]
         entry |= {"bytes": path.stat().st_size, "sha256": sha256(path)}
-    write_table(pa.Table.from_pylist(files, schema=FILES_SCHEMA), folder / "files.parquet")
+    write_rows(pa.Table.from_pylist(files, schema=FILES_SCHEMA), folder / "files.parquet")
     for name, entry in manifest["tables"].items():
         entry |= {"bytes": (folder / name).stat().st_size, "sha256": sha256(folder / name)}
     write_json(folder / "manifest.json", manifest)
@@ -63,7 +63,7 @@ def change(folder: Path, table: str, column: str, row: int, value: Any) -> None:
     cells = rows[column].to_pylist()
     cells[row] = value(cells[row]) if callable(value) else value
     position = rows.schema.get_field_index(column)
-    write_table(
+    write_rows(
         rows.set_column(position, rows.schema.field(column), pa.array(cells, rows.schema.field(column).type)), path
     )
     resign(folder)

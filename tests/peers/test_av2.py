@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from conftest import Peer
 
-from flcav.dataset.formats.argoverse2.read import AXLE_M, CATEGORIES
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.argoverse2 import AXLE_M, CATEGORIES
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.store import Dataset
 from flcav.geometry import transform_points, wrap_angle
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from conftest import Peer
 
-from flcav.dataset.formats.export import export
+from flcav.dataset.formats.conversion import export
 from flcav.dataset.store import Dataset
 
 SCHEMAS = {

@@ -9,8 +9,8 @@ from conftest import Peer
 from numpy.typing import NDArray
 from recorded import echoes_in, in_lidar, points_in
 
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.nuscenes.tables import CATEGORIES
+from flcav.dataset.formats.conversion import export
+from flcav.dataset.formats.nuscenes.files import CATEGORIES
 from flcav.dataset.store import Dataset
 from flcav.sensors.frame import Frame
 

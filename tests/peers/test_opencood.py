@@ -10,7 +10,7 @@ import yaml
 from conftest import Peer
 from recorded import points_in
 
-from flcav.dataset.formats.export import export
+from flcav.dataset.formats.conversion import export
 from flcav.dataset.store import Dataset
 from flcav.geometry import inverse, wrap_angle
 from flcav.sensors.frame import Frame

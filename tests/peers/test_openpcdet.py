@@ -11,9 +11,9 @@ import pytest
 from conftest import Peer
 from recorded import in_lidar, points_in
 
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.conversion import export
 from flcav.dataset.formats.kitti.write import CLASSES
+from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.store import Dataset
 from flcav.geometry import wrap_angle
 

@@ -8,7 +8,7 @@ from conftest import Peer
 
 from flcav.odd.domain import read_domain
 from flcav.odd.openscenario import to_openscenario, write_script
-from flcav.odd.sampling import CASES, Sample, Space, sample_domain
+from flcav.odd.sampling import CASES, SampledScenario, Space, sample_domain
 from flcav.odd.scenery import Scenery
 from flcav.world.map.town import load_town
 from flcav.world.opendrive.exporting import export_town
@@ -17,7 +17,7 @@ CHECKS = 17  # of the checker's bundle
 
 
 @pytest.fixture(scope="module")
-def drawn() -> dict[str, Sample]:
+def drawn() -> dict[str, SampledScenario]:
     space = Space(read_domain("urban"), [Scenery(load_town("ring"))])
     found = {each.case: each for each in sample_domain(space, 300, "sobol").samples}
     assert set(found) == {case for cases in CASES.values() for case in cases}
@@ -25,7 +25,7 @@ def drawn() -> dict[str, Sample]:
 
 
 def test_every_corner_case_is_valid_and_parsed(
-    drawn: dict[str, Sample], peer: Callable[[str], Peer], tmp_path: Path
+    drawn: dict[str, SampledScenario], peer: Callable[[str], Peer], tmp_path: Path
 ) -> None:
     (tmp_path / "ring.xodr").write_text(export_town(load_town("ring")))
     for case, sample in drawn.items():
@@ -38,7 +38,9 @@ def test_every_corner_case_is_valid_and_parsed(
         assert events == len(script.actions)
 
 
-def test_the_checker_finds_what_is_wrong(drawn: dict[str, Sample], peer: Callable[[str], Peer], tmp_path: Path) -> None:
+def test_the_checker_finds_what_is_wrong(
+    drawn: dict[str, SampledScenario], peer: Callable[[str], Peer], tmp_path: Path
+) -> None:
     right = to_openscenario(drawn["crash"], "ring.xodr")
     (tmp_path / "unknown.xosc").write_bytes(right.replace(b'<EntityRef entityRef="car_1"', b'<EntityRef entityRef="x"'))
     (tmp_path / "schema.xosc").write_bytes(right.replace(b'author="flcav"', b'author="flcav" mood="x"'))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from conftest import Peer
 
-from flcav.dataset.formats.export import export
+from flcav.dataset.formats.conversion import export
 from flcav.dataset.rectangles import CLASSES
 from flcav.dataset.store import Dataset
 

@@ -9,8 +9,8 @@ import pytest
 import yaml
 from conftest import PEERS, Peer
 
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.conversion import export
+from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
 

@@ -15,8 +15,7 @@ import pytest
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import export, import_dataset
 from flcav.dataset.recording.recorder import record
 from flcav.interface.progress import ignore_progress
 from flcav.machine import locks

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import typer
 
+from flcav.carla.server.blueprints import Quality
 from flcav.cli.terminal import echo
-from flcav.sources.carla.server.catalogue import Quality
 
 carla = typer.Typer(help="CARLA: serve its clients from a town, without a GPU.", no_args_is_help=True)
 
@@ -30,11 +30,11 @@ def serve(
     host: str = typer.Option("127.0.0.1", "--host", help="Address to listen on; anyone who reaches it is served."),
 ) -> None:
     """Serve the clients of CARLA 0.9.16 until interrupted: their scripts run unchanged (docs/carla.md)."""
-    from flcav.sources.carla.server.calls import Calls
-    from flcav.sources.carla.server.maps import Maps
-    from flcav.sources.carla.server.serve import open_doors
-    from flcav.sources.carla.server.serve import serve as serve_calls
-    from flcav.sources.carla.server.wire import VERSION
+    from flcav.carla.server.calls import Calls
+    from flcav.carla.server.maps import Maps
+    from flcav.carla.server.serve import open_doors
+    from flcav.carla.server.serve import serve_clients as serve_calls
+    from flcav.carla.server.wire import VERSION
 
     logging.basicConfig(format="flcav: %(message)s", level=logging.WARNING)
     if not _is_loopback(host):

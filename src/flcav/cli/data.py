@@ -12,7 +12,7 @@ from flcav.dataset.formats.formats import EXPORTS, IMPORTS, export_format
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
-    from flcav.dataset.formats.exporter import LeftOut
+    from flcav.dataset.formats.writing import LeftOut
 
 
 @when_interrupted()
@@ -26,9 +26,9 @@ def record(
 ) -> None:
     """Record a dataset: traffic in a town, seen by the sensors of vehicles and poles, with ground truth."""
     from flcav.dataset.layout import read_manifest, trace_path
+    from flcav.dataset.recording.recorder import open_source
     from flcav.dataset.recording.recorder import record as write
     from flcav.interface import progress
-    from flcav.sources.opening import open_source
     from flcav.sources.recipe import find_recipe, load_recipe, parse_recipe
     from flcav.storage.files import check_writable
     from flcav.world.trace import Trace
@@ -61,8 +61,8 @@ def validate(
     folders: list[Path] = typer.Argument(metavar="DIR...", help="Datasets; several are also checked for leakage."),
 ) -> None:
     """Check datasets: files, tables, boxes against points and traffic, leakage between splits. Exit 1 on a problem."""
-    from flcav.dataset.checks.copies import find_copies
     from flcav.dataset.layout import read_manifest
+    from flcav.dataset.scene_checks import find_copies
     from flcav.dataset.validation import find_leaks
     from flcav.dataset.validation import validate as problems_of
     from flcav.interface import progress
@@ -92,9 +92,9 @@ def import_(
 
     Files that need no conversion are linked to, so they have to stay where they are.
     """
-    from flcav.dataset.checks.copies import find_copies
-    from flcav.dataset.formats.importing import import_dataset
+    from flcav.dataset.formats.conversion import import_dataset
     from flcav.dataset.layout import read_manifest
+    from flcav.dataset.scene_checks import find_copies
     from flcav.dataset.validation import find_leaks
     from flcav.interface import progress
 
@@ -139,8 +139,8 @@ def export(
 ) -> None:
     """Write a dataset in a format that other software reads: docs/formats.md has the tables."""
     from flcav.config import parse_config
-    from flcav.dataset.formats.export import export as write
-    from flcav.dataset.formats.exporter import ExportOptions
+    from flcav.dataset.formats.conversion import export as write
+    from flcav.dataset.formats.writing import ExportOptions
     from flcav.dataset.store import Dataset
     from flcav.interface import progress
 

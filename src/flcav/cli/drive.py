@@ -45,8 +45,8 @@ def drive(
 ) -> Answer:
     """Drive through scenarios in closed loop, and print time to collision, hard brakes, progress and collisions."""
     from flcav.config import InputError
-    from flcav.driving.driver import Settings
-    from flcav.driving.jobs import Job, Sensed, run_jobs
+    from flcav.driving.driver import DriverSettings
+    from flcav.driving.jobs import DriveJob, Sensed, run_jobs
     from flcav.driving.loop import Loop
     from flcav.driving.scenarios import find_scenarios
     from flcav.driving.studies.error_measurement import measure_errors
@@ -67,7 +67,7 @@ def drive(
     if measure is not None:
         check_writable(measure.parent)
     model = read_model(perception, errors)
-    loop = Loop(Settings(margin, sigmas), lasts)
+    loop = Loop(DriverSettings(margin, sigmas), lasts)
     if measure is not None:
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)
@@ -82,7 +82,7 @@ def drive(
         yield from gain.lines()
         return
     with show_progress("drive") as report:
-        tasks = [Job(each, seed, loop=loop) for each in chosen for seed in numbers]
+        tasks = [DriveJob(each, seed, loop=loop) for each in chosen for seed in numbers]
         drives = run_jobs(tasks, Sensed(perception.value, model), jobs, report)
     yield {"drives": [own.as_json() for own in drives]}
     for own in drives:

@@ -5,11 +5,10 @@ from typing import TYPE_CHECKING
 from flcav.interface.fields import lazy_names
 
 if TYPE_CHECKING:
-    from flcav.dataset.formats.export import export
-    from flcav.dataset.formats.exporter import Exported, ExportFormat, ExportOptions, read_frame
+    from flcav.dataset.formats.conversion import export, import_dataset
     from flcav.dataset.formats.formats import EXPORTS, IMPORTS
-    from flcav.dataset.formats.importing import import_dataset
     from flcav.dataset.formats.reading import ImportFormat, LogSource, annotate
+    from flcav.dataset.formats.writing import Exported, ExportFormat, ExportOptions, read_frame
     from flcav.dataset.recording.recorder import record
     from flcav.dataset.store import Dataset
     from flcav.dataset.validation import validate
@@ -19,13 +18,13 @@ PLACES = {
     "record": "flcav.dataset.recording.recorder",
     "Dataset": "flcav.dataset.store",
     "EXPORTS": "flcav.dataset.formats.formats",
-    "export": "flcav.dataset.formats.export",
-    "ExportOptions": "flcav.dataset.formats.exporter",
-    "Exported": "flcav.dataset.formats.exporter",
-    "ExportFormat": "flcav.dataset.formats.exporter",
-    "read_frame": "flcav.dataset.formats.exporter",
+    "export": "flcav.dataset.formats.conversion",
+    "ExportOptions": "flcav.dataset.formats.writing",
+    "Exported": "flcav.dataset.formats.writing",
+    "ExportFormat": "flcav.dataset.formats.writing",
+    "read_frame": "flcav.dataset.formats.writing",
     "IMPORTS": "flcav.dataset.formats.formats",
-    "import_dataset": "flcav.dataset.formats.importing",
+    "import_dataset": "flcav.dataset.formats.conversion",
     "ImportFormat": "flcav.dataset.formats.reading",
     "LogSource": "flcav.dataset.formats.reading",
     "annotate": "flcav.dataset.formats.reading",

@@ -11,7 +11,7 @@ from flcav.world.map.town import Town
 POLE = "pole"  # prefix of the names of roadside agents; all other agents are vehicles
 
 
-class Ground:
+class DatasetGround:
     """The ground of a dataset's scenes: that of its town, or, where no town is known, that below its vehicles."""
 
     def __init__(self, data: Dataset) -> None:

@@ -1,7 +1,7 @@
-"""Navigation logs of a scene as a Parquet file: one row per vehicle, its samples as lists."""
+"""Navigation logs of a scene as a Parquet file, one row per vehicle with its samples as lists, and their check."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from flcav.config import Config, InputError, parse_config
-from flcav.dataset.checks.navigation import check_log
+from flcav.dataset.frame_checks import FORCE, RATE
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.navigation_log import NavigationLog
 from flcav.storage.files import atomic_path, read_parquet
@@ -77,3 +77,35 @@ def _parse(model: type[Sheet], text: str, where: str) -> Sheet:
     except (ValueError, RecursionError):
         raise InputError(f"{where} has a data sheet that is no JSON") from None
     return parse_config(model, fields, where)
+
+
+GAP = 1.5  # longest time between two IMU samples, in periods of its rate
+FIX_GAP_S = 5.0  # longest time between two fixes
+HIGHEST_M = 1e5
+
+
+def check_log(log: NavigationLog) -> Iterator[str]:
+    """Check that times ascend without gaps, numbers are finite, and places and motions possible.
+
+    Each sentence lacks its subject, the log.
+    """
+    kinds = (
+        ("fixes", log.fix_time_s, log.fix, FIX_GAP_S),
+        ("IMU samples", log.imu_time_s, log.inertia, GAP / log.unit.rate_hz),
+    )
+    for kind, times_s, values, longest_s in kinds:
+        if len(times_s) != len(values) or len(times_s) < 2:
+            yield f"has {len(values)} {kind} at {len(times_s)} times; two or more are wanted"
+            return
+        if not (np.isfinite(times_s).all() and np.isfinite(values).all()):
+            yield f"has {kind} that are not finite"
+            return
+        steps = np.diff(times_s)
+        if steps.min() <= 0:
+            yield f"has {kind} whose time runs backwards after {times_s[steps.argmin()]:.2f} s"
+        elif steps.max() > longest_s:
+            yield f"has no {kind} for {steps.max():.2f} s after {times_s[steps.argmax()]:.2f} s"
+    if (np.abs(log.fix).max(axis=0) > (90, 180, HIGHEST_M)).any():
+        yield "has fixes that are nowhere on Earth"
+    if not (np.abs(log.inertia[:, :3]).max() < FORCE and np.abs(log.inertia[:, 3:]).max() < RATE):
+        yield "reports a motion that nothing survives"

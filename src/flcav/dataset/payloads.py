@@ -2,10 +2,14 @@
 
 All encodings are lossless but that of depth, which rounds the mantissa to DEPTH_BITS. They were chosen by size and CPU
 time, see `benchmarks/bench_recording.py`.
+
+Pictures are upright everywhere in flcav, as the orientation in their EXIF data says (JEITA CP-3451, tag 274): a phone
+stores the rows of its sensor and how it was held.
 """
 
 import io
 import math
+import struct
 import warnings
 from collections.abc import Collection, Iterator
 from pathlib import Path
@@ -14,11 +18,10 @@ from typing import NamedTuple
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import ExifTags, Image
 
 from flcav.config import InputError, check_is_file
 from flcav.dataset.layout import payload_path
-from flcav.dataset.upright import turn_upright
 from flcav.sensors.frame import Frame
 
 DEPTH_BITS = 14  # bits kept of a depth's mantissa: rounds by up to 3 mm at 100 m
@@ -202,3 +205,38 @@ def encode_png(pixels: NDArray) -> bytes:
     data = io.BytesIO()
     Image.fromarray(pixels).save(data, "png", compress_level=1)
     return data.getvalue()
+
+
+TURNS = {
+    2: Image.Transpose.FLIP_LEFT_RIGHT,
+    3: Image.Transpose.ROTATE_180,
+    4: Image.Transpose.FLIP_TOP_BOTTOM,
+    5: Image.Transpose.TRANSPOSE,
+    6: Image.Transpose.ROTATE_270,
+    7: Image.Transpose.TRANSVERSE,
+    8: Image.Transpose.ROTATE_90,
+}
+ON_SIDE = (5, 6, 7, 8)  # orientations that exchange width and height
+
+
+def turn_upright(image: Image.Image) -> Image.Image:
+    """Return an image that was opened and not yet decoded, upright."""
+    turn = TURNS.get(_orientation(image))
+    return image if turn is None else image.transpose(turn)
+
+
+def measure_upright(image: Image.Image) -> tuple[int, int]:
+    """Return width and height [px] of the image upright; it is not decoded."""
+    width, height = image.size
+    return (height, width) if _orientation(image) in ON_SIDE else (width, height)
+
+
+def _orientation(image: Image.Image) -> int:
+    """Return the EXIF orientation, 1 where there is none, or none that is read before the pixels are."""
+    if "exif" not in image.info:
+        return 1
+    try:
+        found = image.getexif().get(ExifTags.Base.Orientation, 1)
+    except (SyntaxError, ValueError, OSError, struct.error):  # damaged; the pixels need not be
+        return 1
+    return found if isinstance(found, int) else 1

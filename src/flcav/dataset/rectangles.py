@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry import Array
 from flcav.sensors.frame import Frame
 from flcav.world.trace import CATEGORIES
 
@@ -19,7 +20,7 @@ class Rectangles:
     """The N labelled 2D bounding boxes of one image."""
 
     label: NDArray[np.int64]  # (N,) index into the chosen list of CLASSES
-    box: NDArray[np.float64]  # (N, 4) left, top, right, bottom of the visible part [px], from the image's corner
+    box: Array  # (N, 4) left, top, right, bottom of the visible part [px], from the image's corner
     pixels: NDArray[np.int64]  # (N,) number of visible pixels
     row: NDArray[np.int64]  # (N,) index into the frame's annotations, or into the image's signs
 

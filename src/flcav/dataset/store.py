@@ -14,10 +14,14 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, path_within, shorten
 from flcav.dataset.calibration import Calibrations, read_calibrations
-from flcav.dataset.checks.calibration import check_calibration
-from flcav.dataset.checks.frames import check_measurements, check_values
-from flcav.dataset.checks.images import check_planes, check_signs, check_views
-from flcav.dataset.frames import decode_annotations, decode_vectors, decode_weather
+from flcav.dataset.frame_checks import (
+    check_calibration,
+    check_measurements,
+    check_planes,
+    check_signs,
+    check_values,
+    check_views,
+)
 from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
@@ -34,7 +38,9 @@ from flcav.dataset.layout import (
 )
 from flcav.dataset.navigation_logs import load_logs
 from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TIMES, read_image, read_plane, read_rows
+from flcav.dataset.rows import decode_annotations, decode_vectors, decode_weather
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, TILTS, read_table
+from flcav.geometry import Array
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.map.town import PACKAGED, Town, load_town
@@ -86,7 +92,7 @@ class Dataset:
         """Return the dataset in the folder `path`; raises `InputError` that names the missing or damaged file.
 
         With `checked`, `InputError` is also raised for impossible values, here and when frames are read: see
-        `flcav.dataset.checks`.
+        `flcav.dataset.frame_checks`.
         """
         folder = Path(path)
         manifest = read_manifest(folder)
@@ -166,7 +172,7 @@ class Dataset:
                 _raise_first(self.folder, check_signs(frame.key, camera, frame.annotations.signs[camera]))
         return frame
 
-    def world_from_agent(self, i: int) -> NDArray[np.float64]:
+    def world_from_agent(self, i: int) -> Array:
         """Return the (4, 4) pose of the agent in frame `i`, as `frame(i)` has it, without reading measurements."""
         return np.array(self._tables["poses"]["world_from_agent"][i].as_py()).reshape(4, 4)
 

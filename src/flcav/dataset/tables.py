@@ -31,89 +31,69 @@ TILT_COLUMNS = ("pitch", "roll")  # [rad], as in `geometry.pose`
 FILES_SCHEMA = pa.schema([("path", pa.string()), ("bytes", pa.int64()), ("sha256", pa.string())])
 
 
-def _numbers(names: Iterable[str]) -> list[tuple[str, pa.DataType]]:
-    return [(name, pa.float64()) for name in names]
+TEXT, WHOLE, NUMBER = pa.string(), pa.int64(), pa.float64()
 
 
+def _columns(kind: pa.DataType, *names: str) -> list[tuple[str, pa.DataType]]:
+    return [(name, kind) for name in names]
+
+
+SEEN = _columns(TEXT, "frame", "sensor")
+ROW = ("row", WHOLE)  # index into the frame's annotations
 SCHEMAS: dict[str, pa.Schema] = {
     "frames": pa.schema(
         [
-            ("key", pa.string()),
-            ("scene", pa.string()),
-            ("index", pa.int64()),  # spin number within the scene
-            ("agent", pa.string()),
-            ("time_s", pa.float64()),
-            ("lidar", pa.list_(pa.string())),  # names of LiDARs, which are folders of point clouds
-            ("points", pa.list_(pa.int64())),  # number of points of each LiDAR
-            ("radar", pa.list_(pa.string())),
-            ("detections", pa.list_(pa.int64())),  # number of detections of each radar
-            ("cameras", pa.list_(pa.string())),
-            ("infrared", pa.list_(pa.string())),
-            ("annotations", pa.int64()),  # number of rows of the frame in `annotations`
+            *_columns(TEXT, "key", "scene"),
+            ("index", WHOLE),  # spin number within the scene
+            ("agent", TEXT),
+            ("time_s", NUMBER),
+            ("lidar", pa.list_(TEXT)),  # names of LiDARs, which are folders of point clouds
+            ("points", pa.list_(WHOLE)),  # number of points of each LiDAR
+            ("radar", pa.list_(TEXT)),
+            ("detections", pa.list_(WHOLE)),  # number of detections of each radar
+            *_columns(pa.list_(TEXT), "cameras", "infrared"),
+            ("annotations", WHOLE),  # number of rows of the frame in `annotations`
         ]
     ),
     "poses": pa.schema(
         [
-            ("frame", pa.string()),
-            ("world_from_agent", pa.list_(pa.float64(), 16)),  # at the spin, row-major
-            ("triggered", pa.list_(pa.string())),  # sensors with another trigger time than the spin
-            ("world_from_agent_then", pa.list_(pa.float64())),  # at each of these times, 16 numbers, row-major
+            ("frame", TEXT),
+            ("world_from_agent", pa.list_(NUMBER, 16)),  # at the spin, row-major
+            ("triggered", pa.list_(TEXT)),  # sensors with another trigger time than the spin
+            ("world_from_agent_then", pa.list_(NUMBER)),  # at each of these times, 16 numbers, row-major
         ]
     ),
     "annotations": pa.schema(
         [
-            ("frame", pa.string()),
-            ("track", pa.string()),
-            ("category", pa.string()),
-            *_numbers(BOX_COLUMNS),  # geometric centre and size [m], yaw [rad], world frame
-            *_numbers(VELOCITY_COLUMNS),  # world frame [m/s]
-            *_numbers(ACCELERATION_COLUMNS),  # world frame [m/s^2]
-            ("returns", pa.int64()),
-            ("occlusion", pa.float64()),
+            *_columns(TEXT, "frame", "track", "category"),
+            *_columns(NUMBER, *BOX_COLUMNS),  # geometric centre and size [m], yaw [rad], world frame
+            *_columns(NUMBER, *VELOCITY_COLUMNS, *ACCELERATION_COLUMNS),  # world frame [m/s], [m/s^2]
+            ("returns", WHOLE),
+            ("occlusion", NUMBER),
         ]
     ),
-    "points": pa.schema(  # number of a sensor's points on each actor that has any
+    # number of points of a LiDAR or a radar on each actor that has any
+    "points": pa.schema([*SEEN, ROW, ("points", WHOLE)]),
+    "views": pa.schema(  # see `Views`; one row for each actor whose amodal box is not NaN, infrared cameras included
         [
-            ("frame", pa.string()),
-            ("sensor", pa.string()),  # a LiDAR or a radar
-            ("row", pa.int64()),  # index into the frame's annotations
-            ("points", pa.int64()),
-        ]
-    ),
-    "views": pa.schema(  # see `Views`; one row for each actor whose amodal box is not NaN
-        [
-            ("frame", pa.string()),
-            ("sensor", pa.string()),  # a camera or an infrared camera
-            ("row", pa.int64()),  # index into the frame's annotations
-            *_numbers(AMODAL_COLUMNS),
-            *_numbers(VISIBLE_COLUMNS),
-            ("pixels", pa.int64()),
-            ("truncation", pa.float64()),
-            ("occlusion", pa.float64()),
+            *(*SEEN, ROW, *_columns(NUMBER, *AMODAL_COLUMNS, *VISIBLE_COLUMNS)),
+            *(("pixels", WHOLE), *_columns(NUMBER, "truncation", "occlusion")),
         ]
     ),
     "signs": pa.schema(  # see `SignViews`
         [
-            ("frame", pa.string()),
-            ("sensor", pa.string()),
-            ("kind", pa.string()),
-            ("state", pa.string()),
-            *_numbers(RECTANGLE_COLUMNS),
-            ("pixels", pa.int64()),
-            ("distance_m", pa.float64()),
-            ("thing", pa.int64()),
+            *(*SEEN, *_columns(TEXT, "kind", "state"), *_columns(NUMBER, *RECTANGLE_COLUMNS)),
+            *(("pixels", WHOLE), ("distance_m", NUMBER), ("thing", WHOLE)),
         ]
     ),
-    "gnss": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(GNSS_COLUMNS)]),
-    "imu": pa.schema([("frame", pa.string()), ("sensor", pa.string()), *_numbers(IMU_COLUMNS)]),
-    "weather": pa.schema([("frame", pa.string()), *_numbers(WEATHER_COLUMNS)]),
-    TILTS: pa.schema(  # only in datasets with tilted boxes
-        [("frame", pa.string()), ("row", pa.int64()), *_numbers(TILT_COLUMNS)]  # index into the frame's annotations
-    ),
+    "gnss": pa.schema([*SEEN, *_columns(NUMBER, *GNSS_COLUMNS)]),
+    "imu": pa.schema([*SEEN, *_columns(NUMBER, *IMU_COLUMNS)]),
+    "weather": pa.schema([("frame", TEXT), *_columns(NUMBER, *WEATHER_COLUMNS)]),
+    TILTS: pa.schema([("frame", TEXT), ROW, *_columns(NUMBER, *TILT_COLUMNS)]),  # only in datasets with tilted boxes
 }
 
 
-def write_table(table: pa.Table, path: Path) -> None:
+def write_rows(table: pa.Table, path: Path) -> None:
     """Write a table as Parquet with fixed settings, so that equal rows give equal bytes."""
     pq.write_table(table.combine_chunks(), path, row_group_size=ROWS_PER_GROUP, compression="zstd")
 

@@ -1,6 +1,6 @@
 """Validation of a dataset folder, and leakage between datasets of different splits.
 
-The files are checked against the manifest (size, checksum), then their contents by `flcav.dataset.checks`.
+The files are checked against the manifest (size, checksum), then their contents by `frame_checks` and `scene_checks`.
 """
 
 import os
@@ -12,9 +12,9 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import InputError, parse_config, path_within
-from flcav.dataset.checks.calibration import check_calibrations
-from flcav.dataset.checks.copies import find_copies
-from flcav.dataset.checks.frames import (
+from flcav.dataset.frame_checks import (
+    check_calibrations,
+    check_images,
     check_measurements,
     check_points,
     check_sweeps,
@@ -22,9 +22,8 @@ from flcav.dataset.checks.frames import (
     check_triggers,
     check_values,
 )
-from flcav.dataset.checks.images import check_images
-from flcav.dataset.checks.scenes import BlockedViews, EmptyBoxes, check_motion
 from flcav.dataset.layout import MANIFEST, FrameKey, Manifest, navigation_path, read_manifest, trace_path
+from flcav.dataset.scene_checks import BlockedViews, EmptyBoxes, check_motion, find_copies
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import list_files
 from flcav.interface.progress import Report, print_progress

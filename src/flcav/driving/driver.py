@@ -1,5 +1,9 @@
 """A driver: follows a route, keeps its distance, stops at red, and brakes for what is predicted to be in its way.
 
+The corridor of the route tells where and when predicted footprints are in the way. Distances along it are from the
+vehicle's middle. A footprint is taken for `PARTS` points along each of its sides, which are nearer to each other than
+the corridor is wide for vehicles of up to 12 m.
+
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
 corridor at the time at which the vehicle would be there. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
@@ -7,18 +11,84 @@ with all it has. Steering is pure pursuit (Coulter, CMU-RI-TR-92-01, 1992).
 """
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.distance import cdist
 
-from flcav.driving.corridor import Occupied, find_meeting, find_occupied
 from flcav.driving.seen import TIMES_S, Seen
-from flcav.geometry import heading_vectors, rotate
+from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
 from flcav.world.commands import Controls
 from flcav.world.dynamics.vehicle import BodyBlueprint
 from flcav.world.map.roads import Route
 
-Array = NDArray[np.float64]
+PARTS = 6
+SPACING_M = 1.0  # of the points of the route that a place is compared with
+BEHIND_M = 6.0  # how far back, and
+AHEAD_M = 80.0  # ahead the corridor goes
+
+
+class Occupied(NamedTuple):
+    """The part of the corridor that each of N footprints covers at each of T times; empty where `low` > `high`."""
+
+    low: Array  # (N, T) nearest distance along the route [m], inf where it covers none
+    high: Array  # (N, T) farthest, -inf where it covers none
+
+
+def find_occupied(
+    route: Route, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
+) -> Occupied:
+    """Return what footprints cover of the corridor of a vehicle that is `along` the route [m].
+
+    `boxes` give the sizes of N road users, `path` (N, T, 2) and `yaw` (N, T) their poses; `half_width_m` is that of
+    the vehicle, `margin_m` (N, T) what is kept free on all sides of each footprint.
+    """
+    n, times = yaw.shape
+    low, high = np.full((n, times), np.inf), np.full((n, times), -np.inf)
+    marks = np.arange(-BEHIND_M, AHEAD_M, SPACING_M)
+    points = route.at(along + marks)
+    heading, left = heading_vectors(points[:, 2]), left_vectors(points[:, 2])
+    reach = np.hypot(*boxes.size[:, :2].T)[:, None] / 2 + half_width_m + margin_m + SPACING_M
+    row, instant = _find_near(path, points[:, :2], reach)
+    if not len(row):
+        return Occupied(low, high)
+    shares = np.linspace(-0.5, 0.5, PARTS)
+    unit = np.concatenate([np.c_[shares, np.full(PARTS, side)] for side in (-0.5, 0.5)])
+    offset = unit[None] * boxes.size[row, None, :2]
+    turn = yaw[row, instant]
+    corner = path[row, instant][:, None] + offset[..., :1] * heading_vectors(turn)[:, None]
+    corner = corner + offset[..., 1:] * left_vectors(turn)[:, None]  # (M, 2 PARTS, 2)
+    nearest = cdist(corner.reshape(-1, 2), points[:, :2]).argmin(axis=1).reshape(corner.shape[:2])
+    gap = corner - points[nearest, :2]
+    ahead = (gap * heading[nearest]).sum(axis=2)
+    aside = (gap * left[nearest]).sum(axis=2)
+    within = (np.abs(aside) <= half_width_m + margin_m[row, instant][:, None]) & (np.abs(ahead) <= 2 * SPACING_M)
+    sides = aside.min(axis=1) * aside.max(axis=1) < 0  # it reaches across the corridor's middle
+    within |= (sides & ~within.any(axis=1))[:, None] & (np.abs(ahead) <= 2 * SPACING_M)
+    at = marks[nearest] + ahead
+    slack = margin_m[row, instant]
+    low[row, instant] = np.where(within, at, np.inf).min(axis=1) - slack
+    high[row, instant] = np.where(within, at, -np.inf).max(axis=1) + slack
+    return Occupied(low, high)
+
+
+def find_meeting(occupied: Occupied, at: Array, half_length_m: float) -> NDArray[np.bool_]:
+    """Return (N, T) whether a vehicle whose middle is `at` (T,) [m] along the corridor then touches each footprint."""
+    return (occupied.low <= at + half_length_m) & (occupied.high >= at - half_length_m)
+
+
+def _find_near(path: Array, points: Array, reach: Array) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the rows and times of the places (N, T, 2) that are within `reach` (N, T) of the route's `points`."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    about = (path >= low - reach[..., None]) & (path <= high + reach[..., None])
+    row, instant = np.nonzero(about.all(axis=2))
+    if len(row):
+        apart = cdist(path[row, instant], points, "chebyshev").min(axis=1)
+        near = apart < reach[row, instant]
+        row, instant = row[near], instant[near]
+    return row, instant
+
 
 GAIN_MPS2, EASE_MPS2 = 2.0, 2.5  # greatest acceleration, comfortable deceleration
 HEADWAY_S, STANDSTILL_M = 1.2, 2.0
@@ -31,7 +101,7 @@ FARTHEST_GAP_M = 1e3
 
 
 @dataclass(frozen=True)
-class Settings:
+class DriverSettings:
     """Safety margins of a driver: a fixed distance, and a multiple of its perception's uncertainty."""
 
     margin_m: float = 0.4
@@ -39,11 +109,11 @@ class Settings:
     most_m: float = 3.0  # the margin is never more
 
 
-DEFAULT = Settings()
+DEFAULT = DriverSettings()
 
 
 @dataclass(frozen=True)
-class Motion:
+class EgoMotion:
     """Pose and speed of the ego vehicle, by its own navigation."""
 
     x: float  # of the box's middle [m]
@@ -62,7 +132,9 @@ class Decision:
     emergency: bool
 
 
-def decide(route: Route, own: Motion, seen: Seen, vehicle: BodyBlueprint, settings: Settings = DEFAULT) -> Decision:
+def decide_controls(
+    route: Route, own: EgoMotion, seen: Seen, vehicle: BodyBlueprint, settings: DriverSettings = DEFAULT
+) -> Decision:
     """Return the controls for the next tenth of a second."""
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
@@ -83,7 +155,7 @@ def decide(route: Route, own: Motion, seen: Seen, vehicle: BodyBlueprint, settin
     return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency)
 
 
-def find_speed(route: Route, own: Motion, share: float) -> float:
+def find_speed(route: Route, own: EgoMotion, share: float) -> float:
     """Return the speed [m/s] that limits, curves ahead and the weather allow."""
     ahead = own.along + CURVES_M
     turn = np.abs(np.diff(np.unwrap(route.at(np.append(ahead - 1.5, ahead[-1] + 1.5))[:, 2])))
@@ -118,7 +190,7 @@ def _halt(speed: float, wanted: float, gap_m: float) -> float:
     return _follow(speed, wanted, gap_m + STANDSTILL_M, 0.0)
 
 
-def _stop_at_light(route: Route, own: Motion, seen: Seen, half_m: float, wanted: float) -> float:
+def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> float:
     """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
     for stop, link in route.stops:
         gap = stop - LINE_M - own.along - half_m
@@ -131,7 +203,7 @@ def _stop_at_light(route: Route, own: Motion, seen: Seen, half_m: float, wanted:
     return np.inf
 
 
-def _avoid(route: Route, own: Motion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
+def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
     """Return the acceleration for each road user that is, or is going to be, in the way."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
@@ -170,7 +242,7 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: Route, own: Motion, vehicle: BodyBlueprint) -> float:
+def _steer(route: Route, own: EgoMotion, vehicle: BodyBlueprint) -> float:
     """Return the share of the greatest steering angle (pure pursuit)."""
     aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
     ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)

@@ -16,21 +16,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, read_json
-from flcav.driving.following import MOTIONS, Following, Spread
+from flcav.driving.following import MOTIONS, Following, PathSpread
 from flcav.driving.loop import Sensing
-from flcav.driving.networks import LIGHTS_M, load_networks, load_roads
-from flcav.driving.scenarios import Staged
-from flcav.driving.seen import EGO, TIMES_S, WEATHER_SPEED, Perception, Seen
-from flcav.driving.truth import find_around, read_actors, read_lights
-from flcav.driving.visibility import EYE_M, FIELD_M, share_seen
-from flcav.geometry import Boxes, heading_vectors, rotate
+from flcav.driving.networks import LIGHTS_M, load_networks, load_road_map
+from flcav.driving.scenarios import StagedScenario
+from flcav.driving.seen import (
+    EGO,
+    EYE_M,
+    FIELD_M,
+    TIMES_S,
+    WEATHER_SPEED,
+    Perception,
+    Seen,
+    find_around,
+    read_actors,
+    read_lights,
+    share_seen,
+)
+from flcav.geometry import Array, Boxes, heading_vectors, rotate
 from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
 CLASSES = ("Car", "Pedestrian", "Cyclist")
@@ -49,14 +57,14 @@ class ErrorModel(Record):
     lights: tuple[float, float]  # share of the lights in the picture read right, and read wrong
     weather: Mapping[str, Mapping[str, float]]  # by true class: shares of the classes that are named
     spread_factor: float
-    growth: Mapping[str, tuple[float, ...]]  # of `Spread`
+    growth: Mapping[str, tuple[float, ...]]  # of `PathSpread`
     seen: int  # road users in sight, over all frames
     frames: int
 
     @property
-    def spread(self) -> Spread:
+    def spread(self) -> PathSpread:
         """Return the calibrated uncertainty of tracks."""
-        return Spread(self.spread_factor, self.growth)
+        return PathSpread(self.spread_factor, self.growth)
 
 
 def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], Boxes, Array]:
@@ -78,7 +86,7 @@ def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], 
     return rows[seen], Boxes(kept.center, kept.size, kept.yaw, labels), local[seen]
 
 
-def load_errors(path: Path | None = None) -> ErrorModel:
+def load_error_model(path: Path | None = None) -> ErrorModel:
     """Return the error model in a JSON file, by default that of the package; raises `InputError` for another file."""
     path = path or SHIPPED
     model = ErrorModel.from_json(read_json(path), str(path))
@@ -90,11 +98,11 @@ def load_errors(path: Path | None = None) -> ErrorModel:
 class ModelledPerception:
     """Perception with the errors of a model."""
 
-    def __init__(self, model: ErrorModel, staged: Staged, seed: int) -> None:
+    def __init__(self, model: ErrorModel, staged: StagedScenario, seed: int) -> None:
         self._model = model
         self._scene = Scene(staged.town, staged.world.snapshot.trace)
         self._random = stream(seed, "errors", staged.scenario.name)
-        self._following = Following(load_networks().trajectory, load_roads(staged.town.name), model.spread)
+        self._following = Following(load_networks().trajectory, load_road_map(staged.town.name), model.spread)
         self._held: dict[str, tuple[float, float]] = {}
         self._read: dict[str, tuple[float, str]] = {}
         self._signals = staged.town.signals
@@ -162,7 +170,7 @@ class ModelledPerception:
 def sense_model(model: ErrorModel) -> Sensing:
     """Return the constructor of a perception with the errors of a model, for `loop.drive`."""
 
-    def sense(staged: Staged, seed: int) -> Perception:
+    def sense(staged: StagedScenario, seed: int) -> Perception:
         return ModelledPerception(model, staged, seed)
 
     return sense

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from flcav.dataset.layout import FrameKey
 from flcav.driving.seen import TIMES_S, predict_motion
-from flcav.geometry import Boxes, concatenate, heading_vectors, wrap_angle
+from flcav.geometry import Array, Boxes, concatenate, heading_vectors, wrap_angle
 from flcav.perception.tracking import Tracker
 from flcav.perception.trajectory.config import FUTURE, PAST, STEP_S
 from flcav.perception.trajectory.model import TrajectoryNetwork
@@ -24,8 +24,6 @@ from flcav.perception.trajectory.rasters import RoadMap
 from flcav.perception.trajectory.samples import Sample, extract_columns
 from flcav.perception.trajectory.tracks import OFFSETS_S, Tracks, out_of_frame
 from flcav.world.trace import Trace
-
-Array = NDArray[np.float64]
 
 KEPT_S = 0.45
 EVERY_S = 0.5  # between two forecasts of a track
@@ -50,7 +48,7 @@ def head_forward(yaw: Array, velocity: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class Spread:
+class PathSpread:
     """Calibrated uncertainty: factors of the variances of boxes, and the growth of the error of predicted paths."""
 
     factor: float = 1.0  # of the variances of tracked positions
@@ -59,11 +57,11 @@ class Spread:
     )  # by motion: deviation at `TIMES_S`, each axis [m]
 
 
-CERTAIN = Spread()
+CERTAIN = PathSpread()
 
 
 @dataclass(frozen=True)
-class Followed:
+class FollowedTracks:
     """Tracks at one instant with their forecasts, in the fields of `Seen`."""
 
     boxes: Boxes
@@ -90,11 +88,11 @@ class _Known:
 class Following:
     """Follows detections through a drive; a network of None forecasts constant velocity for all."""
 
-    def __init__(self, network: TrajectoryNetwork | None, roads: RoadMap | None, spread: Spread = CERTAIN) -> None:
+    def __init__(self, network: TrajectoryNetwork | None, roads: RoadMap | None, spread: PathSpread = CERTAIN) -> None:
         self._tracker, self._known = Tracker(), dict[int, _Known]()
         self._network, self._roads, self._spread = network, roads, spread
 
-    def step(self, found: Boxes, time_s: float, closed: frozenset[str]) -> Followed:
+    def step(self, found: Boxes, time_s: float, closed: frozenset[str]) -> FollowedTracks:
         """Return the tracks at `time_s` by the detections `found` (world frame) and the lights that are closed."""
         told = self._tracker.step(found, time_s)
         boxes = replace(told.boxes, yaw=head_forward(told.boxes.yaw, told.velocity))
@@ -109,12 +107,12 @@ class Following:
             self._forecast(self._network, self._roads, time_s, closed)
         return self._report(time_s)
 
-    def _report(self, time_s: float) -> Followed:
+    def _report(self, time_s: float) -> FollowedTracks:
         numbers = sorted(self._known)
         rows = [self._known[n] for n in numbers]
         if not rows:
             none = np.zeros((0, len(TIMES_S)))
-            return Followed(
+            return FollowedTracks(
                 Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none, ()
             )
         boxes, velocity = concatenate([each.box for each in rows]), np.array([each.velocity for each in rows])
@@ -128,7 +126,7 @@ class Following:
         growth = np.array([self._spread.growth.get(each, (0.0,) * len(TIMES_S)) for each in motions])
         now = np.zeros(len(rows)) if boxes.variance is None else boxes.variance[:, :2].mean(axis=1)
         spread = np.sqrt(self._spread.factor * now[:, None] + growth**2)
-        return Followed(boxes, np.array(numbers, np.int64), velocity, path, yaw, spread, motions)
+        return FollowedTracks(boxes, np.array(numbers, np.int64), velocity, path, yaw, spread, motions)
 
     def _forecast(self, network: TrajectoryNetwork, roads: RoadMap, time_s: float, closed: frozenset[str]) -> None:
         """Give the tracks that have a past of two seconds a new forecast, where their last one is old."""

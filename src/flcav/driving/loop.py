@@ -5,11 +5,19 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.driving.driver import DEFAULT, Motion, Settings, decide
-from flcav.driving.measures import HARD_MPS2, NEAR_S, STANDS_MPS, Drive, Hit, judge_collision, measure_ttc, score_drive
-from flcav.driving.scenarios import DT_S, Scenario, Staged
-from flcav.driving.seen import EGO, Perception
-from flcav.driving.truth import Truth, read_lights
+from flcav.driving.driver import DEFAULT, DriverSettings, EgoMotion, decide_controls
+from flcav.driving.measures import (
+    HARD_MPS2,
+    NEAR_S,
+    STANDS_MPS,
+    DriveResult,
+    Hit,
+    judge_collision,
+    measure_ttc,
+    score_drive,
+)
+from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
+from flcav.driving.seen import EGO, Perception, TruePerception, read_lights
 from flcav.geometry import heading_vectors
 from flcav.world.map.roads import Route
 from flcav.world.snapshot import Snapshot
@@ -17,40 +25,42 @@ from flcav.world.snapshot import Snapshot
 LASTS_S = 30.0
 ENDS_M = 15.0  # before the end of the route a drive ends
 
-Sensing = Callable[[Staged, int], Perception]  # makes the perception of a drive, by its scenario and seed
+Sensing = Callable[[StagedScenario, int], Perception]  # makes the perception of a drive, by its scenario and seed
 
 
 @dataclass(frozen=True)
 class Loop:
     """Settings of the closed loop."""
 
-    driver: Settings = DEFAULT
+    driver: DriverSettings = DEFAULT
     lasts_s: float = LASTS_S
 
 
 LOOP = Loop()
 
 
-def sense_truth(staged: Staged, seed: int) -> Perception:
+def sense_truth(staged: StagedScenario, seed: int) -> Perception:
     """Return ground-truth perception."""
-    return Truth(staged.scenario.weather)
+    return TruePerception(staged.scenario.weather)
 
 
-def drive(scenario: Scenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP) -> Drive:
+def drive_scenario(
+    scenario: DrivingScenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP
+) -> DriveResult:
     """Return the measures of a closed-loop drive through a scenario with a seed, on the perception that `sense` makes.
 
     It ends with a collision at fault, near the end of the route, or after its time. Raises `InputError` where the town
     has no room for the ego vehicle, and what the perception raises.
     """
-    staged = Staged(scenario, seed)
+    staged = StagedScenario(scenario, seed)
     try:
         return _drive(staged, seed, sense(staged, seed), loop)
     finally:
         staged.world.close()
 
 
-def _drive(staged: Staged, seed: int, perception: Perception, loop: Loop) -> Drive:
-    world, route, truth = staged.world, staged.route, Truth(staged.scenario.weather)
+def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop) -> DriveResult:
+    world, route, truth = staged.world, staged.route, TruePerception(staged.scenario.weather)
     body = world.bodies.find(EGO).blueprint
     size = (body.size[0], body.size[1])
     now, along = world.snapshot, staged.start_m
@@ -60,7 +70,7 @@ def _drive(staged: Staged, seed: int, perception: Perception, loop: Loop) -> Dri
         own = find_motion(now, route, along)
         staged.act(own.along, own.speed)
         now = world.snapshot
-        controls = decide(route, own, perception.look(now), body, loop.driver).controls
+        controls = decide_controls(route, own, perception.look(now), body, loop.driver).controls
         ttc.append(measure_ttc(route, own, truth.look(now), size))
         before, now = now, world.step({EGO: controls})
         after = find_motion(now, route, own.along)
@@ -82,7 +92,7 @@ def _drive(staged: Staged, seed: int, perception: Perception, loop: Loop) -> Dri
     allowed = _allowed(route, staged.start_m, loop.lasts_s if along <= route.length_m - ENDS_M else now.time_s)
     progress = min((along - staged.start_m) / allowed, 1.0)
     least, near = np.array(ttc), np.array(ttc) < NEAR_S
-    return Drive(
+    return DriveResult(
         scenario=staged.scenario.name,
         seed=seed,
         time_s=now.time_s,
@@ -97,16 +107,16 @@ def _drive(staged: Staged, seed: int, perception: Perception, loop: Loop) -> Dri
     )
 
 
-def find_motion(snapshot: Snapshot, route: Route, near: float) -> Motion:
+def find_motion(snapshot: Snapshot, route: Route, near: float) -> EgoMotion:
     """Return the motion of the ego vehicle, which was `near` [m] along the route a moment ago."""
     trace, row = snapshot.trace, snapshot.row(EGO)
     x, y = trace.position[0, row, :2].tolist()
     yaw = float(trace.yaw[0, row])
     along, _ = route.project(x, y, near)
-    return Motion(x, y, yaw, float(trace.velocity[0, row, :2] @ heading_vectors(yaw)), along)
+    return EgoMotion(x, y, yaw, float(trace.velocity[0, row, :2] @ heading_vectors(yaw)), along)
 
 
-def _pass_red(route: Route, own: Motion, after: Motion, length_m: float, snapshot: Snapshot) -> int:
+def _pass_red(route: Route, own: EgoMotion, after: EgoMotion, length_m: float, snapshot: Snapshot) -> int:
     """Return how many stop lines the front has passed at red between two steps."""
     closed, amber = read_lights(snapshot)
     front, next_front = own.along + length_m / 2, after.along + length_m / 2

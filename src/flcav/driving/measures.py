@@ -10,17 +10,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from flcav.driving.corridor import find_meeting, find_occupied
-from flcav.driving.driver import Motion
+from flcav.driving.driver import EgoMotion, find_meeting, find_occupied
 from flcav.driving.seen import EGO, TIMES_S, Seen
 from flcav.geometry import heading_vectors
 from flcav.storage.records import Record
 from flcav.world.map.roads import Route
 from flcav.world.snapshot import Collision, Snapshot
-
-Array = NDArray[np.float64]
 
 HARD_MPS2 = 4.0  # deceleration of a hard brake
 STANDS_MPS = 0.3
@@ -40,7 +36,7 @@ class Hit(Record):
 
 
 @dataclass(frozen=True)
-class Drive(Record):
+class DriveResult(Record):
     """The measures of one drive."""
 
     scenario: str
@@ -75,7 +71,7 @@ def score_drive(progress: float, hits: Sequence[Hit], red_lights: int) -> float:
     return progress * penalty * PENALTY["red light"] ** red_lights
 
 
-def measure_ttc(route: Route, own: Motion, truth: Seen, size: tuple[float, float]) -> float:
+def measure_ttc(route: Route, own: EgoMotion, truth: Seen, size: tuple[float, float]) -> float:
     """Return the time to collision [s] by true states, if all keep their motion; the horizon if there is no collision.
 
     The ego vehicle, `size` its length and width [m], keeps its speed along the route.

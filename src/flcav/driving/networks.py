@@ -11,9 +11,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.driving.following import CERTAIN, Followed, Following, Spread
-from flcav.driving.road import RoadUnits, fuse
-from flcav.driving.scenarios import Staged
+from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
+from flcav.driving.road import RoadUnits, merge_detections
+from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
 from flcav.geometry import Boxes, heading_vectors, inverse, transform_points
 from flcav.perception.networks import resolve_network
@@ -63,7 +63,7 @@ def load_networks() -> Networks:
 
 
 @lru_cache(maxsize=4)
-def load_roads(town: str) -> RoadMap:
+def load_road_map(town: str) -> RoadMap:
     """Return the map of a town for forecasts, cached."""
     return road_map(load_town(town))
 
@@ -118,19 +118,21 @@ class LightReader:
 class NetworkPerception:
     """Perception of a drive by the networks, from its sensors."""
 
-    def __init__(self, staged: Staged, seed: int, *, spread: Spread = CERTAIN, road: RoadUnits | None = None) -> None:
+    def __init__(
+        self, staged: StagedScenario, seed: int, *, spread: PathSpread = CERTAIN, road: RoadUnits | None = None
+    ) -> None:
         """Take a drive, its seed, how uncertain tracks are, and the poles that send what they find, if any."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
         self.weather = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
         self.lights = LightReader(staged.town)
-        self._following = Following(self.networks.trajectory, load_roads(staged.town.name), spread)
+        self._following = Following(self.networks.trajectory, load_road_map(staged.town.name), spread)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
         self.own = self.found = Boxes.empty()  # of the last look, world frame: the vehicle's own, and with the road's
-        self.followed: Followed | None = None
+        self.followed: FollowedTracks | None = None
 
     def look(self, snapshot: Snapshot) -> Seen:
         """Return the networks' perception at this instant."""
@@ -146,7 +148,7 @@ class NetworkPerception:
         found = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
         self.own = self.found = found.transform(frame.assumed_world_from_sensor(LIDAR))
         if self._road is not None:
-            self.found = fuse(self.own, self._road.receive(self.scene, snapshot))
+            self.found = merge_detections(self.own, self._road.receive(self.scene, snapshot))
         closed, amber = self.lights.closed(snapshot.time_s)
         told = self._following.step(self.found, snapshot.time_s, closed)
         self.followed = told
@@ -161,6 +163,6 @@ class NetworkPerception:
         return network.config.classes[int(shares.argmax())]
 
 
-def sense_networks(staged: Staged, seed: int) -> NetworkPerception:
+def sense_networks(staged: StagedScenario, seed: int) -> NetworkPerception:
     """Return the perception by the networks of the package, for `loop.drive`."""
     return NetworkPerception(staged, seed)

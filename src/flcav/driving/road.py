@@ -10,7 +10,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.driving.seen import EGO
 from flcav.fusion.road import THRESHOLD, load_road_network
@@ -27,8 +26,6 @@ from flcav.world.map.town import Town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.trace import empty_trace
-
-Array = NDArray[np.float64]
 
 SPIN_S = 0.5  # between two messages of a pole
 DETECTS_S = 0.1  # from the end of a spin to the boxes
@@ -117,7 +114,7 @@ def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
     return learn_background(sweeps)
 
 
-def fuse(own: Boxes, road: Boxes) -> Boxes:
+def merge_detections(own: Boxes, road: Boxes) -> Boxes:
     """Return the vehicle's own boxes, and those of the road that are none of them."""
     if not len(road):
         return own

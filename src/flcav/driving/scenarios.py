@@ -33,7 +33,7 @@ LEAD = "lead"
 
 
 @dataclass(frozen=True)
-class Scenario:
+class DrivingScenario:
     """Driving scenario: town, event and weather; a seed makes a drive of it."""
 
     name: str
@@ -44,18 +44,18 @@ class Scenario:
     pedestrians: int
 
 
-def list_scenarios() -> tuple[Scenario, ...]:
+def list_scenarios() -> tuple[DrivingScenario, ...]:
     """Return the scenarios of the package: every town with each event in clear weather, and in rain or fog in turn."""
     bad = ("fog", "heavy_rain")
     events: tuple[Event, ...] = ("none", "walker", "stalled", "braking")
     found = []
     for (i, town), (j, event) in product(enumerate(TOWNS), enumerate(events)):
         for weather in ("clear", bad[(i + j) % 2]):
-            found.append(Scenario(f"{town}-{event}-{weather}", town, event, weather, 25, 8))
+            found.append(DrivingScenario(f"{town}-{event}-{weather}", town, event, weather, 25, 8))
     return tuple(found)
 
 
-def find_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
+def find_scenarios(names: Sequence[str]) -> tuple[DrivingScenario, ...]:
     """Return the scenarios of these names, or all for none; raises `InputError` for an unknown one."""
     known = {each.name: each for each in list_scenarios()}
     if odd := [name for name in names if name not in known]:
@@ -63,17 +63,17 @@ def find_scenarios(names: Sequence[str]) -> tuple[Scenario, ...]:
     return tuple(known[name] for name in names) or list_scenarios()
 
 
-def spread_scenarios(count: int) -> tuple[Scenario, ...]:
+def spread_scenarios(count: int) -> tuple[DrivingScenario, ...]:
     """Return a number of scenarios that cycle through towns, events and weathers."""
     known = list_scenarios()
     step = 7  # coprime to their number: it goes through all
     return tuple(known[(step * i) % len(known)] for i in range(count))
 
 
-class Staged:
+class StagedScenario:
     """A scenario under way: the world with the ego vehicle at the start of its route, and the event's actors."""
 
-    def __init__(self, scenario: Scenario, seed: int) -> None:
+    def __init__(self, scenario: DrivingScenario, seed: int) -> None:
         """Start the world; raises `InputError` where no room is found for the ego vehicle."""
         self.scenario = scenario
         self.town: Town = load_town(scenario.town)

@@ -10,6 +10,9 @@ from flcav.geometry.boxes import (
     turned_boxes,
 )
 from flcav.geometry.poses import (
+    Array as Array,
+)
+from flcav.geometry.poses import (
     angles_of,
     heading_vectors,
     inverse,

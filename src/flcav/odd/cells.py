@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.geometry import inverse
+from flcav.geometry import Array, inverse
 from flcav.interface.wording import suggest
 from flcav.odd.domain import Domain
 from flcav.odd.measure import Measurements
@@ -23,8 +23,6 @@ from flcav.statistics.estimates import Estimate
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record
 from flcav.world.map.town import Town
-
-Array = NDArray[np.float64]
 
 MISSING = "<missing>"
 CERTAIN_RETURNS = 20  # LiDAR returns from which a missed object is a failure

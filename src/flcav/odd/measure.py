@@ -1,22 +1,37 @@
-"""Measurement of a domain's attributes in a recording, by its ground truth: whole columns at once, no sweep is read."""
+"""Measurement of a domain's attributes in a recording: by its ground truth, and as a vehicle perceives them.
+
+By ground truth whole columns are measured at once, and no sweep is read.
+
+As perceived, the weather network names the class of each picture. Of rain, sight, clouds and sun it says that they are
+in the region of that class; where a limit of the domain lies within the region, the value is missing: the class does
+not decide. Detections to all sides are tracked: pedestrians, and vehicles that move, are the road users around. Scenery
+is the map's at the vehicle's pose, and its speed that of its odometry: both as recorded.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError, parse_config
 from flcav.dataset.store import Dataset
 from flcav.dataset.tables import WEATHER_COLUMNS
+from flcav.geometry import Array
+from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.odd.domain import Value
+from flcav.odd.domain import Domain, Value
 from flcav.odd.scenery import Column, Scenery
+from flcav.perception.agents import frame_reader
+from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_in, look_around
+from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.tracking import Tracked, Tracker
+from flcav.perception.weather.evaluate import predict_probabilities
+from flcav.perception.weather.model import Classifier
+from flcav.perception.weather.samples import reduce_picture
 from flcav.sensors.rig import Rig
 from flcav.storage.records import Record
-from flcav.world.weather import NIGHT_DEG
-
-Array = NDArray[np.float64]
+from flcav.world.weather import NIGHT_DEG, WEATHER_CLASSES, Weather
 
 AROUND_M = 50.0  # within which road users count
 LOW_LIGHT_DEG = 10.0  # sun elevation below which the light is low
@@ -61,7 +76,7 @@ class Span(Record):
         return "unknown" if self.low is None else f"{self.low:g} to {self.high:g}{missing}"
 
 
-def summarise(measured: Measurements) -> tuple[Span, ...]:
+def summarise_measurements(measured: Measurements) -> tuple[Span, ...]:
     """Return the range or the values of each attribute in the frames, in the order of the columns."""
     spans = []
     for name, column in measured.columns.items():
@@ -84,7 +99,7 @@ def select_vehicles(data: Dataset) -> tuple[int, ...]:
     return frames
 
 
-def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
+def measure_domain(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
     """Return the value of each attribute in `frames` (None: all of vehicles), by ground truth.
 
     scenery: that of the recording's town, where it has been read before. What a recording does not say is missing.
@@ -101,7 +116,7 @@ def measure(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery
     columns |= {name: column[list(chosen)] for name, column in describe_weather(weather).items()}
     columns |= {"ego_speed": _speeds(data)[list(chosen)]}
     columns |= {name: column[list(chosen)] for name, column in _count_agents(data).items()}
-    columns |= {name: np.full(len(chosen), number) for name, number in describe_rig(data.manifest.recipe).items()}
+    columns |= {name: np.full(len(chosen), number) for name, number in describe_reach(data.manifest.recipe).items()}
     return Measurements(chosen, columns)
 
 
@@ -126,7 +141,7 @@ def describe_weather(weather: Mapping[str, Array]) -> dict[str, Column]:
     }
 
 
-def describe_rig(recipe: Mapping[str, object]) -> dict[str, float]:
+def describe_reach(recipe: Mapping[str, object]) -> dict[str, float]:
     """Return the field of view [deg] and the range [m] of a recipe's vehicle rig; NaN without a recipe."""
     if "vehicle_rig" not in recipe:
         return {"field_of_view": np.nan, "sensing_range": np.nan}
@@ -205,3 +220,87 @@ def _plain(column: Column) -> list[Value]:
     if column.dtype.kind == "U":
         return [value or None for value in values]
     return [None if value != value else value for value in values]
+
+
+TRACKED_SCORE = 0.3  # lowest score of a detection that is tracked
+MOVING_MPS = 1.0  # a slower vehicle is taken for parked
+PEDESTRIAN = "Pedestrian"
+
+
+def perceive(
+    domain: Domain,
+    data: Dataset,
+    frames: Sequence[int],
+    weather: Classifier | None,
+    objects: Second | None,
+    progress: Report = ignore_progress,
+) -> Measurements:
+    """Return the attributes as a vehicle perceives them in its `frames`; those of a network that is None are missing.
+
+    Raises `InputError` where a frame lacks the camera of the weather network, or the LiDAR of the detector.
+    """
+    known = measure_domain(data, frames)
+    unseen = np.full(len(frames), np.nan)
+    columns: dict[str, Column] = dict(known.columns)
+    columns |= describe_weather(dict.fromkeys(Weather.model_fields, unseen))
+    columns |= {"agents": unseen, "pedestrians": unseen}
+    if weather is not None:
+        columns |= _narrow(domain, *map(describe_weather, _see_weather(weather, data, frames)))
+    if objects is not None:
+        columns |= _track_agents(look_around(objects), data, frames, progress)
+    return Measurements(tuple(frames), columns)
+
+
+def _narrow(domain: Domain, low: Mapping[str, Column], high: Mapping[str, Column]) -> dict[str, Column]:
+    """Return the columns (F,) of values between `low` and `high`; missing where a limit lies between these."""
+    limits = {column: domain.limits.get(name, ()) for name, column in domain.bound.items()}
+    out: dict[str, Column] = {}
+    for name, one in low.items():
+        other = high[name]
+        if one.dtype.kind == "U":
+            out[name] = np.where(one == other, one, "")
+            continue
+        least, most = np.minimum(one, other), np.maximum(one, other)
+        straddles = [(least < limit) & (limit < most) for limit in limits.get(name, ())]
+        out[name] = np.where(np.any([np.zeros(len(one), np.bool_), *straddles], axis=0), np.nan, (least + most) / 2)
+    return out
+
+
+def _see_weather(
+    network: Classifier, data: Dataset, frames: Sequence[int]
+) -> tuple[dict[str, Array], dict[str, Array]]:
+    """Return the least and the largest fields (F,) of the class that the network sees in each frame's first camera."""
+    blind = [i for i in frames if not data.cameras(i)]
+    if blind:
+        raise InputError(f"{data.folder}: frame '{data.name(blind[0])}' has no camera, which the weather network needs")
+    pictures = [reduce_picture(data.plane(i, data.cameras(i)[0], "rgb")) for i in frames]
+    likeliest = predict_probabilities(network, pictures).argmax(axis=1)
+    regions = [WEATHER_CLASSES[network.config.classes[number]] for number in likeliest]
+    free = (np.nan, np.nan)
+    ends = {name: np.array([region.get(name, free) for region in regions]) for name in Weather.model_fields}
+    return {name: both[:, 0] for name, both in ends.items()}, {name: both[:, 1] for name, both in ends.items()}
+
+
+def _track_agents(network: Second, data: Dataset, frames: Sequence[int], progress: Report) -> dict[str, Array]:
+    """Return how many moving road users, and pedestrians, are tracked within `AROUND_M` in each frame."""
+    sequences: dict[tuple[str, str], list[int]] = {}
+    for i in frames:
+        sequences.setdefault((data.keys[i].scene, data.keys[i].agent), []).append(i)
+    read, counts = frame_reader(data, network.config.foreground), dict[int, tuple[int, int]]()
+    for sequence in sequences.values():
+        tracker = Tracker(confirm=1)
+        for i in sorted(sequence, key=lambda number: data.keys[number].time_s):
+            frame = read(i)
+            (found,) = detect_in(network, [frame], score_threshold=TRACKED_SCORE)
+            tracked = tracker.step(found.transform(frame.world_from_sensor(choose_lidar(frame))), frame.time_s)
+            counts[i] = _count_tracked(tracked, frame.world_from_agent[:2, 3])
+            progress(len(counts), len(frames), "")
+    agents, walking = np.array([counts[i] for i in frames], dtype=np.float64).reshape(-1, 2).T
+    return {"agents": agents, "pedestrians": walking}
+
+
+def _count_tracked(tracked: Tracked, here: Array) -> tuple[int, int]:
+    near = np.linalg.norm(tracked.boxes.center[:, :2] - here, axis=1) <= AROUND_M
+    walking = tracked.boxes.label == PEDESTRIAN
+    moving = np.linalg.norm(tracked.velocity, axis=1) > MOVING_MPS
+    return int((near & (walking | moving)).sum()), int((near & walking).sum())

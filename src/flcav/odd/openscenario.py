@@ -10,7 +10,7 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from flcav.odd.sampling import Sample
+from flcav.odd.sampling import SampledScenario
 from flcav.world.scenarios.scenario import Kind
 from flcav.world.shapes import SHAPES
 from flcav.world.weather import NO_FOG_M
@@ -27,7 +27,7 @@ Pose = tuple[float, float, float]  # ahead of and left of the ego's start [m], h
 
 
 @dataclass(frozen=True)
-class Actor:
+class Entity:
     """An entity of a scenario beside the ego."""
 
     name: str
@@ -59,7 +59,7 @@ class Aside:
 class Script:
     """What happens in a corner case: actors, and actions that begin together when the trigger fires."""
 
-    actors: tuple[Actor, ...]
+    actors: tuple[Entity, ...]
     actions: tuple[Speed | Aside, ...]
     near: str | None = None  # fires when the ego is within `within_m` of this actor; None: at `BEGINS_S`
     within_m: float = 0.0
@@ -69,30 +69,30 @@ def write_script(case: Kind, limit: float) -> Script:
     """Return the script of a corner case on a street with that speed limit [m/s]."""
     back = math.pi
     if case == "stalled_vehicle":
-        return Script((Actor("stalled", "car", "sedan", (25.0, 0.0, 0.0), limit),), (Speed("stalled", 0.0, 4.0),))
+        return Script((Entity("stalled", "car", "sedan", (25.0, 0.0, 0.0), limit),), (Speed("stalled", 0.0, 4.0),))
     if case == "crash":
-        ahead, behind = (Actor(f"car_{n}", "car", "sedan", (at, 0.0, 0.0), limit) for n, at in ((1, 38.0), (2, 28.0)))
+        ahead, behind = (Entity(f"car_{n}", "car", "sedan", (at, 0.0, 0.0), limit) for n, at in ((1, 38.0), (2, 28.0)))
         return Script((ahead, behind), (Speed("car_1", 0.0, 9.0),))
     if case == "cut_in":
-        car = Actor("neighbour", "car", "hatchback", (8.0, LANE_M, 0.0), 0.9 * limit)
+        car = Entity("neighbour", "car", "hatchback", (8.0, LANE_M, 0.0), 0.9 * limit)
         return Script((car,), (Aside("neighbour", -1, 2.2),))
     if case == "overtaking":
-        slow = Actor("slow", "truck", "box_truck", (70.0, LANE_M, back), 0.5 * limit)
-        fast = Actor("overtaking", "car", "sedan", (85.0, LANE_M, back), limit)
+        slow = Entity("slow", "truck", "box_truck", (70.0, LANE_M, back), 0.5 * limit)
+        fast = Entity("overtaking", "car", "sedan", (85.0, LANE_M, back), limit)
         return Script((slow, fast), (Aside("overtaking", 1, 2.5), Speed("overtaking", 1.2 * limit, 2.0)))
     if case == "pedestrian_behind_van":
-        van = Actor("van", "van", "high_van", (24.0, -2.6, 0.0), 0.0)
-        walker = Actor("walker", "pedestrian", "child", (28.5, -3.2, math.pi / 2), 0.0)
+        van = Entity("van", "van", "high_van", (24.0, -2.6, 0.0), 0.0)
+        walker = Entity("walker", "pedestrian", "child", (28.5, -3.2, math.pi / 2), 0.0)
         return Script((van, walker), (Speed("walker", 2.6, 4.0),), near="walker", within_m=22.0)
-    runner = Actor("runner", "car", "hatchback", (48.0, -35.0, math.pi / 2), 9.0)
+    runner = Entity("runner", "car", "hatchback", (48.0, -35.0, math.pi / 2), 9.0)
     return Script((runner,), (Speed("runner", 12.0, 2.0),), near="runner", within_m=45.0)
 
 
-def to_openscenario(sample: Sample, map_file: str) -> bytes:
+def to_openscenario(sample: SampledScenario, map_file: str) -> bytes:
     """Return the scenario of a sample as OpenSCENARIO XML 1.2, with `map_file` as its OpenDRIVE map."""
     limit = max(sample.limit_kmh / 3.6, 1.0)
     script = write_script(sample.case, limit)
-    ego = Actor("ego", "car", "compact", (0.0, 0.0, 0.0), limit)
+    ego = Entity("ego", "car", "compact", (0.0, 0.0, 0.0), limit)
     root = ElementTree.Element("OpenSCENARIO")
     major, minor = map(str, REVISION)
     told = f"{sample.case} at a {sample.place.kind} of {sample.place.town}"
@@ -115,7 +115,7 @@ def _add(parent: ElementTree.Element, tag: str, **attributes: str | float) -> El
     return ElementTree.SubElement(parent, tag, texts)
 
 
-def _add_entity(entities: ElementTree.Element, actor: Actor) -> None:
+def _add_entity(entities: ElementTree.Element, actor: Entity) -> None:
     shape = next(each for each in SHAPES[actor.category] if each.name == actor.shape)
     named = _add(entities, "ScenarioObject", name=actor.name)
     if actor.category == "pedestrian":
@@ -134,7 +134,7 @@ def _add_entity(entities: ElementTree.Element, actor: Actor) -> None:
     _add(body, "Properties")
 
 
-def _add_start(actions: ElementTree.Element, sample: Sample, actors: Sequence[Actor]) -> None:
+def _add_start(actions: ElementTree.Element, sample: SampledScenario, actors: Sequence[Entity]) -> None:
     """Write the weather, and the place and speed of each actor."""
     weather, sky = (
         sample.weather,

@@ -4,31 +4,34 @@ Three ways to draw: openodd-py's sampler, least covered buckets first; Latin hyp
 (`scipy.stats.qmc`; Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995). A point of the unit cube has one
 axis per attribute that recipes set, one for the corner case and one for the place among those of its kind. An axis goes
 over the buckets inside the domain, equally, and within a bucket uniformly; sight on a logarithmic scale.
+
+A sample becomes the recipe of a recording, with its corner case where and when it is to happen.
 """
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, pairwise
+from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
+import yaml
 from openodd import CoverageReport, OddKnob, OddSampler
 from scipy.stats import qmc
 
-from flcav.config import InputError
+from flcav.config import InputError, Json
 from flcav.odd.domain import Domain, Value
-from flcav.odd.judge import OUTSIDE, judge_values
+from flcav.odd.judge import OUTSIDE, choose_rig, find_inside_places, judge_values
 from flcav.odd.measure import describe_weather, reach_of
-from flcav.odd.realise import choose_rig, find_places
-from flcav.odd.scenery import Place, Scenery
+from flcav.odd.scenery import ScenarioPlace, Scenery
 from flcav.sensors.rig import RIGS
+from flcav.sources.recipe import Recipe, parse_recipe
 from flcav.statistics.streams import stream
+from flcav.storage.files import flush_all, write_json
 from flcav.storage.records import Record
+from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import Kind
 from flcav.world.weather import Weather
-
-Array = NDArray[np.float64]
 
 METHODS = ("coverage", "lhs", "sobol")
 CASES: Mapping[str, tuple[Kind, ...]] = {  # corner cases that a kind of place lends itself to
@@ -67,10 +70,10 @@ class Axis:
 
 
 @dataclass(frozen=True)
-class Sample(Record):
+class SampledScenario(Record):
     """One drawn scenario of a domain."""
 
-    place: Place
+    place: ScenarioPlace
     case: Kind
     weather: Weather
     buckets: Mapping[str, str]  # attribute, and the corner case -> bucket
@@ -82,7 +85,7 @@ class Sample(Record):
 class Sampled:
     """Samples of a domain, and the pairs of buckets that they have."""
 
-    samples: tuple[Sample, ...]
+    samples: tuple[SampledScenario, ...]
     pairs: int  # pairs of buckets of two axes in the samples
     possible: int  # pairs that a sample can have
     refused: int  # points that were outside the domain
@@ -101,9 +104,9 @@ class Space:
 
     def __init__(self, domain: Domain, sceneries: Sequence[Scenery]) -> None:
         domain.require_bound()
-        self.domain = domain
-        self.places: dict[str, list[tuple[Place, dict[str, Value]]]] = {}
-        for place, row in find_places(domain, sceneries):
+        self.domain, self.sceneries = domain, {scenery.town.name: scenery for scenery in sceneries}
+        self.places: dict[str, list[tuple[ScenarioPlace, dict[str, Value]]]] = {}
+        for place, row in find_inside_places(domain, sceneries):
             if cases_at(place):
                 self.places.setdefault(place.kind, []).append((place, row))
         if not self.places:
@@ -148,7 +151,7 @@ class Space:
         given = {each: known[own] for each, own in self.domain.bound.items() if known.get(own) not in (None, "")}
         return self.domain.can_hold({each: one for each, one in given.items() if one == one})
 
-    def realise(self, values: Mapping[str, Value], case: float, place: float) -> Sample | None:
+    def realise(self, values: Mapping[str, Value], case: float, place: float) -> SampledScenario | None:
         """Return the sample with these values, shares in [0, 1) of its cases and places; None if it cannot be.
 
         Where it rains, fewer clouds than `RAIN_CLOUDS` are lifted above it. A sample is refused where the domain is
@@ -180,7 +183,9 @@ class Space:
             for name in self.knobs
             if (item := items[name]) is not None
         }
-        return Sample(here, chosen, weather, {**buckets, CASE: chosen}, self.rig, float(row["speed_limit"] or 0.0))
+        return SampledScenario(
+            here, chosen, weather, {**buckets, CASE: chosen}, self.rig, float(row["speed_limit"] or 0.0)
+        )
 
     def possible_pairs(self) -> set[tuple[tuple[str, str], tuple[str, str]]]:
         """Return the pairs of buckets, of two axes or of an axis and the corner cases, that a sample can have."""
@@ -207,7 +212,7 @@ class Space:
         }
 
 
-def cases_at(place: Place) -> tuple[Kind, ...]:
+def cases_at(place: ScenarioPlace) -> tuple[Kind, ...]:
     """Return the corner cases that can happen at a place."""
     return tuple(case for case in CASES.get(place.kind, ()) if case != LIT or place.control == "signalised")
 
@@ -225,10 +230,12 @@ def sample_domain(
     covered: report of earlier runs, of the method "coverage". Points that are refused are replaced by further ones.
     Raises `InputError` where hardly any point can be realised.
     """
-    samples: list[Sample] = []
+    samples: list[SampledScenario] = []
     refused = 0
     points = (
-        _draw_covering(space, count, seed, covered) if method == "coverage" else draw_points(space, count, method, seed)
+        _draw_covering(space, count, seed, covered)
+        if method == "coverage"
+        else draw_sample_points(space, count, method, seed)
     )
     for values, case, place in points:
         found = space.realise(values, case, place)
@@ -243,7 +250,7 @@ def sample_domain(
     return count_pairs(space, samples, refused)
 
 
-def count_pairs(space: Space, samples: Sequence[Sample], refused: int = 0) -> Sampled:
+def count_pairs(space: Space, samples: Sequence[SampledScenario], refused: int = 0) -> Sampled:
     """Return samples of a space with the pairs of buckets that they have."""
     possible = space.possible_pairs()
     order = [axis.attribute for axis in space.axes] + [CASE]
@@ -255,7 +262,9 @@ def count_pairs(space: Space, samples: Sequence[Sample], refused: int = 0) -> Sa
     return Sampled(tuple(samples), len(had & possible), len(possible), refused)
 
 
-def draw_points(space: Space, count: int, method: str, seed: int) -> Iterator[tuple[dict[str, Value], float, float]]:
+def draw_sample_points(
+    space: Space, count: int, method: str, seed: int
+) -> Iterator[tuple[dict[str, Value], float, float]]:
     """Yield values by attribute and the shares of case and place, without end, in batches of quasi-random points."""
     axes, rng = space.axes, stream(seed, "odd", method)
     sobol = qmc.Sobol(len(axes) + 2, scramble=True, rng=rng)
@@ -283,3 +292,70 @@ def _draw_covering(
         for case in sampler.sample(count) if not drawn else (sampler.draw(drawn + number) for number in range(count)):
             drawn += 1
             yield dict(case.values), float(rng.random()), float(rng.random())
+
+
+WARMUP_S, BEGINS_S = 30.0, 31.0  # of the traffic; from then on the corner case may begin
+SPINS, EVERY_S = 20, 2.0
+CAVS = 6  # the case waits for one of them to come within 50 m of its place
+POLE_M = 40.0  # a pole this near to the place records, too
+INDEX = "samples.json"
+
+
+def make_recipe(sample: SampledScenario, scenery: Scenery, seed: int, split: str = "train") -> dict[str, Json]:
+    """Return the fields of the recipe of a sample, which `parse_recipe` takes."""
+    town, place = scenery.town, sample.place
+    away = np.linalg.norm(town.poles.position[:, :2] - (place.x, place.y), axis=1)
+    near = town.poles.id[np.flatnonzero(away <= POLE_M)[np.argsort(away[away <= POLE_M])][:1]]
+    lasts = {"lasts_s": 10.0} if sample.case == "stalled_vehicle" else {}
+    position = [round(place.x, 1), round(place.y, 1)]
+    return {
+        "town": town.name if town.name in PACKAGED else str(town.net.parent.absolute()),
+        "seed": seed,
+        "split": split,
+        "scenes": 1,
+        "warmup_s": WARMUP_S,
+        "spins_per_scene": SPINS,
+        "every_s": EVERY_S,
+        "cavs": CAVS,
+        "poles": near.tolist(),
+        "vehicle_rig": sample.rig,
+        "weather": {name: round(float(value), 4) for name, value in sample.weather.model_dump().items()},
+        "scenarios": [{"kind": sample.case, "at_s": BEGINS_S, "position": position, **lasts}],
+    }
+
+
+def write_recipes(
+    drawn: Sampled,
+    sceneries: Mapping[str, Scenery],
+    out: Path,
+    seed: int,
+    also: Callable[[SampledScenario, Recipe, Path], None],
+    told: Sequence[Mapping[str, Json]] = (),
+) -> list[Path]:
+    """Write the recipe of each sample as OUT/NUMBER.yaml, and OUT/samples.json last; return the recipes' paths.
+
+    also: called for each sample with its recipe and path; told: further values of each sample in samples.json. Every
+    recipe has been read before it is written. Raises `InputError` where the folder has recipes already.
+    """
+    if out.exists() and any(out.glob("*.yaml")):
+        raise InputError(f"{out}: has recipes already; name another folder")
+    values = [make_recipe(each, sceneries[each.place.town], seed + number) for number, each in enumerate(drawn.samples)]
+    recipes = [parse_recipe(each, f"sample {number}") for number, each in enumerate(values, start=1)]
+    out.mkdir(parents=True, exist_ok=True)
+    paths = [out / f"{number:0{len(str(len(values)))}}.yaml" for number in range(1, len(values) + 1)]
+    for sample, each, recipe, path in zip(drawn.samples, values, recipes, paths, strict=True):
+        path.write_text(yaml.safe_dump(each, sort_keys=False, default_flow_style=None))
+        also(sample, recipe, path)
+    flush_all([*paths, out])
+    summary: dict[str, Json] = {
+        "pairwise": drawn.pairwise,
+        "pairs": drawn.pairs,
+        "possible_pairs": drawn.possible,
+        "refused": drawn.refused,
+        "samples": [
+            {"recipe": path.name, **each.as_json(), **more}
+            for path, each, more in zip(paths, drawn.samples, told or [{}] * len(paths), strict=True)
+        ],
+    }
+    write_json(out / INDEX, summary, sort=False)
+    return paths

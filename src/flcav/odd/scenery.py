@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from shapely.geometry import LineString, Point
 from shapely.geometry.base import BaseGeometry
 
+from flcav.geometry import Array
 from flcav.world.map.roads import LaneConnection, RoadNet, read_net
 from flcav.world.map.town import Town
 
-Array = NDArray[np.float64]
-Column = NDArray[np.float64] | NDArray[np.str_]  # NaN and "" are missing
+Column = Array | NDArray[np.str_]  # NaN and "" are missing
 
 NEAR_M = 15.0  # a frame this near to the area of a junction is at it; so with parking spaces
 LANE_M = 12.0  # from a place to the middle of the lane that it is on, at most
@@ -35,7 +35,7 @@ ROADS = ((100.0, "radial_road"), (55.0, "distributor_road"), (35.0, "minor_road"
 
 
 @dataclass(frozen=True)
-class Place:
+class ScenarioPlace:
     """A place of a town where scenarios happen: the middle of a junction, or of a straight road."""
 
     town: str
@@ -91,11 +91,11 @@ class Scenery:
             "junction_control": controls[junction],
         }
 
-    def places(self) -> tuple[Place, ...]:
+    def places(self) -> tuple[ScenarioPlace, ...]:
         """Return the places of the town, junctions first: every junction, and the middle of every straight road."""
         return (*self._junction_places(), *self._straight_places())
 
-    def measure_places(self, places: Sequence[Place]) -> dict[str, Column]:
+    def measure_places(self, places: Sequence[ScenarioPlace]) -> dict[str, Column]:
         """Return the scenery on the approaches of places, with the kind and control of each: a column per concept."""
         found = self.measure(np.array([place.approach for place in places]), np.array([place.yaw for place in places]))
         kinds, controls = ([getattr(place, name) for place in places] for name in ("kind", "control"))
@@ -123,7 +123,7 @@ class Scenery:
         ahead, behind = (self.town.grounds(*(position + side * step).T) for side in (1, -1))
         return 100 * np.abs(ahead - behind) / (2 * SLOPE_M)
 
-    def _junction_places(self) -> Iterator[Place]:
+    def _junction_places(self) -> Iterator[ScenarioPlace]:
         conflicts = count_conflicts(self.net)
         for kind, control, area in self._areas:
             middle = area.centroid
@@ -137,9 +137,9 @@ class Scenery:
                 line = LineString(leads[0].shape)
                 start, end = _pose_along(line, line.length - BEFORE_M), _pose_along(line, line.length)
                 points = sum(conflicts[name] for name in inside)
-                yield Place(self.town.name, kind, control, middle.x, middle.y, end[:2], end[2], start, points)
+                yield ScenarioPlace(self.town.name, kind, control, middle.x, middle.y, end[:2], end[2], start, points)
 
-    def _straight_places(self) -> Iterator[Place]:
+    def _straight_places(self) -> Iterator[ScenarioPlace]:
         for edge in self.net.streets:
             driving = edge.lanes_of("driving")
             line = LineString(driving[0].shape) if driving else None
@@ -148,7 +148,7 @@ class Scenery:
             start, here, end = (_pose_along(line, line.length / 2 + side) for side in (-STRAIGHT_M, 0.0, STRAIGHT_M))
             chord = float(np.hypot(end[0] - start[0], end[1] - start[1]))
             if chord >= BENT * 2 * STRAIGHT_M and not len(self._near.query(Point(here[:2]), predicate="within")):
-                yield Place(self.town.name, "none", "none", *here[:2], here[:2], here[2], start, 0)
+                yield ScenarioPlace(self.town.name, "none", "none", *here[:2], here[:2], here[2], start, 0)
 
 
 def _name_roads(limit: Array) -> NDArray[np.str_]:

@@ -4,10 +4,13 @@ A naive Bayes model has the rate of failures in each bucket of each axis of a fr
 the town; a rate is drawn from its Beta posterior (Thompson sampling: Russo et al., "A tutorial on Thompson sampling",
 2018), so that what is little known is tried. Of a few Sobol points that scenario is taken whose cells without a failure
 so far promise most, and of its traffic those frames. The plain draws it is compared with have as many of both.
+
+A failure is a missed object of many LiDAR returns in the vehicle's path (`cells.locate_failure`). Two are distinct
+where they are in different cells of a grid that is fixed before any search: by place, class, weather, road users
+around, distance and occlusion.
 """
 
 import hashlib
-import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,29 +19,151 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.config import InputError, Json, read_file
+from flcav.config import InputError, Json
 from flcav.interface.progress import Report, ignore_progress
-from flcav.odd.failures import (
-    CLASSES,
-    GRID,
-    NOBODY,
-    Candidate,
-    Cell,
-    Failure,
-    TriedFrame,
-    list_candidates,
-    take_apart,
-    try_frames,
-    weather_buckets,
-)
-from flcav.odd.recipes import make_recipe
-from flcav.odd.sampling import HARDLY, MOST_TRIES, Sample, Space, draw_points
-from flcav.odd.scenery import Scenery
+from flcav.odd.cells import PATH_AHEAD_M, PATH_ASIDE_M, locate_failure
+from flcav.odd.measure import AROUND_M, PARKED
+from flcav.odd.sampling import HARDLY, MOST_TRIES, SampledScenario, Space, draw_sample_points, make_recipe
 from flcav.perception.objects.model import Second
+from flcav.perception.objects.predict import detect_in
+from flcav.perception.objects.task import find_errors
+from flcav.perception.objects.truth import DETECTION_CLASS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import parse_recipe
 from flcav.statistics.streams import stream
+from flcav.storage.kept import hash_request, keep, read_kept
 from flcav.storage.records import Record, from_json, to_json
+from flcav.world.trace import Trace
+from flcav.world.weather import Weather
+
+SCORE = 0.3  # from which a detection counts
+APART_M = 5.0  # between two tested frames of one vehicle
+GRID: Mapping[str, tuple[float, ...]] = {  # edges between the buckets of numbers
+    "rainfall": (0.3, 5.0),  # [mm/h]
+    "visibility": (400.0, 3000.0),  # [m]
+    "agents": (5.0, 15.0, 30.0),  # that are not parked, within `AROUND_M`
+    "distance": (10.0, 20.0, 30.0),  # ahead [m]
+    "occlusion": (1 / 3, 2 / 3),
+}
+CLASSES = tuple(dict.fromkeys(DETECTION_CLASS.values()))
+NOBODY = ""  # class of a candidate without anybody in the path
+
+Cell = tuple[str, ...]  # kind of place, class, and the bucket of each number of `GRID`
+
+
+@dataclass(frozen=True)
+class CandidateFrame:
+    """A candidate frame of the search: a vehicle at a spin, and the road users in its path."""
+
+    spin: int
+    vehicle: int  # number of "cav0", ...
+    x: float  # of the vehicle [m]
+    y: float
+    cell: Cell  # without occlusion, of the nearest in the path; its class is `NOBODY` where there is none
+    away_m: float  # from the place of the sample
+    plays: bool  # whether the corner case plays
+
+
+@dataclass(frozen=True)
+class Failure(Record):
+    """One failure: a missed object in the path of a vehicle."""
+
+    frame: str  # key in the recording of the recipe
+    cell: Cell
+    distance_m: float
+    returns: int
+
+
+@dataclass(frozen=True)
+class TriedFrame(Record):
+    """A tested frame: the cell of its candidate, and its failures."""
+
+    cell: Cell
+    failures: tuple[Failure, ...]
+
+
+def bucket(name: str, value: float) -> str:
+    """Return the bucket of a number of `GRID`."""
+    return f"{name} {int(np.digitize(value, GRID[name]))}"
+
+
+def weather_buckets(weather: Weather) -> tuple[str, str]:
+    """Return the buckets of rain and of sight."""
+    return bucket("rainfall", weather.rain_mm_h), bucket("visibility", weather.visibility_m)
+
+
+def list_candidates(sample: SampledScenario, trace: Trace, cavs: int, plays_s: float = 12.0) -> list[CandidateFrame]:
+    """Return the frames of connected vehicles in the traffic of a sample's recipe.
+
+    A corner case plays for `plays_s` from its beginning.
+    """
+    names = trace.actor.tolist()
+    rows = [names.index(f"cav{number}") for number in range(cavs)]
+    labels = np.array([DETECTION_CLASS.get(str(each), NOBODY) for each in trace.category])
+    driving = ~np.char.startswith(trace.actor, PARKED)
+    begins_s = trace.events[0].begins_s if trace.events else np.inf
+    found = []
+    for spin, time_s in enumerate(trace.time_s.tolist()):
+        at = np.where(trace.present[spin, :, None], trace.position[spin, :, :2], np.inf)
+        for vehicle, row in enumerate(rows):
+            own, yaw = at[row], float(trace.yaw[spin, row])
+            gap = np.where(np.isfinite(at), at - own, 1e6)
+            ahead = gap @ (np.cos(yaw), np.sin(yaw))
+            aside = gap @ (-np.sin(yaw), np.cos(yaw))
+            path = (ahead > 0) & (ahead <= PATH_AHEAD_M) & (np.abs(aside) <= PATH_ASIDE_M) & (labels != NOBODY)
+            path[row] = False
+            nearest = int(np.argmin(np.where(path, ahead, np.inf)))
+            count = int((driving & (np.hypot(*gap.T) <= AROUND_M)).sum()) - 1
+            cell = (
+                sample.place.kind,
+                str(labels[nearest]) if path.any() else NOBODY,
+                *weather_buckets(sample.weather),
+                bucket("agents", count),
+                bucket("distance", float(ahead[nearest]) if path.any() else np.inf),
+            )
+            away = float(np.hypot(own[0] - sample.place.x, own[1] - sample.place.y))
+            plays = begins_s <= time_s <= begins_s + plays_s
+            found.append(CandidateFrame(spin, vehicle, float(own[0]), float(own[1]), cell, away, plays))
+    return found
+
+
+def take_apart(ranked: Sequence[CandidateFrame], count: int) -> list[CandidateFrame]:
+    """Return the first `count` candidates, without those within `APART_M` of an earlier one of the same vehicle."""
+    taken: list[CandidateFrame] = []
+    for each in ranked:
+        if all(
+            other.vehicle != each.vehicle or np.hypot(other.x - each.x, other.y - each.y) >= APART_M for other in taken
+        ):
+            taken.append(each)
+        if len(taken) == count:
+            break
+    return taken
+
+
+def try_frames(
+    sample: SampledScenario, source: EmbeddedSource, trace: Trace, chosen: Sequence[CandidateFrame], network: Second
+) -> list[TriedFrame]:
+    """Return the failures of a detector in chosen frames of a sample's recording, whose traffic is `trace`."""
+    scene, tested = source.scenes()[0], []
+    for each in chosen:
+        number = each.spin * len(source.agents) + each.vehicle
+        frame = next(source.replay(scene, trace, range(number, number + 1)))
+        found = detect_in(network, [frame], score_threshold=SCORE)
+        marks = frame.annotations
+        away = np.linalg.norm(marks.boxes.center[:, :2] - frame.world_from_agent[:2, 3], axis=1)
+        agents = int((~np.char.startswith(marks.track, PARKED) & (away <= AROUND_M)).sum())
+        failures = []
+        for error in next(find_errors([frame], found, network.config, SCORE)):
+            ahead = locate_failure(frame.world_from_agent, error)
+            if ahead is None:
+                continue
+            numbers = {"agents": float(agents), "distance": ahead, "occlusion": error.occlusion}
+            buckets = (bucket(name, value) for name, value in numbers.items())
+            cell = (sample.place.kind, error.label, *weather_buckets(sample.weather), *buckets)
+            failures.append(Failure(frame.key, cell, ahead, error.returns))
+        tested.append(TriedFrame(each.cell, tuple(failures)))
+    return tested
+
 
 RULES = ("sobol", "path", "failures")
 TESTED = "tested.jsonl"  # kept results beside recipes
@@ -52,7 +177,7 @@ FIRST_RATE = 0.2  # of failures, before the first test
 class Searched(Record):
     """A scenario of a search, with its tested frames."""
 
-    sample: Sample
+    sample: SampledScenario
     seed: int  # of its recipe
     tested: tuple[TriedFrame, ...]
 
@@ -75,7 +200,7 @@ class FailureModel:
     hits: Counter[str] = field(default_factory=Counter)
     failed: Counter[Cell] = field(default_factory=Counter)  # by cell without occlusion
 
-    def learn(self, sample: Sample, tested: Sequence[TriedFrame]) -> None:
+    def learn(self, sample: SampledScenario, tested: Sequence[TriedFrame]) -> None:
         """Take the frames of a scenario into account."""
         for frame in tested:
             names = (*frame.cell, *_context(sample), "any")
@@ -100,7 +225,6 @@ class FailureModel:
 
 def search_failures(
     space: Space,
-    sceneries: Sequence[Scenery],
     network: Second,
     scenarios: int,
     seed: int,
@@ -114,23 +238,25 @@ def search_failures(
     corner case plays; "path" takes frames of them at random, but with somebody in the path. Scenario n has seed + n.
     With `kept`, a file of JSON lines, scenarios in it are not tested again.
     """
-    by_name, model = {scenery.town.name: scenery for scenery in sceneries}, FailureModel()
-    points, known, detector = _realise(space, scenarios, seed), _read(kept), _hash_weights(network)
+    model = FailureModel()
+    points, detector, kind = _realise(space, scenarios, seed), _hash_weights(network), tuple[TriedFrame, ...]
+    known = {key: from_json(kind, held, str(kept)) for key, held in read_kept(kept, "tested").items()}
     done: list[Searched] = []
     for number in range(scenarios):
         rng = stream(seed, "odd", rule, str(number))
         few = [next(points) for _ in range(POINTS if rule == "failures" else 1)]
         sample = choose_scenario(few, model, rng)
-        told = json.dumps([detector, rule, seed, number, sample.as_json()], sort_keys=True)
-        key = hashlib.sha256(told.encode()).hexdigest()[:24]
+        key = hash_request([detector, rule, seed, number, sample.as_json()])
         tested = known.get(key)
         if tested is None:
-            values = make_recipe(sample, by_name[sample.place.town], seed + number)
+            values = make_recipe(sample, space.sceneries[sample.place.town], seed + number)
             source = EmbeddedSource(parse_recipe(values, f"sample {number}"))
             trace = source.trace(source.scenes()[0])
             every = list_candidates(sample, trace, source.recipe.cavs)
-            tested = tuple(try_frames(sample, source, trace, choose_frames(every, sample, model, rule, rng), network))
-            _keep(kept, key, tested)
+            tested = tuple(
+                try_frames(sample, source, trace, choose_candidates(every, sample, model, rule, rng), network)
+            )
+            keep(kept, key, "tested", to_json(tested, kind))
         model.learn(sample, tested)
         done.append(Searched(sample, seed + number, tested))
         progress(number + 1, scenarios, f"{len(distinct(done))} distinct failures")
@@ -142,12 +268,14 @@ def distinct(searched: Sequence[Searched]) -> set[Cell]:
     return {failure.cell for each in searched for failure in each.failures}
 
 
-def choose_scenario(samples: Sequence[Sample], model: FailureModel, rng: np.random.Generator) -> Sample:
+def choose_scenario(
+    samples: Sequence[SampledScenario], model: FailureModel, rng: np.random.Generator
+) -> SampledScenario:
     """Return the sample whose cells promise most, by one draw of the rates."""
     ratios = model.draw_ratios(rng)
     agents, distances = ([f"{name} {i}" for i in range(len(GRID[name]) + 1)] for name in ("agents", "distance"))
 
-    def promise(sample: Sample) -> float:
+    def promise(sample: SampledScenario) -> float:
         names, weather = _context(sample), weather_buckets(sample.weather)
         return sum(
             model.promise(names, (sample.place.kind, label, *weather, *rest), ratios)
@@ -157,9 +285,9 @@ def choose_scenario(samples: Sequence[Sample], model: FailureModel, rng: np.rand
     return max(samples, key=promise)
 
 
-def choose_frames(
-    every: Sequence[Candidate], sample: Sample, model: FailureModel, rule: str, rng: np.random.Generator
-) -> list[Candidate]:
+def choose_candidates(
+    every: Sequence[CandidateFrame], sample: SampledScenario, model: FailureModel, rule: str, rng: np.random.Generator
+) -> list[CandidateFrame]:
     """Return the frames of a scenario to test, by a rule of `RULES`."""
     near = sorted(every, key=lambda each: (not each.plays, each.away_m))
     if rule == "sobol":
@@ -174,15 +302,15 @@ def choose_frames(
     return take_apart([*(each for each in ranked if firsts[each.cell] is each), *ranked, *near], FRAMES)
 
 
-def _context(sample: Sample) -> tuple[str, ...]:
+def _context(sample: SampledScenario) -> tuple[str, ...]:
     """Return the further features that a rate depends on, beside those of the cell."""
     return f"case {sample.case}", f"town {sample.place.town}"
 
 
-def _realise(space: Space, scenarios: int, seed: int) -> Iterator[Sample]:
+def _realise(space: Space, scenarios: int, seed: int) -> Iterator[SampledScenario]:
     """Yield the samples of Sobol points, those that the domain refuses left out; raises `InputError` if all are."""
     refused = 0
-    for point in draw_points(space, scenarios, "sobol", seed):
+    for point in draw_sample_points(space, scenarios, "sobol", seed):
         sample = space.realise(*point)
         if sample is not None:
             refused = 0
@@ -198,23 +326,3 @@ def _hash_weights(network: Second) -> str:
     for value in network.state_dict().values():
         whole.update(value.cpu().numpy().tobytes())
     return whole.hexdigest()
-
-
-def _read(path: Path | None) -> dict[str, tuple[TriedFrame, ...]]:
-    """Return the tested frames in a file of kept ones, by key; a last line that was cut off is left out."""
-    known = {}
-    for line in read_file(path).decode().splitlines() if path is not None and path.exists() else ():
-        try:
-            row = json.loads(line)
-        except json.JSONDecodeError:
-            continue
-        known[row["key"]] = from_json(tuple[TriedFrame, ...], row["tested"], str(path))
-    return known
-
-
-def _keep(path: Path | None, key: str, tested: tuple[TriedFrame, ...]) -> None:
-    if path is not None:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with path.open("a", encoding="utf-8") as book:
-            row = {"key": key, "tested": to_json(tested, tuple[TriedFrame, ...])}
-            book.write("\n" + json.dumps(row))  # on a line of its own, also after one that was cut off

@@ -17,9 +17,8 @@ from flcav.arrays import Array, Bytes, Mask
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, read_calibration
 from flcav.dataset.layout import MANIFEST
-from flcav.dataset.payloads import open_image
+from flcav.dataset.payloads import open_image, turn_upright
 from flcav.dataset.store import Dataset
-from flcav.dataset.upright import turn_upright
 from flcav.geometry import inverse, transform_points
 from flcav.network.ledger import from_names, to_names
 from flcav.sensors.frame import Frame

@@ -10,7 +10,7 @@ import numpy as np
 
 from flcav.config import InputError, shorten
 from flcav.dataset.layout import read_manifest
-from flcav.dataset.recording.recorder import record
+from flcav.dataset.recording.recorder import open_source, record
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report
 from flcav.perception.agents import POLE, kind_of
@@ -18,7 +18,6 @@ from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
 from flcav.pipeline.recipe import SPLITS_OF, Role, RunRecipe, SplitName, find_path
 from flcav.pipeline.results.saved import Saved
-from flcav.sources.opening import open_source
 from flcav.sources.recipe import Recipe, parse_recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.storage.files import sha256

@@ -13,9 +13,8 @@ from flcav.sensors.frame import Frame
 from flcav.sensors.navigation_log import NavigationLog, log_drive
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
-from flcav.sources.division import Division
 from flcav.sources.randomisation import randomise_bodies, randomise_rig, randomise_town, town_files
-from flcav.sources.recipe import Recipe
+from flcav.sources.recipe import DividedSource, Recipe
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.map.town import HEIGHTS, HILLS, HILLY, PACKAGED, Town, check_town_name, load_town
 from flcav.world.scene import Scene
@@ -23,7 +22,7 @@ from flcav.world.trace import Trace
 from flcav.world.traffic.traffic import simulate_drives
 
 
-class EmbeddedSource:
+class EmbeddedSource(DividedSource):
     """A `Replayable` source of the frames of a recipe.
 
     The traffic of scene i depends on the town, the seed, the number of vehicles, the times of the spins and the
@@ -56,7 +55,7 @@ class EmbeddedSource:
             x, y, z = self.town.poles.position[known.index(pole)].tolist()
             mount_m = z - self.town.ground(x, y)
             check_mounts("pole_rig", recipe.pole_rig, f"pole {pole}", mount_m)
-        self._division = Division(recipe, self.town.name, tuple(self.agents))
+        super().__init__(recipe, self.town.name, tuple(self.agents))
         self._last_traffic: tuple[str, Trace, Trace] | None = None
         self._last_scene: tuple[str, Scene] | None = None
 
@@ -76,7 +75,7 @@ class EmbeddedSource:
             "town": self.town.name,
             "town_files": {name: hashlib.sha256(data).hexdigest() for name, data in self._files().items()},
             "scenes": len(self.scenes()),
-            "frames": self._division.frames,
+            "frames": self.frame_total,
             "poles": self.poles,
         }
 
@@ -84,17 +83,6 @@ class EmbeddedSource:
         """Return the contents of the town's files by name; empty for a town that comes with flcav."""
         kept = self.recipe.town not in PACKAGED or self.recipe.randomise is not None
         return self._files() if kept else {}
-
-    def scenes(self) -> list[str]:
-        """Return the names of the scenes, `<town>-<seed>-<number>`."""
-        return self._division.scenes()
-
-    def frame_count(self, scene: str) -> int:
-        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames.
-
-        With `window_range_m` it is the largest number: how many are recorded depends on the traffic.
-        """
-        return self._division.frame_count(scene)
 
     def frames(self, scene: str) -> Iterator[Frame]:
         """Yield the scene's frames by spin, and within a spin the vehicles' before the poles'."""

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError
-from flcav.geometry import rotate, wrap_angle
+from flcav.geometry import Array, rotate, wrap_angle
 from flcav.interface.wording import format_install_command
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.observe import observe
@@ -165,7 +165,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             seen["lidar"] = self._scan(snapshot)
         return {name: values.astype(np.float32) for name, values in seen.items()}
 
-    def _see_light(self, snapshot: Snapshot) -> NDArray[np.float64]:
+    def _see_light(self, snapshot: Snapshot) -> Array:
         """Return the distance to the next light on the route, and whether it is green."""
         assert self._route is not None
         for along, link in self._route.stops:

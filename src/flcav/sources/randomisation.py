@@ -12,9 +12,9 @@ import numpy as np
 import pyarrow.parquet as pq
 import shapely
 import yaml
-from numpy.typing import NDArray
 from shapely.geometry import Polygon
 
+from flcav.geometry import Array
 from flcav.sensors.lidar.lidar import BEAMS, Lidar
 from flcav.sensors.rig import MountedLidar, Rig
 from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, StreetParameters, TownParameters
@@ -25,7 +25,6 @@ from flcav.world.shapes import RARE, SHAPES
 from flcav.world.static import LAND_M
 from flcav.world.trace import Trace
 
-Array = NDArray[np.float64]
 Draw = np.random.Generator
 
 CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them

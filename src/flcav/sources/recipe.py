@@ -1,4 +1,4 @@
-"""Recording recipes: validated YAML files that say what a dataset contains."""
+"""Recording recipes: validated YAML files that say what a dataset contains, and how its frames divide into scenes."""
 
 import os
 from collections.abc import Mapping
@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from flcav.config import Config, InputError, Json, parse_config, read_yaml, shorten
+from flcav.geometry import Array
 from flcav.interface.wording import suggest
+from flcav.sensors.frame import LONGEST_NAME, format_key
 from flcav.sensors.lens import Lens
 from flcav.sensors.rig import RIGS, CalibrationError, Mounted, MountedInfrared, MountedRadar, Rig
 from flcav.world.map.parameters import RareKinds
@@ -172,7 +174,7 @@ class Recipe(Config):
         away = np.abs(self._steps()[middle] - self._steps()[spin])
         return middle[away <= round(self.window_s / STEP_S)]
 
-    def times_s(self, warmup_steps: int) -> NDArray[np.float64]:
+    def times_s(self, warmup_steps: int) -> Array:
         """Return (spins,) the times of the spins [s] after a warm-up of `warmup_steps` steps of STEP_S."""
         return np.round((warmup_steps + self._steps()) * np.float64(STEP_S), 1)
 
@@ -286,3 +288,32 @@ def load_recipe(path: Path | str) -> Recipe:
     if recipe.town in PACKAGED or not os.path.isdir(folder):  # noqa: PTH112 - Path.is_dir raises for too long a name
         return recipe
     return recipe.model_copy(update={"town": str(folder)})
+
+
+class DividedSource:
+    """A source whose scenes are those of a recipe in a town: each has the frames of all agents at all its spins."""
+
+    def __init__(self, recipe: Recipe, town: str, agents: tuple[str, ...]) -> None:
+        """Raises `InputError` where nobody observes, or the town's name is too long for the names of frames."""
+        if not agents:
+            raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
+        self._name = f"{town}-{recipe.seed}"
+        self._per_scene = recipe.spins * len(agents)
+        self.frame_total = recipe.frames or recipe.scenes * self._per_scene
+        longest = max((format_key(self.scenes()[-1], recipe.spins - 1, one) for one in agents), key=len)
+        if len(longest) > LONGEST_NAME:
+            raise InputError(
+                f"field 'town' = {shorten(recipe.town)}: a frame would be called {shorten(longest)}, {len(longest)} "
+                f"characters where {LONGEST_NAME} are allowed; give the town's folder a shorter name"
+            )
+
+    def scenes(self) -> list[str]:
+        """Return the names of the scenes, `<town>-<seed>-<number>`."""
+        return [f"{self._name}-{scene:03d}" for scene in range(-(-self.frame_total // self._per_scene))]
+
+    def frame_count(self, scene: str) -> int:
+        """Return the number of frames of a scene; the last scene has fewer where the recipe limits frames.
+
+        With `window_range_m` it is the largest number: how many are recorded depends on the traffic.
+        """
+        return min(self._per_scene, self.frame_total - self.scenes().index(scene) * self._per_scene)

@@ -21,8 +21,8 @@ from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.carlaflcav.labels import MOST_BYTES, read_labels
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.carlaflcav_labels import MOST_BYTES, read_labels
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
 from flcav.geometry import inverse, pose, transform_points

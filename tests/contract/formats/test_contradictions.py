@@ -15,9 +15,8 @@ from painted_source import PaintedSource
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import export, import_dataset
+from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate

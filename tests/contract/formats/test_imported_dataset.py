@@ -9,8 +9,8 @@ import pytest
 from painted_source import PaintedSource
 
 from flcav.cli.main import run
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions
+from flcav.dataset.formats.conversion import export
+from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import load_errors

@@ -10,10 +10,9 @@ import pytest
 from painted_source import PaintedSource
 
 from flcav.config import InputError
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import export, import_dataset
 from flcav.dataset.formats.kitti import KittiFolder
+from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate

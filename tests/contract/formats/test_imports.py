@@ -16,13 +16,12 @@ from PIL import Image
 
 from flcav.cli.main import run
 from flcav.config import InputError
-from flcav.dataset.formats.export import export
-from flcav.dataset.formats.exporter import ExportOptions, split_scenes
+from flcav.dataset.formats.conversion import export, import_dataset
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS
-from flcav.dataset.formats.importing import import_dataset
 from flcav.dataset.formats.kitti.read import KittiSource
-from flcav.dataset.formats.nuscenes.rows import COLUMNS
-from flcav.dataset.formats.opv2v.read import read_cloud
+from flcav.dataset.formats.nuscenes.tables import COLUMNS
+from flcav.dataset.formats.opv2v.files import read_cloud
+from flcav.dataset.formats.writing import ExportOptions, split_scenes
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import find_leaks, validate

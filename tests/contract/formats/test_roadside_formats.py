@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from flcav.cli.main import run
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
 from flcav.perception.agents import POLE, kind_of

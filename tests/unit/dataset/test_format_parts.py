@@ -13,10 +13,22 @@ from toy_source import ToySource
 
 from flcav.cli.main import run
 from flcav.dataset.formats.coco import encode_run_lengths
-from flcav.dataset.formats.mounts import assign_channels, find_front_camera, quaternion
-from flcav.dataset.formats.nuscenes.files import RADAR, RESOLUTION_M, encode_lidar, encode_radar, map_mask
-from flcav.dataset.formats.nuscenes.tables import CAMERAS, Row, attributes, link_rows, token, visibility
-from flcav.dataset.formats.opv2v.write import agent_numbers, carla_pose, encode_pcd
+from flcav.dataset.formats.nuscenes.files import (
+    CAMERAS,
+    RADAR,
+    RESOLUTION_M,
+    Row,
+    attributes,
+    encode_lidar,
+    encode_radar,
+    link_rows,
+    map_mask,
+    token,
+    visibility,
+)
+from flcav.dataset.formats.opv2v.files import carla_pose, encode_cloud
+from flcav.dataset.formats.opv2v.write import agent_numbers
+from flcav.dataset.formats.writing import assign_channels, find_front_camera, quaternion
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
 from flcav.sensors.lens import BODY_FROM_OPTICAL
@@ -113,7 +125,7 @@ def test_carla_s_angles_have_the_signs_people_know():
 
 def test_a_pcd_s_red_is_the_intensity():
     points = np.array([[1.0, 2, 3, 0.0], [4, -5, 6, 1.0], [0, 0, 0, 0.5]], np.float32)
-    header, _, data = encode_pcd(points).partition(b"DATA binary\n")
+    header, _, data = encode_cloud(points).partition(b"DATA binary\n")
     assert b"WIDTH 3\nHEIGHT 1\n" in header
     rows = np.frombuffer(data, "<f4").reshape(3, 4)
     np.testing.assert_array_equal(rows[:, :3], points[:, :3] * (1, -1, 1))

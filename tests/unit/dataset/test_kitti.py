@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from flcav.config import InputError
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.formats.kitti import (
     KittiCalibration,
     KittiFolder,

@@ -16,7 +16,7 @@ from flcav.dataset.layout import navigation_path
 from flcav.dataset.navigation_logs import SAMPLES, SCHEMA, load_logs, save_logs
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
-from flcav.dataset.tables import FILES_SCHEMA, write_table
+from flcav.dataset.tables import FILES_SCHEMA, write_rows
 from flcav.dataset.validation import validate
 from flcav.interface.progress import ignore_progress
 from flcav.sensors.navigation import Gnss, Imu
@@ -164,7 +164,7 @@ def test_validate_tells_of_logs_that_end_before_their_frames(recorded: Path, tmp
     files = pq.read_table(out / "files.parquet").to_pylist()
     row = next(row for row in files if row["path"] == navigation_path("ring-3-000"))
     row |= {"bytes": path.stat().st_size, "sha256": sha256(path)}
-    write_table(pa.Table.from_pylist(files, schema=FILES_SCHEMA), out / "files.parquet")
+    write_rows(pa.Table.from_pylist(files, schema=FILES_SCHEMA), out / "files.parquet")
     manifest = json.loads((out / "manifest.json").read_text())
     listing = out / "files.parquet"
     manifest["tables"]["files.parquet"] = {"bytes": listing.stat().st_size, "sha256": sha256(listing)}

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from flcav.config import InputError
-from flcav.dataset.formats.nuscenes import rows
-from flcav.dataset.formats.nuscenes.rows import read_table, stream_table
+from flcav.dataset.formats.nuscenes import tables
+from flcav.dataset.formats.nuscenes.tables import read_rows_by_token, stream_table
 
 NAMES = ['a "quoted" one', "ends in \\", "brackets ]},{[", "überall", "", "1e5", "a\nb"]
 
@@ -23,12 +23,12 @@ def _write(folder: Path, text: str) -> Path:
 def test_rows_are_those_of_the_file_read_at_once(
     chunk: int, layout: dict[str, object], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(rows, "CHUNK", chunk)
+    monkeypatch.setattr(tables, "CHUNK", chunk)
     table = [{"token": str(n), "name": name, "index": [n, {"deep": [1.5, -2]}]} for n, name in enumerate(NAMES)]
     folder = _write(tmp_path, f" \n{json.dumps(table, **layout)}\n ")  # type: ignore[arg-type]
     read = json.loads((folder / "category.json").read_text(encoding="utf-8"))
     assert list(stream_table(folder, "category")) == [{"name": row["name"], "token": row["token"]} for row in read]
-    assert read_table(_write(tmp_path, "[ ]"), "category") == {}
+    assert read_rows_by_token(_write(tmp_path, "[ ]"), "category") == {}
 
 
 @pytest.mark.parametrize("chunk", [3, 1 << 20])
@@ -53,18 +53,18 @@ def test_rows_are_those_of_the_file_read_at_once(
 def test_what_is_no_table_is_one_sentence(
     text: str, sentence: str, chunk: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
-    monkeypatch.setattr(rows, "CHUNK", chunk)
+    monkeypatch.setattr(tables, "CHUNK", chunk)
     with pytest.raises(InputError, match=sentence) as error:
-        read_table(_write(tmp_path, text), "category")
+        read_rows_by_token(_write(tmp_path, text), "category")
     assert str(error.value).startswith(f"{tmp_path / 'category.json'}: ")
 
 
 def test_memory_is_that_of_the_rows_that_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(rows, "CHUNK", 1 << 14)
+    monkeypatch.setattr(tables, "CHUNK", 1 << 14)
     table = [{"token": f"{n:032d}", "name": f"{n:064d}", "description": "x" * 200} for n in range(3000)]
     folder = _write(tmp_path, json.dumps(table))
     tracemalloc.start()
-    found = read_table(folder, "category", lambda row: row["token"].endswith("00"))
+    found = read_rows_by_token(folder, "category", lambda row: row["token"].endswith("00"))
     _, peak = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(found) == 30

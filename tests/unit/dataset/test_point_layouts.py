@@ -12,12 +12,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.dataset.formats.clouds import describe_numbers, has_kitti_layout, has_nuscenes_layout, read_pcd
 from flcav.dataset.formats.kitti import read_points
-from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout, has_nuscenes_layout
 from flcav.dataset.formats.nuscenes.files import encode_lidar
-from flcav.dataset.formats.opv2v.write import encode_pcd
-from flcav.dataset.formats.pcd import read_pcd
-from flcav.dataset.formats.sweeps import list_sweeps, read_sweep
+from flcav.dataset.formats.opv2v.files import encode_cloud
+from flcav.dataset.formats.sweeps import list_sweeps, read_cloud_file
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[3].parent / "shared" / "data"))
 Points = NDArray[np.float32]
@@ -107,9 +106,9 @@ MANY = settings(max_examples=60, deadline=None, suppress_health_check=[HealthChe
 def test_known_layouts_are_read(tmp_path: Path, points: Points) -> None:
     path = tmp_path / "cloud.bin"
     path.write_bytes(points.tobytes())
-    np.testing.assert_array_equal(read_sweep(path), points)
+    np.testing.assert_array_equal(read_cloud_file(path), points)
     path.write_bytes(encode_lidar(points, np.radians(np.linspace(-25, 3, 32))))
-    np.testing.assert_allclose(read_sweep(path), points, atol=1e-6)
+    np.testing.assert_allclose(read_cloud_file(path), points, atol=1e-6)
 
 
 @pytest.mark.parametrize("layout", OTHERS)
@@ -123,7 +122,7 @@ def test_other_layouts_are_refused(tmp_path: Path, layout: str, points: Points) 
         points = np.concatenate((points, points[:1]))
         path.write_bytes(data := OTHERS[layout](points))
         with pytest.raises(InputError):
-            read_sweep(path)
+            read_cloud_file(path)
         with pytest.raises(InputError):
             read_points(path)
     assert not has_kitti_layout(data)
@@ -137,13 +136,13 @@ def test_a_few_points_are_a_cloud(tmp_path: Path, rows: list[tuple[float, ...]])
     points = np.array([*rows, (20.0, -3.0, -1.5, 0.25)], "<f4")
     points[np.abs(points) < 1e-20] = 0  # no distance that a LiDAR measures
     (tmp_path / "cloud.bin").write_bytes(points.tobytes())
-    np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
+    np.testing.assert_array_equal(read_cloud_file(tmp_path / "cloud.bin"), points)
 
 
 def test_points_of_one_object_are_a_cloud(tmp_path: Path) -> None:
     points = np.random.default_rng(0).uniform((18, 0.1, -1.5, 0), (22, 0.9, 0, 1), (200, 4)).astype("<f4")
     (tmp_path / "cloud.bin").write_bytes(points.tobytes())
-    np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
+    np.testing.assert_array_equal(read_cloud_file(tmp_path / "cloud.bin"), points)
 
 
 @pytest.mark.parametrize(
@@ -178,7 +177,7 @@ def test_numbers_tell_their_layout(layout: str, said: str, order: str) -> None:
 def test_what_is_no_point_cloud_is_refused(tmp_path: Path, data: bytes, said: str) -> None:
     (tmp_path / "cloud.bin").write_bytes(data)
     with pytest.raises(InputError, match=said):
-        read_sweep(tmp_path / "cloud.bin")
+        read_cloud_file(tmp_path / "cloud.bin")
 
 
 def write_ascii(path: Path, points: NDArray, fields: str = "x y z intensity", data: str = "ascii") -> None:
@@ -194,8 +193,8 @@ def write_ascii(path: Path, points: NDArray, fields: str = "x y z intensity", da
 def test_a_pcd_file_is_read_as_text(tmp_path: Path) -> None:
     points = sweep(0, 200, 60.0, 1.7, "columns", 0.0)
     write_ascii(tmp_path / "cloud.pcd", points)
-    np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.pcd"), points)
-    (tmp_path / "binary.pcd").write_bytes(encode_pcd(points))
+    np.testing.assert_array_equal(read_cloud_file(tmp_path / "cloud.pcd"), points)
+    (tmp_path / "binary.pcd").write_bytes(encode_cloud(points))
     coloured = read_pcd(tmp_path / "binary.pcd")
     write_ascii(tmp_path / "colour.pcd", np.array(coloured.tolist()), "x y z rgb")
     np.testing.assert_array_equal(read_pcd(tmp_path / "colour.pcd"), coloured)
@@ -216,12 +215,12 @@ def test_other_pcd_files_are_refused(tmp_path: Path, fields: str, data: str, sca
     points = sweep(0, 50, 60.0, 1.7, "columns", 0.0) * np.array([1, 1, 1, scale], np.float32)
     write_ascii(tmp_path / "cloud.pcd", points, fields, data)
     with pytest.raises(InputError, match=said):
-        read_sweep(tmp_path / "cloud.pcd")
+        read_cloud_file(tmp_path / "cloud.pcd")
     path = tmp_path / "cut.pcd"
     write_ascii(path, points)
     path.write_text(path.read_text().rpartition("\n")[0].rpartition("\n")[0])
     with pytest.raises(InputError, match="truncated; it holds 49 of 50 points"):
-        read_sweep(path)
+        read_cloud_file(path)
 
 
 def test_times_beside_points_are_no_cloud(tmp_path: Path) -> None:
@@ -239,9 +238,9 @@ def test_sweeps_of_argoverse_are_told_by_their_numbers(tmp_path: Path) -> None:
         x, y, z, intensity = (table[name].to_numpy().astype(np.float32) for name in ("x", "y", "z", "intensity"))
         points = np.column_stack((x, y, z, intensity / np.float32(255)))
         (tmp_path / "cloud.bin").write_bytes(points.tobytes())
-        np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
+        np.testing.assert_array_equal(read_cloud_file(tmp_path / "cloud.bin"), points)
         (tmp_path / "cloud.bin").write_bytes(np.column_stack((-y, x, z, intensity, intensity % 32)).tobytes())
-        np.testing.assert_array_equal(read_sweep(tmp_path / "cloud.bin"), points)
+        np.testing.assert_array_equal(read_cloud_file(tmp_path / "cloud.bin"), points)
 
 
 def test_real_sweeps_are_read_as_they_are() -> None:
@@ -251,4 +250,4 @@ def test_real_sweeps_are_read_as_they_are() -> None:
     for path in files:
         data = path.read_bytes()
         assert not has_nuscenes_layout(data)
-        assert read_sweep(path).tobytes() == data, path
+        assert read_cloud_file(path).tobytes() == data, path

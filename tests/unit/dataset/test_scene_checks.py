@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from flcav.dataset.checks.frames import check_sweeps
-from flcav.dataset.checks.scenes import BlockedViews, check_motion
+from flcav.dataset.frame_checks import check_sweeps
+from flcav.dataset.scene_checks import BlockedViews, check_motion
 from flcav.geometry import pose
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import lidar_pole

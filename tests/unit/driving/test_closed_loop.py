@@ -9,15 +9,22 @@ from shapely.affinity import rotate as turn
 from shapely.affinity import translate
 
 from flcav.config import InputError
-from flcav.driving.corridor import find_meeting, find_occupied
-from flcav.driving.couplings import TASKS, leave_out
-from flcav.driving.driver import EMERGENCY_MPS2, GAIN_MPS2, Motion, Settings, _cover, decide
-from flcav.driving.jobs import Job, Sensed, run_job
+from flcav.driving.driver import (
+    EMERGENCY_MPS2,
+    GAIN_MPS2,
+    DriverSettings,
+    EgoMotion,
+    _cover,
+    decide_controls,
+    find_meeting,
+    find_occupied,
+)
+from flcav.driving.jobs import DriveJob, Sensed, run_job
 from flcav.driving.loop import LOOP
-from flcav.driving.measures import Drive, Hit, judge_collision, score_drive
+from flcav.driving.measures import DriveResult, Hit, judge_collision, score_drive
 from flcav.driving.scenarios import find_scenarios, list_scenarios, spread_scenarios
-from flcav.driving.seen import TIMES_S, Perception, Seen, predict_motion
-from flcav.driving.studies.importance import compare, kendall, weigh
+from flcav.driving.seen import TASKS, TIMES_S, Perception, Seen, leave_out, predict_motion
+from flcav.driving.studies.importance import compare_drives, kendall, weigh
 from flcav.geometry import Boxes
 from flcav.world.dynamics.vehicle import make_blueprint
 from flcav.world.map.roads import Route
@@ -41,22 +48,22 @@ def see(*rows: tuple[float, float, float, float, float], closed: str = "", amber
     return Seen(boxes, array[:, 3:], path, yaw, np.zeros(yaw.shape), links, links if amber else frozenset())
 
 
-def at(along: float, speed: float) -> Motion:
-    return Motion(along, 0.0, 0.0, speed, along)
+def at(along: float, speed: float) -> EgoMotion:
+    return EgoMotion(along, 0.0, 0.0, speed, along)
 
 
 def test_free_road_is_driven_at_the_limit() -> None:
-    assert decide(straight(), at(20.0, 0.0), see(), CAR).acceleration > 1.5
-    assert abs(decide(straight(), at(20.0, 13.9), see(), CAR).acceleration) < 0.1
+    assert decide_controls(straight(), at(20.0, 0.0), see(), CAR).acceleration > 1.5
+    assert abs(decide_controls(straight(), at(20.0, 13.9), see(), CAR).acceleration) < 0.1
     slower = replace(see(), speed_share=0.6)
-    assert decide(straight(), at(20.0, 13.9), slower, CAR).acceleration < -1.0
+    assert decide_controls(straight(), at(20.0, 13.9), slower, CAR).acceleration < -1.0
 
 
 def test_a_leader_is_followed_at_the_equilibrium_of_the_model() -> None:
     speed, wanted = 10.0, 13.9
     gap = (2.0 + 1.2 * speed) / np.sqrt(1 - (speed / wanted) ** 4)  # of the paper, eq. 7
     ahead = see((50.0 + gap + HALF_M + 4.5 / 2, 0.0, 0.0, speed, 0.0))
-    told = decide(straight(), at(50.0, speed), ahead, CAR, Settings(margin_m=0.0)).acceleration
+    told = decide_controls(straight(), at(50.0, speed), ahead, CAR, DriverSettings(margin_m=0.0)).acceleration
     assert told == pytest.approx(0.0, abs=1e-9)
 
 
@@ -71,7 +78,7 @@ def test_a_start_covers_the_integral_of_its_speed(speed: float) -> None:
 @pytest.mark.parametrize("aside", [-1.5, 0.4])
 @pytest.mark.parametrize("speed", [3.0, 10.0])
 def test_the_wheels_follow_the_circle_through_the_point_that_is_aimed_at(aside: float, speed: float) -> None:
-    told = decide(straight(), Motion(50.0, aside, 0.0, speed, 50.0), see(), CAR).controls.steer
+    told = decide_controls(straight(), EgoMotion(50.0, aside, 0.0, speed, 50.0), see(), CAR).controls.steer
     ahead, left = 3.5 + 0.35 * speed, -aside
     radius = (ahead**2 + left**2) / (2 * left)  # of the circle that leaves along the x axis and meets the point
     assert ahead**2 + (left - radius) ** 2 == pytest.approx(radius**2)
@@ -81,30 +88,30 @@ def test_the_wheels_follow_the_circle_through_the_point_that_is_aimed_at(aside: 
 def test_red_and_yellow_lights() -> None:
     route = straight(((100.0, "x:1"),))
     for along, amber, brakes in ((60.0, False, True), (60.0, True, True), (90.0, True, False), (70.0, False, True)):
-        told = decide(route, at(along, 10.0), see(closed="x:1", amber=amber), CAR)
+        told = decide_controls(route, at(along, 10.0), see(closed="x:1", amber=amber), CAR)
         assert (told.acceleration < -0.5) == brakes, (along, amber)
-    assert decide(route, at(60.0, 10.0), see(closed="other:1"), CAR).acceleration > 0
+    assert decide_controls(route, at(60.0, 10.0), see(closed="other:1"), CAR).acceleration > 0
 
 
 def test_who_crosses_is_let_pass_and_an_emergency_is_one() -> None:
     crossing = see((75.0, -20.0, np.pi / 2, 0.0, 7.0))  # at the corridor when the vehicle is
-    told = decide(straight(), at(40.0, 12.0), crossing, CAR)
+    told = decide_controls(straight(), at(40.0, 12.0), crossing, CAR)
     assert told.acceleration < -0.5
-    near = decide(straight(), at(61.0, 12.0), see((75.0, -6.0, np.pi / 2, 0.0, 7.0)), CAR)
+    near = decide_controls(straight(), at(61.0, 12.0), see((75.0, -6.0, np.pi / 2, 0.0, 7.0)), CAR)
     assert near.emergency
     assert near.controls.brake == 1.0
     assert near.acceleration < -EMERGENCY_MPS2
-    gone = decide(straight(), at(40.0, 12.0), see((75.0, 20.0, np.pi / 2, 0.0, 7.0)), CAR)
+    gone = decide_controls(straight(), at(40.0, 12.0), see((75.0, 20.0, np.pi / 2, 0.0, 7.0)), CAR)
     assert gone.acceleration > 0
 
 
 def test_a_wider_margin_and_uncertainty_brake_for_who_is_beside() -> None:
     beside = see((60.0, 2.6, 0.0, 0.0, 0.0))  # 0.8 m from the side of the vehicle
-    narrow, wide = (decide(straight(), at(40.0, 10.0), beside, CAR, Settings(m)) for m in (0.2, 1.2))
+    narrow, wide = (decide_controls(straight(), at(40.0, 10.0), beside, CAR, DriverSettings(m)) for m in (0.2, 1.2))
     assert narrow.acceleration > 0 > wide.acceleration
     unsure = replace(beside, spread=np.full(beside.spread.shape, 0.6))
-    assert decide(straight(), at(40.0, 10.0), unsure, CAR, Settings(0.0, 2.0)).acceleration < 0
-    assert decide(straight(), at(40.0, 10.0), unsure, CAR, Settings(0.0, 0.5)).acceleration > 0
+    assert decide_controls(straight(), at(40.0, 10.0), unsure, CAR, DriverSettings(0.0, 2.0)).acceleration < 0
+    assert decide_controls(straight(), at(40.0, 10.0), unsure, CAR, DriverSettings(0.0, 0.5)).acceleration > 0
 
 
 def test_the_corridor_agrees_with_polygons() -> None:
@@ -171,12 +178,12 @@ def test_unknown_scenarios_are_refused() -> None:
 
 
 def test_weights_are_the_scores_lost() -> None:
-    def run(score: float) -> Drive:
-        return Drive("s", 1, 10.0, score, 5.0, 4.0, 0.0, 0, 0, (), score)
+    def run(score: float) -> DriveResult:
+        return DriveResult("s", 1, 10.0, score, 5.0, 4.0, 0.0, 0, 0, (), score)
 
     whole = [run(0.8), run(0.6)]
     tasks = [
-        compare(task, whole, [run(0.8 - lost), run(0.6 - lost)], ["a", "b"])
+        compare_drives(task, whole, [run(0.8 - lost), run(0.6 - lost)], ["a", "b"])
         for task, lost in (("objects", 0.3), ("signs", 0.1), ("weather", -0.2))
     ]
     assert [each.weight for each in weigh(tasks)] == pytest.approx([0.75, 0.25, 0.0])
@@ -199,7 +206,7 @@ def test_a_loop_that_sees_stops_behind_a_standing_car_and_a_blind_one_hits_it() 
     """The same scenario and seed, driven by ground truth and blindly; collisions and their faults are of the world."""
     (scenario,) = find_scenarios(["suburb-stalled-clear"])
     scenario = replace(scenario, traffic=0, pedestrians=0)
-    job = Job(scenario, 1, loop=replace(LOOP, lasts_s=13.0))
+    job = DriveJob(scenario, 1, loop=replace(LOOP, lasts_s=13.0))
     seeing, blind = (run_job(j, Sensed("truth")) for j in (job, replace(job, task="objects")))
     assert seeing.faults == 0
     assert blind.faults == 1

@@ -12,18 +12,25 @@ from flcav.cli.domains.importance import set_weights
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.driving import jobs as driven
-from flcav.driving.errors import CLASSES, load_errors
+from flcav.driving.errors import CLASSES, load_error_model
 from flcav.driving.following import CERTAIN, Following
-from flcav.driving.jobs import Job, Sensed, read_kept, run_jobs
-from flcav.driving.measures import Drive, Hit
-from flcav.driving.networks import load_roads
-from flcav.driving.road import fuse, pack_tracks
+from flcav.driving.jobs import DriveJob, Sensed, run_jobs
+from flcav.driving.measures import DriveResult, Hit
+from flcav.driving.networks import load_road_map
+from flcav.driving.road import merge_detections, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
 from flcav.driving.studies import importance
-from flcav.driving.studies.error_measurement import Tally, summarise
-from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
-from flcav.driving.studies.pole_gain import FusionTally, PoleGain, Precision, measure_precision
+from flcav.driving.studies.error_measurement import Tally, summarise_tally
+from flcav.driving.studies.pole_gain import (
+    ClosedLoopGain,
+    FusionTally,
+    Hidden,
+    Precision,
+    find_hidden,
+    measure_precision,
+    summarise_hidden,
+)
 from flcav.geometry import Boxes, left_vectors
 from flcav.network.ledger import unpack_arrays
 from flcav.optimization.problem import Problem
@@ -32,12 +39,13 @@ from flcav.perception.tracking import Tracker
 from flcav.perception.trajectory.config import FUTURE
 from flcav.perception.trajectory.task import TRAJECTORY
 from flcav.statistics.estimates import Estimate
+from flcav.storage.kept import read_kept
 from flcav.world.map.roads import draw_route, read_net
 from flcav.world.map.town import load_town
 from flcav.world.scene import Scene
 from flcav.world.trace import Trace, empty_trace
 
-DRIVE = Drive("s", 1, 10.0, 0.5, 5.0, 4.0, 0.0, 0, 0, (), 0.5)
+DRIVE = DriveResult("s", 1, 10.0, 0.5, 5.0, 4.0, 0.0, 0, 0, (), 0.5)
 
 
 def cars(*places: tuple[float, float]) -> Boxes:
@@ -46,14 +54,14 @@ def cars(*places: tuple[float, float]) -> Boxes:
 
 
 def test_kept_drives_are_not_driven_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    first, second = (Job(list_scenarios()[0], seed) for seed in (1, 2))
+    first, second = (DriveJob(list_scenarios()[0], seed) for seed in (1, 2))
     sensed, kept = Sensed("truth"), tmp_path / "drives.jsonl"
     lines = [
         json.dumps({"key": job.key(sensed), "drive": replace(DRIVE, seed=job.seed).as_json()})
         for job in (first, second)
     ]
     kept.write_text(lines[0] + "\n" + lines[1][:40], encoding="utf-8")  # the last line was cut off
-    assert list(read_kept(kept)) == [first.key(sensed)]
+    assert list(read_kept(kept, "drive")) == [first.key(sensed)]
     monkeypatch.setattr(driven, "process_pool", lambda *_: pytest.fail("nothing is to be driven"))
     assert run_jobs([first, first], sensed, kept=kept) == [DRIVE, DRIVE]
     with pytest.raises(pytest.fail.Exception):
@@ -69,7 +77,7 @@ def test_seeds_begin_with_the_first(
 ) -> None:
     asked: list[int] = []
 
-    def drive_none(jobs: Sequence[Job], *_: object) -> list[Drive]:
+    def drive_none(jobs: Sequence[DriveJob], *_: object) -> list[DriveResult]:
         asked.extend(job.seed for job in jobs)
         return [replace(DRIVE, seed=job.seed) for job in jobs]
 
@@ -107,7 +115,7 @@ def test_the_weights_are_those_that_allocate_takes() -> None:
 
 
 def test_the_packaged_error_model() -> None:
-    model = load_errors()
+    model = load_error_model()
     assert set(model.detected) == set(CLASSES)
     assert model.detected["Car"][0] > model.detected["Car"][-1]
     assert len(model.spread.growth["drives"]) == len(TIMES_S)
@@ -121,7 +129,7 @@ def test_the_error_model_is_calibrated() -> None:
     true = 0.5 * np.sqrt(1 + np.arange(horizon))
     tally.tracks = [("drives", 0.0625, random.normal(size=(horizon, 2)) * true[:, None]) for _ in range(4000)]
     tally.pairs = [("Car", 10.0, i % 4 > 0, *random.normal(size=3).tolist()) for i in range(4000)]
-    model = summarise(tally)
+    model = summarise_tally(tally)
     assert model.spread_factor == pytest.approx(4.0, rel=0.1)
     whole = np.sqrt(np.array(model.growth["drives"])[::2] ** 2 + model.spread_factor * 0.0625)
     assert whole == pytest.approx(true, rel=0.08)
@@ -141,7 +149,7 @@ def test_tracks_are_followed_kept_and_forget() -> None:
 
 def test_a_heading_the_wrong_way_round_changes_no_forecast() -> None:
     """A detector that takes the back of a car for its front, always or at times, leaves its path as it was."""
-    network, roads = resolve_network(TRAJECTORY, None), load_roads("ring")
+    network, roads = resolve_network(TRAJECTORY, None), load_road_map("ring")
     route = draw_route(read_net(load_town("ring").net), np.random.default_rng(5), 200.0)
     poses = [route.at(20.0 + 0.8 * tick) for tick in range(26)]
     told = []
@@ -161,7 +169,7 @@ def test_a_heading_the_wrong_way_round_changes_no_forecast() -> None:
 
 
 def test_a_forecast_moves_on_with_its_track_and_keeps_its_last_velocity() -> None:
-    network, roads = resolve_network(TRAJECTORY, None), load_roads("ring")
+    network, roads = resolve_network(TRAJECTORY, None), load_road_map("ring")
     route = draw_route(read_net(load_town("ring").net), np.random.default_rng(5), 200.0)
     following = Following(network, roads, CERTAIN)
     poses = [route.at(20.0 + 0.8 * tick) for tick in range(26)]
@@ -182,21 +190,21 @@ def test_a_forecast_moves_on_with_its_track_and_keeps_its_last_velocity() -> Non
 
 
 def test_an_error_model_without_a_kind_of_motion_is_refused(tmp_path: Path) -> None:
-    model = load_errors()
+    model = load_error_model()
     path = tmp_path / "errors.json"
     path.write_text(json.dumps(replace(model, growth={"drives": model.growth["drives"]}).as_json()))
     with pytest.raises(InputError, match="no growth of 'stands'"):
-        load_errors(path)
+        load_error_model(path)
 
 
 def test_the_gain_of_poles_is_told_with_paired_differences() -> None:
-    def driven(name: str, ttc: float, hits: int = 0) -> Drive:
+    def driven(name: str, ttc: float, hits: int = 0) -> DriveResult:
         hit = Hit(1.0, "veh0", "vehicle", 5.0, at_fault=True)
-        return Drive(name, 1, 10.0, 0.5, 5.0, ttc, 0.0, 0, 0, (hit,) * hits, 0.5)
+        return DriveResult(name, 1, 10.0, 0.5, 5.0, ttc, 0.0, 0, 0, (hit,) * hits, 0.5)
 
     without, with_poles = [driven("a", 1.0, 1), driven("b", 2.0)], [driven("a", 1.5), driven("b", 2.5)]
     precision = Precision(Estimate(0.5, None, None), Estimate(0.75, None, None), Estimate(0.25, 0.1, 0.4))
-    gain = PoleGain((1, 3), Hidden(0, None, None, None), precision, 0.1, tuple(without), tuple(with_poles))
+    gain = ClosedLoopGain((1, 3), Hidden(0, None, None, None), precision, 0.1, tuple(without), tuple(with_poles))
     told = gain.lines()
     assert told[1].endswith(" 0.500, with the poles 0.750, with less without +0.250 (+0.100 to +0.400)")
     assert "without poles: least time to collision 1.50 s" in told[2]
@@ -266,8 +274,8 @@ def test_who_is_behind_a_car_is_hidden_from_the_vehicle_and_seen_from_above() ->
 
 
 def test_boxes_of_the_road_join_those_of_the_vehicle_once() -> None:
-    both = fuse(cars((10.0, 0.0)), cars((11.0, 0.5), (30.0, 0.0)))
+    both = merge_detections(cars((10.0, 0.0)), cars((11.0, 0.5), (30.0, 0.0)))
     assert both.center[:, 0].tolist() == [10.0, 30.0]
-    assert len(fuse(cars(), cars((1.0, 1.0)))) == 1
+    assert len(merge_detections(cars(), cars((1.0, 1.0)))) == 1
     tracked = Tracker().step(cars((1.0, 1.0)), 0.0)
     assert unpack_arrays(pack_tracks(tracked))["boxes"].shape == (1, 7)

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from flcav.odd.failures import Failure, TriedFrame
-from flcav.odd.sampling import Sample
-from flcav.odd.scenery import Place
-from flcav.odd.searching import Searched
+from flcav.odd.sampling import SampledScenario
+from flcav.odd.scenery import ScenarioPlace
+from flcav.odd.searching import Failure, Searched, TriedFrame
 from flcav.reproductions.failure_search.run import (
     RULES,
     SOBOL,
@@ -23,8 +22,8 @@ from flcav.reproductions.failure_search.run import (
 from flcav.storage.records import from_json
 from flcav.world.weather import Weather
 
-PLACE = Place("ring", "none", "none", 0.0, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0)
-SAMPLE = Sample(PLACE, "crash", Weather(), {}, "car", 50.0)
+PLACE = ScenarioPlace("ring", "none", "none", 0.0, 0.0, (0.0, 0.0), 0.0, (0.0, 0.0, 0.0), 0)
+SAMPLE = SampledScenario(PLACE, "crash", Weather(), {}, "car", 50.0)
 
 
 def scenario(*cells: str) -> Searched:

@@ -6,13 +6,13 @@ from io import BytesIO
 import pytest
 from PIL import Image
 
-from flcav.driving.errors import load_errors
-from flcav.driving.measures import Drive, Hit
+from flcav.driving.errors import load_error_model
+from flcav.driving.measures import DriveResult, Hit
 from flcav.reproductions.safety_distance.run import SafetyDistance, list_settings, summarise_margins
 from flcav.storage.records import from_json
 
 HIT = Hit(3.0, "car", "vehicle", 5.0, at_fault=True)
-OWN = Drive("a", 301, 12.0, 0.5, 6.0, 2.0, 0.1, 2, 0, (), 0.5)
+OWN = DriveResult("a", 301, 12.0, 0.5, 6.0, 2.0, 0.1, 2, 0, (), 0.5)
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,7 @@ def results() -> SafetyDistance:
         first = replace(OWN, mean_speed=speed, hard_brakes=1 if name == "1 sigma" else 2)
         other = replace(first, scenario="b", near_share=0.3, hits=(HIT, replace(HIT, at_fault=False)), score=0.0)
         drives[name] = [first, other]
-    return summarise_margins(drives, load_errors())
+    return summarise_margins(drives, load_error_model())
 
 
 def test_means_are_over_drives_and_faults_are_counted(results: SafetyDistance) -> None:

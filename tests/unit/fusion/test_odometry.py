@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.dataset.formats.importing import import_dataset
+from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.formats.kitti import KittiFolder
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate

@@ -11,7 +11,7 @@ import pytest
 from packaging.requirements import Requirement
 
 from flcav.config import InputError
-from flcav.dataset.recording.workers import start_actors
+from flcav.dataset.recording.jobs import start_actors
 from flcav.interface.wording import format_install_command
 from flcav.world.opendrive import netconvert
 

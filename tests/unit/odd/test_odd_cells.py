@@ -15,7 +15,7 @@ from flcav.geometry import transform_points
 from flcav.odd.cells import Trial, cells_of, find_failures, measure_cell, measure_cells
 from flcav.odd.coverage import collect_runs, list_covered, load_report, merge_runs, write_cod, write_matrix, write_runs
 from flcav.odd.domain import Domain, everything
-from flcav.odd.measure import measure
+from flcav.odd.measure import measure_domain
 from flcav.odd.scenery import Scenery
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
@@ -139,7 +139,7 @@ def test_the_cell_with_most_errors_per_frame_comes_first_and_no_pole_is_named_th
 
 
 def test_frames_are_in_the_cell_of_their_values(drive: Dataset, urban: Domain):
-    measured = measure(drive)
+    measured = measure_domain(drive)
     cells = cells_of(urban, measured, ("junction", "speed_limit"))
     for (junction, limit), row in zip(cells, measured.rows(), strict=True):
         assert junction == row["junction"]
@@ -150,7 +150,7 @@ def test_frames_are_in_the_cell_of_their_values(drive: Dataset, urban: Domain):
 
 
 def test_coverage_is_read_by_the_library_and_its_own_command(drive: Dataset, urban: Domain, tmp_path: Path):
-    measured = measure(drive)
+    measured = measure_domain(drive)
     documents = collect_runs(urban, drive, measured, {measured.frames[0]: True})
     assert len(documents) == 4
     rows = {row.attribute: row for row in list_covered(merge_runs(list(documents.values())))}
@@ -170,7 +170,7 @@ def test_coverage_is_read_by_the_library_and_its_own_command(drive: Dataset, urb
 
 
 def test_a_run_fails_at_its_first_failure_and_equal_recordings_give_equal_documents(drive: Dataset, urban: Domain):
-    measured = measure(drive)
+    measured = measure_domain(drive)
     failing = {measured.frames[3]: True, measured.frames[4]: True}
     documents = collect_runs(urban, drive, measured, failing)
     assert [each["outcome"]["passed"] for each in documents.values()].count(False) >= 1  # type: ignore[index,call-overload]
@@ -179,7 +179,7 @@ def test_a_run_fails_at_its_first_failure_and_equal_recordings_give_equal_docume
 
 
 def test_a_cod_has_a_row_per_frame_that_says_what_was_measured(drive: Dataset, tmp_path: Path):
-    measured = measure(drive)
+    measured = measure_domain(drive)
     documents = collect_runs(everything(), drive, measured)
     assert write_cod(documents, tmp_path) == len(measured)
     rows = [row for path in sorted(tmp_path.glob("*_cod.csv")) for row in csv.DictReader(path.open())]

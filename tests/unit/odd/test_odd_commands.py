@@ -11,7 +11,7 @@ import pytest
 from flcav.cli.main import run
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import read_domain
-from flcav.odd.measure import measure
+from flcav.odd.measure import measure_domain
 from flcav.perception.networks import register_errors
 
 
@@ -81,7 +81,7 @@ def test_cover_says_where_the_detector_errs(drive: Dataset, tmp_path: Path, caps
         capsys, "cover", "urban", "--data", folder, "--out", out, "--by", "junction,light", "--detect", "--json"
     )
     found = json.loads(told)
-    measured = measure(drive)
+    measured = measure_domain(drive)
     seen = Counter(zip(measured.columns["junction"].tolist(), measured.columns["light"].tolist(), strict=True))
     assert {tuple(cell["cell"]): cell["frames"] for cell in found["cells"]} == dict(seen)
     errors = register_errors("objects", drive, agents="vehicles")

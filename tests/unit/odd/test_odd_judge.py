@@ -8,9 +8,8 @@ from hypothesis import strategies as st
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain, read_domain
-from flcav.odd.judge import INSIDE, OUTSIDE, UNKNOWN, compare_verdicts, judge, judge_values
-from flcav.odd.measure import Measurements, measure
-from flcav.odd.perceive import _narrow, perceive
+from flcav.odd.judge import INSIDE, OUTSIDE, UNKNOWN, compare_verdicts, judge_frames, judge_values
+from flcav.odd.measure import Measurements, _narrow, measure_domain, perceive
 
 URBAN = read_domain("urban")
 FINE = {
@@ -60,23 +59,23 @@ def test_nothing_is_inside_by_silence(name: str):
 
 
 def test_frames_are_judged_one_by_one(drive: Dataset, urban: Domain):
-    measured = measure(drive)
-    found = judge(urban, measured)
+    measured = measure_domain(drive)
+    found = judge_frames(urban, measured)
     assert found.verdict.tolist() == [judge_values(urban, row) for row in measured.rows()]
-    assert judge(read_domain("mine"), measured).count(INSIDE) == 0
+    assert judge_frames(read_domain("mine"), measured).count(INSIDE) == 0
 
 
 def test_modules_that_put_frames_outside_are_named(urban: Domain):
     rows = [FINE, FINE | {"visibility": 50.0}, FINE | {"visibility": 50.0, "lanes": 5.0}]
     columns = {name: np.array([row[name] for row in rows]) for name in FINE}
-    found = judge(urban, Measurements((0, 1, 2), columns))
+    found = judge_frames(urban, Measurements((0, 1, 2), columns))
     assert dict(found.failed) == {"urban_environment": 2, "urban_scenery": 1}
 
 
 def test_an_unbound_domain_is_refused(odd_file):
     path = odd_file("TAXONOMY: {wind: float velocity}\nMODULES: {m: {INCLUDE_AND: {wind: '<= 5 m/s'}}}")
     with pytest.raises(InputError, match="measures 'wind'"):
-        judge(read_domain(path), Measurements((), {}))
+        judge_frames(read_domain(path), Measurements((), {}))
 
 
 def test_precision_and_recall_are_of_what_truth_decides():
@@ -98,9 +97,9 @@ def test_a_class_of_weather_across_a_limit_does_not_decide(urban: Domain):
 
 
 def test_without_networks_perception_knows_no_weather_and_no_road_users(drive: Dataset, urban: Domain):
-    measured = measure(drive)
+    measured = measure_domain(drive)
     seen = perceive(urban, drive, measured.frames, None, None)
-    assert judge(urban, seen).count(UNKNOWN) == len(measured)
+    assert judge_frames(urban, seen).count(UNKNOWN) == len(measured)
     assert seen.columns["junction"].tolist() == measured.columns["junction"].tolist()
 
 
@@ -109,4 +108,4 @@ def test_weather_needs_a_camera(drive: Dataset, urban: Domain):
     from flcav.perception.tasks import task_named
 
     with pytest.raises(InputError, match="has no camera, which the weather network needs"):
-        perceive(urban, drive, measure(drive).frames, resolve_network(task_named("weather"), None), None)
+        perceive(urban, drive, measure_domain(drive).frames, resolve_network(task_named("weather"), None), None)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from flcav.dataset.store import Dataset
-from flcav.odd.measure import AROUND_M, _speeds, describe_weather, measure, reach_of, summarise
+from flcav.odd.measure import AROUND_M, _speeds, describe_weather, measure_domain, reach_of, summarise_measurements
 from flcav.sensors.rig import RIGS, Rig
 
 
 def test_counts_are_those_of_the_frames(drive: Dataset):
-    found = measure(drive)
+    found = measure_domain(drive)
     for row, i in zip(found.rows(), found.frames, strict=True):
         frame = drive.frame(i)
         away = np.linalg.norm(frame.annotations.boxes.center[:, :2] - frame.world_from_agent[:2, 3], axis=1)
@@ -29,7 +29,7 @@ def test_counts_are_those_of_the_frames(drive: Dataset):
 
 
 def test_speeds_are_those_of_the_traffic(drive: Dataset):
-    found = measure(drive)
+    found = measure_domain(drive)
     for row, i in zip(found.rows(), found.frames, strict=True):
         key = drive.keys[i]
         trace = drive.trace(key.scene)
@@ -68,9 +68,9 @@ def test_the_sight_of_rigs():
 
 
 def test_a_span_says_what_is_there(drive: Dataset):
-    spans = {span.attribute: span for span in summarise(measure(drive))}
-    assert spans["zone"].missing == len(measure(drive))
-    assert sum(spans["junction"].words.values()) == len(measure(drive))
+    spans = {span.attribute: span for span in summarise_measurements(measure_domain(drive))}
+    assert spans["zone"].missing == len(measure_domain(drive))
+    assert sum(spans["junction"].words.values()) == len(measure_domain(drive))
     low, high = spans["agents"].low, spans["agents"].high
     assert low is not None
     assert high is not None

@@ -14,10 +14,9 @@ from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.odd.coverage import collect_runs, list_covered, merge_runs
 from flcav.odd.domain import Domain, read_domain
-from flcav.odd.measure import measure
+from flcav.odd.measure import measure_domain
 from flcav.odd.openscenario import to_openscenario, write_script
-from flcav.odd.recipes import make_recipe
-from flcav.odd.sampling import CASE, CASES, METHODS, Axis, Sample, Space, sample_domain
+from flcav.odd.sampling import CASE, CASES, METHODS, Axis, SampledScenario, Space, make_recipe, sample_domain
 from flcav.odd.scenery import Scenery
 from flcav.sources.recipe import load_recipe, parse_recipe
 from flcav.world.map.town import load_town
@@ -67,7 +66,7 @@ def test_an_axis_goes_over_its_buckets_equally():
 def test_what_runs_did_not_cover_is_drawn_first(space: Space, urban: Domain, drive: Dataset):
     drawn = sample_domain(space, 4, "coverage")
     assert len({each.place.kind for each in drawn.samples}) == 4  # each kind of place once before any twice
-    covered = merge_runs(list(collect_runs(urban, drive, measure(drive)).values()))
+    covered = merge_runs(list(collect_runs(urban, drive, measure_domain(drive)).values()))
     seen = {bucket: set(row.covered) for row in list_covered(covered) for bucket in [row.attribute]}
     first = sample_domain(space, 2, "coverage", covered=covered).samples
     for attribute in ("environment.rainfall", "environment.visibility"):  # of which it covered one bucket
@@ -110,7 +109,7 @@ def test_a_recipe_in_a_town_of_ones_own_names_its_folder(urban: Domain, ring: Sc
     assert load_town(recipe.town).name == first.place.town == "own"
 
 
-def scenario(space: Space, case: str) -> tuple[Sample, ElementTree.Element]:
+def scenario(space: Space, case: str) -> tuple[SampledScenario, ElementTree.Element]:
     drawn = sample_domain(space, 200, "sobol").samples
     found = next(each for each in drawn if each.case == case)
     return found, ElementTree.fromstring(to_openscenario(found, "ring.xodr"))

@@ -11,10 +11,19 @@ import torch
 from flcav.cli.main import run
 from flcav.odd import searching
 from flcav.odd.domain import Domain
-from flcav.odd.failures import Candidate, Failure, TriedFrame, list_candidates, take_apart
-from flcav.odd.sampling import Sample, Space, sample_domain
+from flcav.odd.sampling import SampledScenario, Space, sample_domain
 from flcav.odd.scenery import Scenery
-from flcav.odd.searching import FailureModel, choose_frames, distinct, search_failures
+from flcav.odd.searching import (
+    CandidateFrame,
+    Failure,
+    FailureModel,
+    TriedFrame,
+    choose_candidates,
+    distinct,
+    list_candidates,
+    search_failures,
+    take_apart,
+)
 from flcav.perception.objects.model import Second
 from flcav.statistics.streams import stream
 from flcav.world.trace import Event, Trace
@@ -28,7 +37,7 @@ def space(urban: Domain, ring: Scenery) -> Space:
 
 
 @pytest.fixture(scope="module")
-def sample(space: Space) -> Sample:
+def sample(space: Space) -> SampledScenario:
     return sample_domain(space, 1, "sobol").samples[0]
 
 
@@ -56,7 +65,7 @@ def trace(places: dict[str, tuple[float, float]], category: dict[str, str], even
     )
 
 
-def test_a_candidate_has_the_nearest_in_its_path(sample: Sample):
+def test_a_candidate_has_the_nearest_in_its_path(sample: SampledScenario):
     places = {"cav0": (0.0, 0.0), "veh0": (25.0, 1.0), "ped0": (12.0, -1.0), "parked0": (5.0, 3.0), "veh1": (-9.0, 0.0)}
     first, second = list_candidates(sample, trace(places, {"ped0": "pedestrian"}), 1)
     assert first.cell[1] == "Pedestrian"
@@ -68,23 +77,23 @@ def test_a_candidate_has_the_nearest_in_its_path(sample: Sample):
     assert alone.cell[1] == ""  # too far, and of no class of the detector
 
 
-def test_frames_while_the_case_plays_come_first(sample: Sample):
+def test_frames_while_the_case_plays_come_first(sample: SampledScenario):
     places = {"cav0": (0.0, 0.0), "cav1": (0.0, 50.0)}
     found = list_candidates(sample, trace(places, {}, (Event("crash", 32.5, ("cav0",)),)), 2)
-    chosen = choose_frames(found, sample, FailureModel(), "sobol", stream(0, "test"))
+    chosen = choose_candidates(found, sample, FailureModel(), "sobol", stream(0, "test"))
     assert [each.spin for each in chosen] == [1, 1]  # at 33 s; each vehicle once, since it has not moved
     assert {each.vehicle for each in chosen} == {0, 1}
 
 
 def test_frames_of_one_vehicle_are_apart():
-    def at(vehicle: int, x: float) -> Candidate:
-        return Candidate(0, vehicle, x, 0.0, ("none", "Car"), 0.0, False)
+    def at(vehicle: int, x: float) -> CandidateFrame:
+        return CandidateFrame(0, vehicle, x, 0.0, ("none", "Car"), 0.0, False)
 
     taken = take_apart([at(0, 0.0), at(0, 4.0), at(1, 4.0), at(0, 6.0), at(0, 20.0)], 3)
     assert [(each.vehicle, each.x) for each in taken] == [(0, 0.0), (1, 4.0), (0, 6.0)]
 
 
-def fails(sample: Sample, each: Candidate) -> tuple[Failure, ...]:
+def fails(sample: SampledScenario, each: CandidateFrame) -> tuple[Failure, ...]:
     """Return the failures that are planted: pedestrians and cyclists in the rain."""
     rainy = sample.weather.rain_mm_h >= 0.3 and each.cell[1] in ("Pedestrian", "Cyclist")
     return (Failure("frame", (*each.cell, "occlusion 0"), 9.0, 30),) if rainy else ()
@@ -107,22 +116,24 @@ class Plant:
     def trace(self, scene: str) -> None:
         self.number += 1
 
-    def candidates(self, sample: Sample, trace: None, cavs: int) -> list[Candidate]:
+    def candidates(self, sample: SampledScenario, trace: None, cavs: int) -> list[CandidateFrame]:
         rng, weather = np.random.default_rng(self.number), searching.weather_buckets(sample.weather)
         labels = rng.choice(["", "Car", "Pedestrian", "Cyclist"], 60, p=[0.5, 0.4, 0.05, 0.05]).tolist()
         rest = [(f"agents {rng.integers(4)}", f"distance {rng.integers(4)}") for _ in labels]
         return [
-            Candidate(spin, 0, 10.0 * spin, 0.0, (sample.place.kind, label, *weather, *more), float(spin), False)
+            CandidateFrame(spin, 0, 10.0 * spin, 0.0, (sample.place.kind, label, *weather, *more), float(spin), False)
             for spin, (label, more) in enumerate(zip(labels, rest))
         ]
 
-    def try_frames(self, sample: Sample, source: object, trace: None, chosen: list[Candidate], network: None):
+    def try_frames(
+        self, sample: SampledScenario, source: object, trace: None, chosen: list[CandidateFrame], network: None
+    ):
         self.tested += len(chosen)
         return [TriedFrame(each.cell, fails(sample, each)) for each in chosen]
 
 
 def search(space: Space, ring: Scenery, rule: str, seed: int = 3, scenarios: int = 40, kept: Path | None = None):
-    return search_failures(space, [ring], NETWORK, scenarios, seed, rule, kept)
+    return search_failures(space, NETWORK, scenarios, seed, rule, kept)
 
 
 def test_a_search_finds_what_is_planted(space: Space, ring: Scenery, monkeypatch: pytest.MonkeyPatch):
@@ -152,7 +163,7 @@ def test_scenarios_that_are_kept_are_not_tested_again(
     assert plant.tested == 0
 
 
-def test_a_cell_with_a_failure_promises_less(sample: Sample):
+def test_a_cell_with_a_failure_promises_less(sample: SampledScenario):
     model, cell = FailureModel(), ("none", "Car", "rainfall 0", "visibility 2", "agents 1", "distance 1")
     other = (*cell[:-1], "distance 2")
     model.learn(sample, [TriedFrame(cell, (Failure("frame", (*cell, "occlusion 0"), 9.0, 30),))])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.odd.tasks import ORDER, Complexity, count_tasks, generate_tasks, make_run, saturate, town_of
+from flcav.odd.scenario_tasks import ORDER, Complexity, count_tasks, generate_tasks, make_run, saturate, town_of
 from flcav.pipeline.recipe import load_run_recipe
 
 SHARE = st.floats(0, 0.999)
@@ -44,9 +44,9 @@ def test_errors_of_a_network_raise_the_complexity_of_where_they_are(drive: Datas
 
 
 def _kind_at(drive: Dataset, i: int) -> list[str]:
-    from flcav.odd.measure import measure
+    from flcav.odd.measure import measure_domain
 
-    measured = measure(drive)
+    measured = measure_domain(drive)
     return [str(measured.columns["junction"][measured.frames.index(i)])]
 
 

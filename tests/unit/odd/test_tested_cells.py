@@ -2,7 +2,7 @@
 
 from flcav.dataset.store import Dataset
 from flcav.odd.domain import Domain
-from flcav.odd.measure import measure, select_vehicles
+from flcav.odd.measure import measure_domain, select_vehicles
 from flcav.releases.verification.testing import VerificationFrame
 from flcav.releases.verification.verify import find_cells
 
@@ -11,7 +11,7 @@ def test_frames_are_in_the_buckets_that_their_measurements_say(drive: Dataset, u
     frames = [VerificationFrame(drive.folder, number, "ring", "") for number in select_vehicles(drive)]
     cells, coverage = find_cells(frames, urban, ("junction", "visibility"))
     assert len(cells) == len(frames) == sum(coverage.frames.values())
-    for cell, row in zip(cells, measure(drive).rows(), strict=True):
+    for cell, row in zip(cells, measure_domain(drive).rows(), strict=True):
         junction, _, bucket = cell.partition(" x ")
         low, high = (float(end) for end in bucket.strip("[])").split(","))
         assert junction == row["junction"]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from flcav.cli.main import run
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.fusion.road import build_road_view
@@ -79,7 +79,7 @@ def data(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactor
 
 
 def test_a_pole_is_as_high_as_above_its_foot(data: Dataset) -> None:
-    ground, (vehicle, pole) = Ground(data), (data.frame(i).world_from_agent[2, 3] for i in (0, 1))
+    ground, (vehicle, pole) = DatasetGround(data), (data.frame(i).world_from_agent[2, 3] for i in (0, 1))
     assert [ground.height_of(0), ground.height_of(1)] == pytest.approx([0.0, 6.0])
     assert [ground.below(0), ground.below(1)] == pytest.approx([vehicle, pole - 6])
     assert abs(vehicle) > 4
@@ -104,7 +104,7 @@ def test_a_birdseye_view_colours_points_by_height_above_the_ground(
 
 def test_a_sweep_of_a_report_is_divided_at_the_ground(data: Dataset) -> None:
     seen = data.frame(0)
-    points, ground_m = read_sweep(seen, "top", Ground(data).relief)
+    points, ground_m = read_sweep(seen, "top", DatasetGround(data).relief)
     np.testing.assert_array_equal(points[:, :2], seen.lidar["top"][:, :2])
     np.testing.assert_allclose(points[:, 2] - ground_m, HEIGHTS, atol=1e-4)
 

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.config import InputError
-from flcav.dataset.checks.images import check_images
+from flcav.dataset.frame_checks import check_images
 from flcav.geometry import inverse, points_in_boxes, pose
 from flcav.sensors.camera import Camera
 from flcav.sensors.ground_truth import find_occluded_rays

@@ -27,7 +27,7 @@ class Perceives(StrEnum):
 
 
 class CouplingName(StrEnum):
-    """Couplings of perception and driving, see `flcav.driving.couplings`."""
+    """Couplings of perception and driving, see `flcav.driving.seen`."""
 
     bare = "bare"
     cautious = "cautious"
@@ -105,13 +105,13 @@ def importance(
 def read_model(perception: Perceives, errors: Path | None):
     """Return the error model of a modelled perception, None for another; raises `InputError` for a bad file."""
     from flcav.config import InputError
-    from flcav.driving.errors import load_errors
+    from flcav.driving.errors import load_error_model
 
     if perception != Perceives.model:
         if errors is not None:
             raise InputError(f"--errors: of no use with --perception {perception.value}")
         return None
-    return load_errors(errors)
+    return load_error_model(errors)
 
 
 def set_weights(document: object, weights: "Mapping[str, float]", origin: str) -> "Json":

@@ -40,8 +40,8 @@ def check(
     from flcav.config import InputError
     from flcav.dataset.store import Dataset
     from flcav.odd.domain import read_domain
-    from flcav.odd.measure import measure
-    from flcav.odd.realise import check_frames, check_towns
+    from flcav.odd.judge import check_frames, check_towns
+    from flcav.odd.measure import measure_domain
     from flcav.odd.scenery import Scenery
     from flcav.world.map.town import TOWNS, load_town
 
@@ -49,7 +49,7 @@ def check(
         raise InputError("--town and --data: one of the two at most")
     found = read_domain(domain)
     if data is not None:
-        parts = check_frames(found, measure(Dataset.open(data)))
+        parts = check_frames(found, measure_domain(Dataset.open(data)))
     else:
         parts = check_towns(found, [Scenery(load_town(name)) for name in (TOWNS if town is None else (town,))])
     rows = [part.as_json() | {"realised": part.realised} for part in parts]
@@ -70,14 +70,14 @@ def of_(
     from flcav.dataset.store import Dataset
     from flcav.odd.coverage import collect_runs, write_cod
     from flcav.odd.domain import everything
-    from flcav.odd.measure import measure, summarise
+    from flcav.odd.measure import measure_domain, summarise_measurements
     from flcav.storage.files import check_writable
 
     if out is not None:
         check_writable(out)
     recorded = Dataset.open(data)
-    measured = measure(recorded)
-    spans = summarise(measured)
+    measured = measure_domain(recorded)
+    spans = summarise_measurements(measured)
     rows = None
     if out is not None:
         rows = write_cod(collect_runs(everything(), recorded, measured), out)
@@ -115,8 +115,8 @@ def inside(
     from flcav.dataset.store import Dataset
     from flcav.interface import progress
     from flcav.odd.domain import read_domain
-    from flcav.odd.judge import compare_verdicts, describe_agreement, judge, write_verdicts
-    from flcav.odd.measure import measure, scenery_of
+    from flcav.odd.judge import compare_verdicts, describe_agreement, judge_frames, write_verdicts
+    from flcav.odd.measure import measure_domain, scenery_of
     from flcav.storage.files import check_writable
     from flcav.storage.records import check_ending
 
@@ -130,11 +130,11 @@ def inside(
     recorded = Dataset.open(data)
     scenery = scenery_of(recorded)
     begun = time.perf_counter()
-    truth = judge(found, measure(recorded, scenery=scenery))
+    truth = judge_frames(found, measure_domain(recorded, scenery=scenery))
     rate = len(truth.frames) / (time.perf_counter() - begun)
     seen, agreement = None, None
     if perceived:
-        from flcav.odd.perceive import perceive
+        from flcav.odd.measure import perceive
         from flcav.perception.networks import resolve_network
         from flcav.perception.tasks import task_named
 
@@ -143,7 +143,7 @@ def inside(
             for name, weights in (("weather", weather), ("objects", objects))
         ]
         with progress.show_progress("perceived") as report:
-            seen = judge(found, perceive(found, recorded, truth.frames, *networks, progress=report))
+            seen = judge_frames(found, perceive(found, recorded, truth.frames, *networks, progress=report))
         agreement = compare_verdicts(truth.verdict.tolist(), seen.verdict.tolist())
     if frames is not None:
         write_verdicts(recorded, truth, seen, frames)
@@ -185,8 +185,10 @@ def cover(
     use_threads(1)
     from flcav.cli.options import parse_axes, refuse_unused
     from flcav.interface import progress
-    from flcav.odd.covering import cover_domain
+    from flcav.odd.coverage import cover_domain
     from flcav.odd.domain import read_domain
+    from flcav.perception.networks import resolve_network
+    from flcav.perception.objects.task import OBJECTS
     from flcav.storage.files import check_writable
 
     axes = parse_axes(by)
@@ -200,10 +202,8 @@ def cover(
             data,
             out,
             axes,
-            detect=detect,
-            weights=weights,
+            network=resolve_network(OBJECTS, weights, device.value) if detect else None,
             range_m=range_m,
-            device=device.value,
             progress=report,
         )
     yield result.as_json()
@@ -235,7 +235,7 @@ def tasks(
     import yaml
 
     from flcav.config import InputError
-    from flcav.odd.tasks import generate_tasks, make_run, name_region, town_of
+    from flcav.odd.scenario_tasks import generate_tasks, make_run, name_region, town_of
     from flcav.storage.files import check_writable, write_bytes
     from flcav.world.map.town import load_town
 

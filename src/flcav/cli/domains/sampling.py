@@ -14,7 +14,6 @@ from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.odd.sampling import Space
-    from flcav.odd.scenery import Scenery
     from flcav.odd.searching import Searched
 
 ODD = typer.Argument(metavar="ODD", help="urban, rural, campus, mine, port, parking_lot, or an OpenODD file (.yaml).")
@@ -64,8 +63,7 @@ def sample(
     from flcav.odd.coverage import load_report
     from flcav.odd.domain import read_domain
     from flcav.odd.openscenario import to_openscenario
-    from flcav.odd.recipes import write_recipes
-    from flcav.odd.sampling import Sample, Space, count_pairs, sample_domain
+    from flcav.odd.sampling import SampledScenario, Space, count_pairs, sample_domain, write_recipes
     from flcav.odd.scenery import Scenery
     from flcav.sources.recipe import Recipe
     from flcav.storage.files import check_writable, write_bytes
@@ -82,14 +80,14 @@ def sample(
     found = read_domain(domain)
     sceneries = [Scenery(load_town(name)) for name in dict.fromkeys(town or TOWNS)]
     space = Space(found, sceneries)
-    searched = _search(space, sceneries, weights, count, seed, out) if method is Draw.failures else ()
+    searched = _search(space, weights, count, seed, out) if method is Draw.failures else ()
     drawn = (
         count_pairs(space, [each.sample for each in searched])
         if searched
         else sample_domain(space, count, method.value, seed, None if covered is None else load_report(covered))
     )
 
-    def write_scenario(sample: Sample, recipe: Recipe, path: Path) -> None:
+    def write_scenario(sample: SampledScenario, recipe: Recipe, path: Path) -> None:
         if openscenario:
             path.with_suffix(".xosc").write_bytes(to_openscenario(sample, f"{sample.place.town}.xodr"))
 
@@ -97,7 +95,7 @@ def sample(
     if openscenario:
         used = {each.place.town for each in drawn.samples}
         maps = {each.town.name: export_town(each.town) for each in sceneries if each.town.name in used}
-    paths = write_recipes(drawn, sceneries, out, seed, write_scenario, [each.failed for each in searched])
+    paths = write_recipes(drawn, space.sceneries, out, seed, write_scenario, [each.failed for each in searched])
     for name, text in maps.items():
         write_bytes(out / f"{name}.xodr", text.encode())
     cells = {failure.cell for each in searched for failure in each.failures}
@@ -117,9 +115,7 @@ def sample(
         yield f"    {plural(len(cells), 'distinct failure')} in {plural(frames, 'frame')}, of {failing}"
 
 
-def _search(
-    space: "Space", sceneries: "Sequence[Scenery]", weights: Path | None, count: int, seed: int, out: Path
-) -> "Sequence[Searched]":
+def _search(space: "Space", weights: Path | None, count: int, seed: int, out: Path) -> "Sequence[Searched]":
     """Return the scenarios of a search for failures; their results are kept in the folder of the recipes."""
     from flcav.config import InputError
     from flcav.interface import progress
@@ -131,4 +127,4 @@ def _search(
         raise InputError(f"{out}: has recipes already; name another folder")
     network = resolve_network(OBJECTS, weights, "cpu")
     with progress.show_progress("search") as report:
-        return search_failures(space, sceneries, network, count, seed, kept=out / TESTED, progress=report)
+        return search_failures(space, network, count, seed, kept=out / TESTED, progress=report)

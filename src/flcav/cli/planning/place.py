@@ -115,7 +115,7 @@ def place(
         _draw(map_, here, given, result, conventional, seen, traces)
     hidden = None
     if driving and here is not None:
-        from flcav.driving.studies.hidden import count_hidden
+        from flcav.driving.studies.pole_gain import count_hidden
 
         sites, ranges_m = given.poles[list(result.chosen)], given.ranges_m[list(result.sensors)].tolist()
         hidden = count_hidden(here, traces, sites, ranges_m)

@@ -14,7 +14,7 @@ from faster_coco_eval.core import mask as coco_mask
 from numpy.typing import NDArray
 
 from flcav.config import Json
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
     ExportOptions,
@@ -22,6 +22,7 @@ from flcav.dataset.formats.exporter import (
     count_unwritten,
     missing_data_error,
     split_scenes,
+    write_file,
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, select_rectangles
@@ -43,8 +44,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
         split = split_of[key.scene]
         for camera, picture in frame.images.items():
             path = out / "images" / split / f"{frame.key}_{camera}.png"
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(encode_png(picture.rgb))
+            write_file(path, encode_png(picture.rgb))
             counts["images"] += 1
             image = _image(frame, camera, path.name, counts["images"])
             for labels in CLASSES:
@@ -59,9 +59,7 @@ def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     if not counts["images"]:
         raise missing_data_error(dataset, "COCO", "camera images")
     for (labels, split), table in tables.items():
-        path = out / "annotations" / f"{labels}_{split}.json"
-        path.parent.mkdir(exist_ok=True)
-        path.write_text(json.dumps(table, allow_nan=False), encoding="utf-8")
+        write_file(out / "annotations" / f"{labels}_{split}.json", json.dumps(table, allow_nan=False))
     return exported
 
 

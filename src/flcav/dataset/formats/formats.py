@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING
 from flcav.plugins import load_named
 
 if TYPE_CHECKING:
-    from flcav.dataset.formats.exporter import ExportFormat
     from flcav.dataset.formats.reading import ImportFormat
+    from flcav.dataset.formats.writing import ExportFormat
 
 EXPORTS: Mapping[str, str] = {  # name -> module:NAME, so that listing the formats imports none
     "kitti": "flcav.dataset.formats.kitti.write:EXPORT",
@@ -15,16 +15,16 @@ EXPORTS: Mapping[str, str] = {  # name -> module:NAME, so that listing the forma
     "coco": "flcav.dataset.formats.coco:EXPORT",
     "nuscenes": "flcav.dataset.formats.nuscenes.write:EXPORT",
     "opv2v": "flcav.dataset.formats.opv2v.write:EXPORT",
-    "mcap": "flcav.dataset.formats.mcap.write:EXPORT",
+    "mcap": "flcav.dataset.formats.mcap:EXPORT",
 }
 IMPORTS: Mapping[str, str] = {
     "kitti": "flcav.dataset.formats.kitti.read:IMPORT",
     "nuscenes": "flcav.dataset.formats.nuscenes.read:IMPORT",
-    "argoverse2": "flcav.dataset.formats.argoverse2.read:IMPORT",
+    "argoverse2": "flcav.dataset.formats.argoverse2:IMPORT",
     "opv2v": "flcav.dataset.formats.opv2v.read:IMPORT",
     "dair-v2x": "flcav.dataset.formats.roadside:DAIR",
     "tumtraf": "flcav.dataset.formats.roadside:TUMTRAF",
-    "carlaflcav": "flcav.dataset.formats.carlaflcav.read:IMPORT",
+    "carlaflcav": "flcav.dataset.formats.carlaflcav:IMPORT",
 }
 
 
@@ -33,7 +33,7 @@ def export_format(name: str) -> "ExportFormat":
 
     Raises `InputError` for an unknown name, and if the user's module is missing or has no format of that name.
     """
-    from flcav.dataset.formats.exporter import ExportFormat
+    from flcav.dataset.formats.writing import ExportFormat
 
     return load_named("export format", name, EXPORTS, ExportFormat)
 

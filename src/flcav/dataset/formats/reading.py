@@ -17,16 +17,13 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, Json, parse_config, shorten
-from flcav.dataset.payloads import open_image, read_image
+from flcav.dataset.payloads import measure_upright, open_image, read_image
 from flcav.dataset.store import LazyMapping
-from flcav.dataset.upright import measure_upright
-from flcav.geometry import Boxes, count_points_in_boxes, inverse, is_rigid
+from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse, is_rigid
 from flcav.interface.wording import plural
 from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame, SignViews, Views
 from flcav.sensors.lens import Lens
 from flcav.sensors.views import outline_boxes
-
-Array = NDArray[np.float64]
 
 LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
 FARTHEST = 1e9  # largest number that a measurement is taken to have
@@ -261,6 +258,11 @@ class PosePairs:
         return (f"{told}, first in {self._first}",) if self._apart else ()
 
 
+def group_classes(**theirs: str) -> dict[str, str]:
+    """Return a format's class -> category of flcav's, from category -> the format's classes, with spaces between."""
+    return {name: category for category, names in theirs.items() for name in names.split()}
+
+
 def name_some(names: Collection[str]) -> str:
     """Return the first NAMED of several names, and how many others there are."""
     shown = ", ".join(list(names)[:NAMED])
@@ -289,7 +291,7 @@ def measure_picture(path: Path) -> tuple[int, int]:
         raise InputError(f"{path}: not an image, or a truncated one") from None
 
 
-def read_pictures(paths: Mapping[str, Path]) -> Mapping[str, CameraImage]:
+def link_pictures(paths: Mapping[str, Path]) -> Mapping[str, CameraImage]:
     """Return camera -> image, each read on first access."""
     return LazyMapping(list(paths), lambda name: CameraImage(read_image(paths[name], np.uint8, channels=3)))
 

@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, read_json, shorten
-from flcav.dataset.formats.layout import BRIGHTEST
-from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.clouds import BRIGHTEST, read_pcd
 from flcav.dataset.formats.reading import (
     ImportFormat,
     LogSource,
@@ -29,32 +28,29 @@ from flcav.dataset.formats.reading import (
     check_headings,
     check_sizes,
     choose_split,
+    group_classes,
     name_some,
 )
-from flcav.geometry import Boxes, turned_boxes, wrap_angle
+from flcav.geometry import Array, Boxes, turned_boxes, wrap_angle
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, Frame
 
-Array = NDArray[np.float64]
-
 LIDAR = "lidar"
-CATEGORIES = {  # of both datasets, without regard to case; others keep their names
-    "car": "car",
-    "van": "van",
-    "truck": "truck",
-    "trailer": "truck",
-    "bus": "bus",
-    "pedestrian": "pedestrian",
-    "cyclist": "bicycle",
-    "bicycle": "bicycle",
-    "motorcyclist": "motorcycle",
-    "motorcycle": "motorcycle",
-}
+# Classes of both datasets, without regard to case; others keep their names.
+CATEGORIES = group_classes(
+    car="car",
+    van="van",
+    truck="truck trailer",
+    bus="bus",
+    pedestrian="pedestrian",
+    bicycle="cyclist bicycle",
+    motorcycle="motorcyclist motorcycle",
+)
 OCCLUSION = (0.0, 0.3, 0.75)  # share that stands for DAIR-V2X's levels 0 not, 1 partly and 2 largely occluded
 STAMP = re.compile(r"(\d+)_(\d{9})_")  # seconds and nanoseconds in the names of TUMTraf's files
 
 
-class Sweep(NamedTuple):
+class RoadsideSweep(NamedTuple):
     """A sweep of a roadside LiDAR, its labels, and where it belongs in a dataset."""
 
     cloud: Path
@@ -93,7 +89,7 @@ class RoadsideSource(LogSource):
         """Yield the sweeps of a scene; raises `InputError` where a file is missing, truncated or malformed."""
         calibration, here = Calibration({LIDAR: np.eye(4)}), np.eye(4)
         for sweep in self._sweeps[scene]:
-            points, found = read_sweep(sweep.cloud), self._read_labels(sweep.label)
+            points, found = read_roadside_sweep(sweep.cloud), self._read_labels(sweep.label)
             check_sizes(found.boxes.size, sweep.label)
             yield Frame(
                 scene=scene,
@@ -108,7 +104,7 @@ class RoadsideSource(LogSource):
             )
 
     @abstractmethod
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
         """Return the labelled sweeps by scene, and the names of those without labels."""
 
     @abstractmethod
@@ -121,10 +117,10 @@ class DairSource(RoadsideSource):
 
     FORMAT = "dair-v2x"
 
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
         about, labels = _read_infos(folder / "data_info.json"), folder / "label" / "virtuallidar"
         places = {place: number for number, place in enumerate(sorted({row.place for row in about.values()} | {""}))}
-        scenes: dict[str, list[Sweep]] = {}
+        scenes: dict[str, list[RoadsideSweep]] = {}
         bare = list[str]()
         for cloud in sorted((folder / "velodyne").glob("*.pcd")):
             label, own = labels / f"{cloud.stem}.json", about.get(cloud.stem, Info("", "", 0.0))
@@ -132,7 +128,7 @@ class DairSource(RoadsideSource):
                 bare.append(cloud.name)
                 continue
             scene = f"dair-{own.sequence or cloud.stem}"
-            scenes.setdefault(scene, []).append(Sweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
+            scenes.setdefault(scene, []).append(RoadsideSweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
         return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
 
     def _read_labels(self, path: Path) -> Labelled:
@@ -160,9 +156,9 @@ class TumTrafSource(RoadsideSource):
 
     FORMAT = "tumtraf"
 
-    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[Sweep]], list[str]]:
+    def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
         roots = [folder] if (folder / "point_clouds").is_dir() else sorted(folder.iterdir())
-        scenes: dict[str, list[Sweep]] = {}
+        scenes: dict[str, list[RoadsideSweep]] = {}
         bare = list[str]()
         for root in (each for each in roots if (each / "point_clouds").is_dir()):
             for number, lidar in enumerate(sorted(path for path in (root / "point_clouds").iterdir() if path.is_dir())):
@@ -173,7 +169,7 @@ class TumTrafSource(RoadsideSource):
                     if not label.is_file():
                         bare.append(cloud.name)
                         continue
-                    sweep = Sweep(cloud, label, f"pole{number}", 0, time_s)
+                    sweep = RoadsideSweep(cloud, label, f"pole{number}", 0, time_s)
                     scenes.setdefault(root.resolve().name, []).append(sweep)
         return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
 
@@ -198,7 +194,7 @@ class TumTrafSource(RoadsideSource):
         return Labelled(tuple(track), boxes, np.full(len(boxes), np.nan))
 
 
-def read_sweep(path: Path) -> NDArray[np.float32]:
+def read_roadside_sweep(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x, y, z [m], intensity [0, 1] of a PCD file; points that are not finite are left out.
 
     Intensities may reach 255, or 65535. Raises `InputError` for other files.
@@ -249,7 +245,7 @@ def _read_infos(path: Path) -> Mapping[str, Info]:
         raise InputError(f"{path}: not the list of sweeps of DAIR-V2X") from None
 
 
-def _number(sweeps: Sequence[Sweep]) -> list[Sweep]:
+def _number(sweeps: Sequence[RoadsideSweep]) -> list[RoadsideSweep]:
     """Return a scene's sweeps with their spins, each LiDAR's in the order of time, and times since the first."""
     first, spins, numbered = min(sweep.time_s for sweep in sweeps), dict[str, int](), []
     for sweep in sorted(sweeps, key=lambda each: (each.time_s, each.cloud)):
@@ -259,11 +255,11 @@ def _number(sweeps: Sequence[Sweep]) -> list[Sweep]:
     return numbered
 
 
-def _describe_lacking(bare: Sequence[str], scenes: Mapping[str, Sequence[Sweep]]) -> Iterator[str]:
+def _describe_lacking(bare: Sequence[str], scenes: Mapping[str, Sequence[RoadsideSweep]]) -> Iterator[str]:
     """Yield sentences on sweeps without labels, and on those of one LiDAR and scene with one time."""
     if bare:
         yield f"left out {plural(len(bare), 'sweep')} without labels: {name_some(bare)}"
-    found: dict[tuple[str, str, float], list[Sweep]] = {}
+    found: dict[tuple[str, str, float], list[RoadsideSweep]] = {}
     for scene, sweep in ((scene, each) for scene, own in scenes.items() for each in own):
         found.setdefault((scene, sweep.pole, sweep.time_s), []).append(sweep)
     if twins := [own for own in found.values() if len(own) > 1]:

@@ -6,10 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import InputError, read_file
+from flcav.dataset.formats.clouds import has_nuscenes_layout, is_pcd, read_pcd
 from flcav.dataset.formats.kitti.files import read_points
-from flcav.dataset.formats.layout import has_nuscenes_layout
-from flcav.dataset.formats.nuscenes.files import read_lidar
-from flcav.dataset.formats.pcd import is_pcd, read_pcd
+from flcav.dataset.formats.nuscenes.files import read_nuscenes_points
 from flcav.dataset.formats.reading import check_cloud
 from flcav.dataset.payloads import TIMES
 
@@ -29,7 +28,7 @@ OTHERS = {  # formats that are not read, by their first bytes
 }
 
 
-def read_sweep(path: Path) -> NDArray[np.float32]:
+def read_cloud_file(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x ahead, y left, z up [m], intensity [0, 1] of a point cloud's file, LiDAR frame.
 
     Files of KITTI and nuScenes are told by their numbers, see `layout`; a PCD file has the fields `FIELDS`. Raises
@@ -41,7 +40,7 @@ def read_sweep(path: Path) -> NDArray[np.float32]:
             raise InputError(f"{path}: {name}; supported are point clouds of KITTI (.bin), nuScenes (.pcd.bin) and PCD")
     if is_pcd(data):
         return _read_fields(path)
-    return read_lidar(path) if has_nuscenes_layout(data) else read_points(path)
+    return read_nuscenes_points(path) if has_nuscenes_layout(data) else read_points(path)
 
 
 def list_sweeps(folder: Path) -> list[Path]:

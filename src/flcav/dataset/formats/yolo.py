@@ -9,16 +9,17 @@ from pathlib import Path
 
 import yaml
 
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
     ExportOptions,
     LeftOut,
     count_unlabelled,
     count_unwritten,
-    find_visible,
+    find_visible_objects,
     missing_data_error,
     split_with_validation,
+    write_file,
 )
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, Rectangles, select_rectangles
@@ -47,11 +48,11 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
             found = select_rectangles(frame, camera, options.labels, options.min_pixels)
             height, width = picture.rgb.shape[:2]
             name = f"{frame.key}_{camera}"
-            _write(out / "images" / split / f"{name}.png", encode_png(picture.rgb))
-            _write(out / "labels" / split / f"{name}.txt", format_label_file(found, width, height).encode())
+            write_file(out / "images" / split / f"{name}.png", encode_png(picture.rgb))
+            write_file(out / "labels" / split / f"{name}.txt", format_label_file(found, width, height))
             exported.counts.update({"images": 1, options.labels: len(found)})
             exported.left_out.update(count_unlabelled(frame, camera, options.labels, options.min_pixels))
-            exported.left_out[others] += len(find_visible(frame, camera, others.what))
+            exported.left_out[others] += len(find_visible_objects(frame, camera, others.what))
         exported.left_out.update(count_unwritten("YOLO", frame, frame.images))
         progress(i + 1, len(dataset), "")
     if not exported.counts["images"]:
@@ -60,7 +61,7 @@ def export_yolo(dataset: Dataset, out: Path, options: ExportOptions, progress: R
     for folder in folders.values():  # Ultralytics requires the first two, even for a test
         (out / folder).mkdir(exist_ok=True)
     names = dict(enumerate(CLASSES[options.labels]))
-    (out / "data.yaml").write_text(yaml.safe_dump({**folders, "names": names}, sort_keys=False), encoding="utf-8")
+    write_file(out / "data.yaml", yaml.safe_dump({**folders, "names": names}, sort_keys=False))
     return exported
 
 
@@ -72,8 +73,3 @@ def format_label_file(found: Rectangles, width: int, height: int) -> str:
     left, top, right, bottom = (found.box / (width, height, width, height)).T
     rows = zip(found.label, (left + right) / 2, (top + bottom) / 2, right - left, bottom - top)
     return "".join(f"{label} " + " ".join(f"{value:.6f}" for value in box) + "\n" for label, *box in rows)
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)

@@ -1,19 +1,24 @@
-"""The jobs of a recording: their division of the frames, how one is performed, and their scheduling.
+"""The jobs of a recording: division of the frames, how a job is performed, and engines that perform many at a time.
 
 A scene of a `Replayable` source is one job for its traffic and one for each part of its frames; any other scene is one
 job. A job writes below `work/SCENE`: the traffic, with navigation logs if there are any, or the folder of a part, which
 appears there when it is complete. A scene's traffic is scheduled before its parts, and only a few scenes are under way
-at a time.
+at a time. Jobs run in this process, in a pool of processes, or in actors on the machines of a Ray cluster.
 """
 
+import contextlib
 import hashlib
+import itertools
 import json
+import os
 import re
 import shutil
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from concurrent.futures.process import BrokenProcessPool
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import pyarrow as pa
 
@@ -23,9 +28,11 @@ from flcav.dataset.layout import CALIBRATION, FILES, MANIFEST, NAVIGATION, TOWN,
 from flcav.dataset.navigation_logs import save_logs
 from flcav.dataset.payloads import PICTURES, POINTS, check_image, encode_payloads
 from flcav.dataset.rows import build_table, encode_frame
-from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_table
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, write_rows
+from flcav.machine.processes import process_pool, start_server
+from flcav.machine.ray_engine import actor_pool
 from flcav.sensors.frame import LONGEST_NAME, Frame, LinkedFrame
-from flcav.sources.source import LoggingSource, Replayable, Source
+from flcav.sources.source import Isolated, LoggingSource, Replayable, Source
 from flcav.storage.files import flush_all, flush_tree, sha256, write_bytes, write_in_pieces
 from flcav.world.trace import Trace
 
@@ -40,13 +47,13 @@ OWN_NAMES = {TRACES, NAVIGATION, TOWN, MANIFEST, CALIBRATION, HEADER, JOINED, *m
 AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
-class Traffic(NamedTuple):
+class SceneTraffic(NamedTuple):
     """The job that simulates the traffic of a scene, which its parts replay."""
 
     scene: str
 
 
-class Part(NamedTuple):
+class ScenePart(NamedTuple):
     """The job that records `frames` consecutive frames of a scene, from number `first` on."""
 
     scene: str
@@ -59,7 +66,7 @@ class Part(NamedTuple):
         return work / self.scene / f"{self.number:05d}"
 
 
-Job = Traffic | Part
+Job = SceneTraffic | ScenePart
 
 
 def check_scenes(scenes: Sequence[str]) -> None:
@@ -71,21 +78,23 @@ def check_scenes(scenes: Sequence[str]) -> None:
         raise ValueError(f"two scenes are called '{max(scenes, key=list(scenes).count)}'")
 
 
-def split_scene(source: Source, scene: str) -> list[Part]:
+def split_scene(source: Source, scene: str) -> list[ScenePart]:
     """Return the parts of a scene: of PART_FRAMES each for a `Replayable` source, else one of all frames."""
     count = source.frame_count(scene)
     step = PART_FRAMES if isinstance(source, Replayable) else max(count, 1)
-    return [Part(scene, number, min(step, count - first), first) for number, first in enumerate(range(0, count, step))]
+    return [
+        ScenePart(scene, number, min(step, count - first), first) for number, first in enumerate(range(0, count, step))
+    ]
 
 
-def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], None]) -> None:
+def perform_job(source: Source, task: Job, work: Path, wrote_frame: Callable[[], None]) -> None:
     """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
 
     Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
     replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts; and the
     ValueError `InputError` where an image that is linked to is truncated.
     """
-    if isinstance(task, Traffic):
+    if isinstance(task, SceneTraffic):
         trace = source.trace(task.scene)
         if trace is None:
             raise ValueError(f"{task.scene}: the source can replay this scene but has no traffic of it")
@@ -108,7 +117,7 @@ def perform(source: Source, task: Job, work: Path, wrote_frame: Callable[[], Non
     flush_all([part.parent])
 
 
-def _frames(source: Source, task: Part, work: Path) -> Iterator[Frame]:
+def _frames(source: Source, task: ScenePart, work: Path) -> Iterator[Frame]:
     if not isinstance(source, Replayable):
         return source.frames(task.scene)
     trace = Trace.load(work / task.scene / TRAFFIC)
@@ -151,9 +160,9 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
             raise ValueError(f"{frame.key}: the sensors of {frame.agent} moved on their mounts within a dataset")
         wrote_frame()
     for name, rows in tables.items():
-        write_table(build_table(name, rows), part / table_path(name))
+        write_rows(build_table(name, rows), part / table_path(name))
     listing = pa.table(dict(zip(FILES_SCHEMA.names, zip(*files) if files else ([], [], []))), schema=FILES_SCHEMA)
-    write_table(listing, part / table_path(FILES))
+    write_rows(listing, part / table_path(FILES))
     write_bytes(part / CALIBRATION, json.dumps(calibrations).encode())
 
 
@@ -170,24 +179,35 @@ def _check_names(frame: Frame, scene: str) -> None:
         raise ValueError(f"{frame.key}: scene, agent or sensor names that a dataset cannot hold: {names}")
 
 
-class Engine(Protocol):
+class Engine:
     """An executor of jobs, in any order, `slots` at a time."""
 
-    slots: int
+    def __init__(self, slots: int, start: Callable[[Job], Future[None]], wrote: Callable[[int], None]) -> None:
+        """`start` begins a job; `wrote` is called with the number of frames of the parts that are completed."""
+        self.slots, self._start, self._wrote = slots, start, wrote
+        self._tasks: dict[Future[None], Job] = {}
+        self._count = 0
 
     def submit(self, task: Job) -> None:
         """Enqueue a job."""
-        ...
+        self._tasks[self._start(task)] = task
 
-    def wait(self) -> Iterable[Job]:
+    def wait(self) -> list[Job]:
         """Block until a submitted job is done; return those done since the last call, at least one.
 
         Raises the exception of a failed job, and OSError where a worker was killed.
         """
-        ...
+        done: set[Future[None]] = set()
+        while not done:
+            done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
+            self._count += sum(task.frames for each in done if isinstance(task := self._tasks[each], ScenePart))
+            self._wrote(self._count)
+        for future in done:
+            future.result()
+        return [self._tasks.pop(future) for future in done]
 
 
-def find_pending(source: Source, scene: str, work: Path) -> list[Part]:
+def find_pending(source: Source, scene: str, work: Path) -> list[ScenePart]:
     """Return the parts of a scene that are not completed yet."""
     return [part for part in split_scene(source, scene) if not part.folder(work).is_dir()]
 
@@ -202,10 +222,88 @@ def record_scenes(source: Source, engine: Engine, work: Path) -> None:
             if not ready:
                 scene = scenes.popleft()
                 known = not isinstance(source, Replayable) or (work / scene / TRAFFIC).is_file()
-                ready.extend(find_pending(source, scene, work) if known else [Traffic(scene)])
+                ready.extend(find_pending(source, scene, work) if known else [SceneTraffic(scene)])
             engine.submit(ready.popleft())
             busy += 1
         for task in engine.wait():
             busy -= 1
-            if isinstance(task, Traffic):
+            if isinstance(task, SceneTraffic):
                 ready.extend(find_pending(source, task.scene, work))
+
+
+POLL_S = 0.2
+
+_job: Any = None  # in a worker process: source, folder, and the shared counter of written frames
+
+
+@contextlib.contextmanager
+def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+    """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
+
+    It calls `wrote` with the number of frames written so far. A single one is this process, unless the source is
+    `Isolated`; others are child processes of one thread each, which end with this one, even if it is killed.
+    """
+    if jobs == 1 and not isinstance(source, Isolated):
+        count = itertools.count(1)
+
+        def run(task: Job) -> Future[None]:
+            perform_job(source, task, work, lambda: wrote(next(count)))
+            done: Future[None] = Future()
+            done.set_result(None)
+            return done
+
+        yield Engine(1, run, lambda _: None)
+        return
+    written = start_server().Value("q", 0)
+    with process_pool(jobs, _begin, source, work, written) as pool:
+        try:
+            yield Engine(jobs, lambda task: pool.submit(_perform, task), lambda _: wrote(written.value))
+        except BrokenProcessPool:
+            if isinstance(source, Isolated):
+                raise OSError(source.explain_end()) from None
+            raise
+
+
+@contextlib.contextmanager
+def start_actors(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
+    """Yield an engine of `jobs` Ray actors that perform jobs of `source` below the folder `work`.
+
+    The folder must be on storage shared by all machines, and flcav installed on each. RAY_ADDRESS names the cluster;
+    without it, Ray is started on this machine. It calls `wrote` with the number of frames written so far, as parts are
+    completed. Raises `InputError` where Ray is not installed.
+    """
+    with actor_pool(jobs, _Recorder, source, work.absolute()) as pool:
+        yield Engine(jobs, lambda task: pool.lend(lambda actor: actor.call(_Recorder.perform, task)), wrote)
+
+
+def _begin(*job: Any) -> None:
+    global _job
+    _job = job
+    if isinstance(job[0], Isolated):
+        silent = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):  # what its library prints; errors are returned
+            os.dup2(silent, stream)
+
+
+def _perform(task: Job) -> None:
+    source, work, written = _job
+
+    def count_frame() -> None:
+        with written.get_lock():
+            written.value += 1
+
+    perform_job(source, task, work, count_frame)
+
+
+class _Recorder:
+    """A Ray actor that performs jobs in sequence; its source keeps the scene that it built last."""
+
+    def __init__(self, source: Source, work: Path) -> None:
+        self._source, self._work = source, work
+
+    def perform(self, task: Job) -> None:
+        if not self._work.is_dir():
+            raise OSError(
+                f"{self._work}: not seen from {os.uname().nodename}; record into storage that all nodes share"
+            )
+        perform_job(self._source, task, self._work, lambda: None)

@@ -3,26 +3,30 @@
 Parts of scenes are first written below the hidden folder `.recording`. When all are complete, their files are moved
 into the dataset, their tables are concatenated, and the manifest is written last. An interruption at any point loses
 only the parts that were under way. A part is on the disk before it counts as complete, and all before the manifest.
+
+A finished dataset of which files are missing or damaged is mended: the parts that they are of are recorded again.
 """
 
 import json
 import shutil
 import time
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Callable, Collection, Mapping
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from flcav.config import InputError, Json, read_json
+from flcav.config import InputError, Json, path_within, read_json
 from flcav.dataset.layout import (
     CALIBRATION,
     FILES,
     FORMAT,
     LEVEL_FORMAT,
     MANIFEST,
+    TOWN,
     WORK,
     navigation_path,
     package_versions,
@@ -41,14 +45,14 @@ from flcav.dataset.recording.jobs import (
     find_pending,
     record_scenes,
     split_scene,
+    start_actors,
+    start_processes,
 )
-from flcav.dataset.recording.mending import find_damage, has_damaged_table, mend
-from flcav.dataset.recording.workers import start_actors, start_processes
-from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, write_table
+from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, list_files, read_table, write_rows
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
-from flcav.sources.opening import open_source
-from flcav.sources.recipe import Recipe, load_recipe
+from flcav.sources.embedded import EmbeddedSource
+from flcav.sources.recipe import CarlaRecipe, Recipe, load_recipe
 from flcav.sources.source import Isolated, Source, TownSource
 from flcav.storage.files import flush_all, sha256, write_bytes, write_json
 
@@ -68,7 +72,7 @@ def record(
     """Record a source, or the built-in simulator with a recipe or that in a YAML file, into the folder `out`.
 
     Returns True if anything was recorded, False if `out` already held this very dataset. An interrupted recording of
-    the same source is resumed. A dataset is mended, see `flcav.dataset.recording.mending`, where files are missing or
+    the same source is resumed. A dataset is mended, see `mend`, where files are missing or
     have another size, or tables another hash. Raises `InputError` where `out` holds anything else, is written by
     another process or cannot be mended, or `jobs`, `engine` or the recipe is wrong; ValueError where scenes have names
     that no folder may have, before anything is touched; OSError where `out` cannot be written.
@@ -108,7 +112,7 @@ def record(
                     drop_unbegun(out)
                     raise
                 _assemble(source, out, header)
-            if damaged := find_damage(out):
+            if damaged := find_damaged_files(out):
                 more = f" (and {len(damaged) - 1} more)" if len(damaged) > 1 else ""
                 progress(0, 1, f"{out / min(damaged)} {DAMAGED}{more}, recorded anew")
                 mend(source, out, damaged, write)
@@ -252,7 +256,7 @@ def _write_town(source: Source, work: Path, out: Path) -> bool:
 def _list(files: Mapping[str, Path], folder: Path) -> None:
     """Write the listing of `files`, path in the dataset -> file, into `folder`."""
     rows = [(name, path.stat().st_size, sha256(path)) for name, path in files.items()]
-    write_table(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
+    write_rows(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
 
 
 def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
@@ -290,3 +294,81 @@ def _values(path: Path, column: str) -> pa.Array:
 def _move(source: Path, target: Path) -> None:
     target.parent.mkdir(parents=True, exist_ok=True)
     source.replace(target)
+
+
+def open_source(recipe: Recipe, beside: Path | None = None) -> Source:
+    """Return the source of a recipe's frames; a town's folder may be relative to `beside`, the folder of the recipe.
+
+    Raises `InputError` where the recipe and its town do not go together, and where CARLA's client is not installed.
+    """
+    if isinstance(recipe, CarlaRecipe):
+        from flcav.carla.recording.source import CarlaSource  # not all have CARLA's client
+
+        return CarlaSource(recipe, beside)
+    return EmbeddedSource(recipe, beside)
+
+
+def find_damaged_files(out: Path) -> set[str]:
+    """Return the files of the dataset in `out`, all but its tables, that are missing or of another size."""
+    manifest = read_manifest(out)
+    listed = list_files(out, manifest)
+    kept = {name: size for name, (size, _) in listed.items() if name not in manifest.tables}
+    return {name for name, size in kept.items() if _size(path_within(out, name, out)) != size}
+
+
+def has_damaged_table(out: Path) -> bool:
+    """Return whether a table of the dataset in `out` is missing or altered."""
+    tables = read_manifest(out).tables
+    return any(_size(out / name) != own.bytes or sha256(out / name) != own.sha256 for name, own in tables.items())
+
+
+def mend(source: Source, out: Path, damaged: Collection[str], record: Callable[[], None]) -> None:
+    """Put the files `damaged` of the dataset in `out` in place again.
+
+    `record` performs the remaining jobs of the source below `.recording`; these are the parts that have a damaged file.
+    Raises `InputError` for a file that is not recorded as it was, by other versions of packages.
+    """
+    work, listed = out / WORK, list_files(out, read_manifest(out))
+    shutil.rmtree(work, ignore_errors=True)
+    made = _make_parts(source, out, damaged, record)
+    if isinstance(source, TownSource):
+        folder = town_path(str(source.describe()["town"]))
+        for name, data in source.town_files().items() if any(name.startswith(f"{TOWN}/") for name in damaged) else ():
+            made[f"{folder}/{name}"] = work / TOWN / name
+            write_bytes(work / TOWN / name, data)
+    for name in damaged:
+        if name not in made or sha256(made[name]) != listed[name][1]:
+            raise InputError(f"{out / name}: damaged, and not recorded as it was; remove {out} to record it anew")
+    for name in damaged:
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        made[name].replace(out / name)
+    flush_all({(out / name).parent for name in damaged})
+    shutil.rmtree(work)
+
+
+def _make_parts(source: Source, out: Path, damaged: Collection[str], record: Callable[[], None]) -> dict[str, Path]:
+    """Record the parts that have a damaged file; return the new files by their names in the dataset."""
+    frames = read_table(out / table_path("frames"), "frames").to_pydict()
+    keys: dict[str, list[str]] = defaultdict(list)
+    for scene, key in zip(frames["scene"], frames["key"]):
+        keys[scene].append(key)
+    names = [PurePosixPath(name).name for name in damaged]
+    touched = {name[:end] for name in names for end, letter in enumerate(name) if letter == "."}
+    parts = [part for scene in source.scenes() for part in split_scene(source, scene)]
+    for part in parts:
+        whole = len(keys[part.scene]) == source.frame_count(part.scene)  # else no frame's part is known, as of windows
+        own = keys[part.scene][part.first : part.first + part.frames] if whole else keys[part.scene]
+        moving = {trace_path(part.scene), navigation_path(part.scene)}
+        if touched.isdisjoint(own) and (part.number or moving.isdisjoint(damaged)):
+            part.folder(out / WORK).mkdir(parents=True)  # as if it were recorded
+    (out / WORK).mkdir(exist_ok=True)
+    record()
+    made = {trace_path(scene): out / WORK / scene / TRAFFIC for scene in keys}
+    made |= {navigation_path(scene): out / WORK / scene / LOGS for scene in keys}
+    made = {name: path for name, path in made.items() if path.exists()}
+    folders = [part.folder(out / WORK) / PAYLOADS for part in parts]
+    return made | {name: folder / name for name in damaged for folder in folders if (folder / name).exists()}
+
+
+def _size(path: Path) -> int | None:
+    return path.stat().st_size if path.is_file() else None

@@ -8,22 +8,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.driving.errors import CLASSES, EDGES_M, ErrorModel, find_in_field
 from flcav.driving.following import MOTIONS
 from flcav.driving.jobs import begin_worker
-from flcav.driving.loop import Loop, drive
+from flcav.driving.loop import Loop, drive_scenario
 from flcav.driving.networks import NetworkPerception
-from flcav.driving.scenarios import Scenario, Staged
-from flcav.driving.seen import EGO, TIMES_S, Seen
-from flcav.driving.truth import Truth, find_around
-from flcav.geometry import rotate, wrap_angle
+from flcav.driving.scenarios import DrivingScenario, StagedScenario
+from flcav.driving.seen import EGO, TIMES_S, Seen, TruePerception, find_around
+from flcav.geometry import Array, rotate, wrap_angle
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.world.snapshot import Snapshot
-
-Array = NDArray[np.float64]
 
 MATCH_M = 2.5
 ONE_SIGMA = 0.6827  # share of a normal distribution within one standard deviation: outliers do not widen that
@@ -61,8 +57,8 @@ class Tally:
 class Comparing:
     """Perception by the networks, compared with the truth, by which the vehicle is driven."""
 
-    def __init__(self, staged: Staged, seed: int, tally: Tally) -> None:
-        self._networks, self._truth = NetworkPerception(staged, seed), Truth(staged.scenario.weather)
+    def __init__(self, staged: StagedScenario, seed: int, tally: Tally) -> None:
+        self._networks, self._truth = NetworkPerception(staged, seed), TruePerception(staged.scenario.weather)
         self._tally, self._class = tally, staged.scenario.weather
         self._forecasts: list[tuple[float, str, str, float, Array]] = []
         self._places: dict[tuple[str, int], Array] = {}
@@ -131,7 +127,7 @@ class Comparing:
 
 
 def measure_errors(
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[DrivingScenario],
     seeds: Sequence[int],
     loop: Loop,
     processes: int = 1,
@@ -144,17 +140,17 @@ def measure_errors(
         for done, own in enumerate(pool.map(tally_drive, *zip(*jobs)), start=1):
             whole.add(own)
             progress(done, len(jobs), "")
-    return summarise(whole)
+    return summarise_tally(whole)
 
 
-def tally_drive(scenario: Scenario, seed: int, loop: Loop) -> Tally:
+def tally_drive(scenario: DrivingScenario, seed: int, loop: Loop) -> Tally:
     """Return the counts of the networks' errors in one drive."""
     tally = Tally()
-    drive(scenario, seed, lambda staged, own: Comparing(staged, own, tally), loop)
+    drive_scenario(scenario, seed, lambda staged, own: Comparing(staged, own, tally), loop)
     return tally
 
 
-def summarise(tally: Tally) -> ErrorModel:
+def summarise_tally(tally: Tally) -> ErrorModel:
     """Return the error model of the counts; shares have half a success and half a failure added (Jeffreys prior)."""
     detected: dict[str, tuple[float, ...]] = {}
     sd: dict[str, tuple[float, float, float]] = {}

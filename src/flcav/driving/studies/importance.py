@@ -13,11 +13,11 @@ from typing import get_args
 
 import numpy as np
 
-from flcav.driving.couplings import FEEDS, TASKS, Coupling
-from flcav.driving.jobs import Job, Sensed, run_jobs
+from flcav.driving.jobs import DriveJob, Sensed, run_jobs
 from flcav.driving.loop import Loop
-from flcav.driving.measures import Drive
-from flcav.driving.scenarios import Scenario
+from flcav.driving.measures import DriveResult
+from flcav.driving.scenarios import DrivingScenario
+from flcav.driving.seen import FEEDS, TASKS, Coupling
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import find_shipped, read_card
@@ -82,7 +82,7 @@ def read_reached() -> dict[str, float]:
 
 
 def measure_importance(
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[DrivingScenario],
     seeds: Sequence[int],
     sensed: Sensed,
     reached: Mapping[str, float],
@@ -102,12 +102,12 @@ def measure_importance(
     loop = Loop(lasts_s=lasts_s)
     arms: list[tuple[str | None, Coupling]] = [(None, "bare"), *((t, c) for c in COUPLINGS for t in TASKS)]
     keys = [(seed, arm, scenario) for seed in seeds for arm in arms for scenario in scenarios]
-    jobs = [Job(scenario, seed, task, coupling, loop) for seed, (task, coupling), scenario in keys]
+    jobs = [DriveJob(scenario, seed, task, coupling, loop) for seed, (task, coupling), scenario in keys]
     drives = run_jobs(jobs, sensed, processes, progress, kept)
     by_arm = {arm: [own for own, (_, each, _) in zip(drives, keys) if each == arm] for arm in arms}
     names = [scenario.name for _ in seeds for scenario in scenarios]
     whole = by_arm[None, "bare"]
-    tasks = {c: weigh([compare(t, whole, by_arm[t, c], names) for t in TASKS]) for c in COUPLINGS}
+    tasks = {c: weigh([compare_drives(t, whole, by_arm[t, c], names) for t in TASKS]) for c in COUPLINGS}
     ranks = [[each.differences["score"].mean for each in tasks[c]] for c in COUPLINGS]
     total = sum(reached.values())
     return Importance(
@@ -121,13 +121,17 @@ def measure_importance(
     )
 
 
-def compare(task: str, whole: Sequence[Drive], without: Sequence[Drive], names: Sequence[str]) -> TaskImportance:
+def compare_drives(
+    task: str, whole: Sequence[DriveResult], without: Sequence[DriveResult], names: Sequence[str]
+) -> TaskImportance:
     """Return the paired differences of drives without a task less with it; its weight is not known yet."""
     differences = {name: paired_difference(whole, without, names, name) for name in MEASURES}
     return TaskImportance(task, FEEDS[task], differences, 0.0)
 
 
-def paired_difference(first: Sequence[Drive], second: Sequence[Drive], names: Sequence[str], field: str) -> Estimate:
+def paired_difference(
+    first: Sequence[DriveResult], second: Sequence[DriveResult], names: Sequence[str], field: str
+) -> Estimate:
     """Return the mean difference of a measure, second less first, with its interval over scenarios (bootstrap).
 
     Drives are paired; those of one scenario, the seeds, are drawn together.

@@ -1,4 +1,9 @@
-"""The benefit of roadside units for driving: hidden road users, average precision, and drives, with and without."""
+"""What roadside sensors on poles give a driver: road users that are hidden without them, precision, and safer drives.
+
+The article argues for road sensors with what a vehicle cannot see (Wang et al., IEEE Network 37(3), 2023). Counted are
+cars and vans in the field of the vehicle's detector; hidden are those that no ray reaches (`seen.share_seen`). In
+closed loop the same drives are repeated with the detections of poles and without them.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -6,25 +11,101 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.driving.loop import LOOP, Loop, drive
-from flcav.driving.measures import Drive
+from flcav.driving.loop import LOOP, Loop, drive_scenario
+from flcav.driving.measures import DriveResult
 from flcav.driving.networks import NetworkPerception
 from flcav.driving.road import SPIN_S, RoadUnits
-from flcav.driving.scenarios import Scenario, Staged
-from flcav.driving.seen import EGO, Seen
-from flcav.driving.studies.hidden import Hidden, find_hidden, summarise_hidden
+from flcav.driving.scenarios import DrivingScenario, StagedScenario
+from flcav.driving.seen import EGO, EYE_M, FIELD_M, Seen, share_seen
 from flcav.driving.studies.importance import paired_difference
-from flcav.driving.visibility import FIELD_M
-from flcav.geometry import Boxes, rotate
+from flcav.geometry import Array, Boxes, rotate
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.metrics.detection import match, weighted_precision
+from flcav.perception.objects.truth import CARS
 from flcav.statistics.bootstrap import bootstrap_over_scenes
-from flcav.statistics.estimates import Estimate
+from flcav.statistics.estimates import Estimate, score_interval
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record
+from flcav.world.line_of_sight import look_at_instants
+from flcav.world.map.town import Town
+from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
+from flcav.world.trace import Trace
 
-Array = NDArray[np.float64]
+INSTANTS = 40
+
+
+@dataclass(frozen=True)
+class Hidden(Record):
+    """Shares of the cars around vehicles that are hidden, with Wilson's interval; 0 cars give no shares."""
+
+    cars: int
+    vehicle: Estimate | None  # from the vehicle
+    poles: Estimate | None  # from every pole, or out of its range
+    both: Estimate | None
+
+    def lines(self) -> list[str]:
+        """Return the shares in words."""
+        if self.vehicle is None or self.poles is None or self.both is None:
+            return ["nobody drives near the vehicles"]
+        return [
+            f"of {self.cars} cars around vehicles hidden from the vehicle {self.vehicle.describe()}, "
+            f"from every pole {self.poles.describe()}, from both {self.both.describe()}"
+        ]
+
+
+def find_hidden(scene: Scene, own: int, sites: Sequence[Array], range_m: float) -> tuple[Boxes, NDArray[np.bool_]]:
+    """Return the cars in the field of the vehicle in row `own`, and (N, 2) whether hidden from it, from every site."""
+    trace, i = scene.trace, scene.index
+    rows = np.flatnonzero(trace.present[i] & np.isin(trace.category, CARS))
+    rows = rows[rows != own]
+    at, yaw = trace.position[i, own], float(trace.yaw[i, own])
+    x, y = rotate(trace.position[i, rows, 0] - at[0], trace.position[i, rows, 1] - at[1], -yaw)
+    rows = rows[(x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])]
+    size = trace.size[rows]
+    boxes = Boxes(trace.position[i, rows] + size * (0.0, 0.0, 0.5), size, trace.yaw[i, rows], np.full(len(rows), "Car"))
+    hidden = np.ones((len(rows), 2), np.bool_)
+    hidden[:, 0] = share_seen(scene, at + np.array((0.0, 0.0, EYE_M)), boxes, own) == 0
+    for site in sites:
+        near = np.linalg.norm(boxes.center - site, axis=1) <= range_m
+        hidden[near, 1] &= share_seen(scene, site, boxes[near]) == 0
+    return boxes, hidden
+
+
+def summarise_hidden(flags: Sequence[NDArray[np.bool_]]) -> Hidden:
+    """Return the shares of the flags (N, 2) of all instants."""
+    joined = np.concatenate([np.zeros((0, 2), np.bool_), *flags])
+    n = len(joined)
+    if not n:
+        return Hidden(0, None, None, None)
+    vehicle, poles, both = joined[:, 0].mean(), joined[:, 1].mean(), joined.all(axis=1).mean()
+    return Hidden(n, *(score_interval(float(share), n) for share in (vehicle, poles, both)))
+
+
+def count_hidden(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Sequence[float]) -> Hidden:
+    """Return the road users hidden from connected vehicles ("cav0", ...) in recorded traffic, and from sites (P, 3).
+
+    Looked at are about `INSTANTS` instants. Without connected vehicles every car that drives is one.
+    """
+    flags = []
+    for scene in look_at_instants(town, traces, INSTANTS):
+        trace, i = scene.trace, scene.index
+        names = np.char.startswith(trace.actor, "cav") & trace.present[i]
+        if not names.any():
+            driving = np.linalg.norm(trace.velocity[i, :, :2], axis=1) > 1.0
+            names = trace.present[i] & np.isin(trace.category, CARS) & driving
+        for own in np.flatnonzero(names).tolist():
+            flags.append(_hidden_of(scene, own, sites, ranges_m))
+    return summarise_hidden(flags)
+
+
+def _hidden_of(scene: Scene, own: int, sites: Array, ranges_m: Sequence[float]) -> NDArray[np.bool_]:
+    """Return the flags of the cars around one vehicle, of sites that have a range each."""
+    _, hidden = find_hidden(scene, own, [], 0.0)
+    for site, range_m in zip(sites, ranges_m, strict=True):
+        hidden[:, 1] &= find_hidden(scene, own, [site], range_m)[1][:, 1]
+    return hidden
+
 
 RANGE_M = 40.0  # of a pole's sensor
 GAINS = {
@@ -52,7 +133,7 @@ class FusionTally:
 class Cooperative:
     """Cooperative perception by vehicle and roadside units; the detections of both are compared with the truth."""
 
-    def __init__(self, staged: Staged, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
+    def __init__(self, staged: StagedScenario, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
         self._units = RoadUnits(staged.town, poles, seed)
         self._networks = NetworkPerception(staged, seed, road=self._units)
         self._scenario, self._tally, self._looked_s = staged.scenario.name, tally, -SPIN_S
@@ -117,15 +198,15 @@ def measure_precision(tally: FusionTally) -> Precision | None:
 
 
 @dataclass(frozen=True)
-class PoleGain(Record):
+class ClosedLoopGain(Record):
     """Gain of roadside sensors in closed loop, over the same drives with and without them."""
 
     poles: tuple[int, ...]
     hidden: Hidden
     precision: Precision | None  # None where there are no cars
     latency_s: float | None  # mean age of a message on arrival; None where none arrived
-    without: tuple[Drive, ...]
-    with_poles: tuple[Drive, ...]
+    without: tuple[DriveResult, ...]
+    with_poles: tuple[DriveResult, ...]
 
     def lines(self) -> list[str]:
         """Return the gain in words."""
@@ -151,19 +232,21 @@ class PoleGain(Record):
 
 
 def measure_pole_gain(
-    scenarios: Sequence[Scenario],
+    scenarios: Sequence[DrivingScenario],
     seeds: Sequence[int],
     poles: Sequence[int],
     loop: Loop = LOOP,
     progress: Report = ignore_progress,
-) -> PoleGain:
+) -> ClosedLoopGain:
     """Return the benefit of roadside units on poles of the scenarios' town; raises `InputError` for an unknown pole."""
-    tally, without, with_poles = FusionTally(), list[Drive](), list[Drive]()
+    tally, without, with_poles = FusionTally(), list[DriveResult](), list[DriveResult]()
     pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
     for done, (scenario, seed) in enumerate(pairs, start=1):
-        without.append(drive(scenario, seed, NetworkPerception, loop))
-        with_poles.append(drive(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop))
+        without.append(drive_scenario(scenario, seed, NetworkPerception, loop))
+        with_poles.append(
+            drive_scenario(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop)
+        )
         progress(done, len(pairs), scenario.name)
     late = float(np.mean(tally.latency_s)) if tally.latency_s else None
     hidden, precision = summarise_hidden(tally.hidden), measure_precision(tally)
-    return PoleGain(tuple(poles), hidden, precision, late, tuple(without), tuple(with_poles))
+    return ClosedLoopGain(tuple(poles), hidden, precision, late, tuple(without), tuple(with_poles))

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from flcav.arrays import Array, Array32
 from flcav.config import InputError
-from flcav.dataset.formats.sweeps import list_sweeps, read_sweep
+from flcav.dataset.formats.sweeps import list_sweeps, read_cloud_file
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse, pose
@@ -277,7 +277,7 @@ def detect_objects(
 ) -> Iterator[Finding]:
     """Yield the objects of score `threshold` or more in each point cloud of `path`.
 
-    path: a file of a point cloud, see `read_sweep`, a folder of them, or a dataset folder, of which `frames` (None:
+    path: a file of a point cloud, see `read_cloud_file`, a folder of them, or a dataset folder, of which `frames` (None:
     all). Raises `InputError` as `read_point_clouds` does.
     """
     for cloud in read_point_clouds(path, frames, network.config):
@@ -306,7 +306,7 @@ def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondCo
 
 
 def _of_file(path: Path) -> InputCloud:
-    return InputCloud(path, validate_points(read_sweep(path), path), None, partial(view_beside, path))
+    return InputCloud(path, validate_points(read_cloud_file(path), path), None, partial(view_beside, path))
 
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:

@@ -13,7 +13,7 @@ import numpy as np
 
 from flcav.arrays import Array, Array32, Mask
 from flcav.config import InputError
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.interface.wording import plural
@@ -129,7 +129,7 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
     Raises `InputError` where there are LiDARs but none fits.
     """
     height_m: dict[int, float] = {}
-    ground = Ground(data)
+    ground = DatasetGround(data)
     for number, key in enumerate(data.keys):
         if lidars := data.lidars(number):
             mounts = data.calibrations[key.agent].true.agent_from_sensor

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import RoadView, build_road_view, label_ideally, road_detector
@@ -82,7 +82,7 @@ def pseudo_label_samples(
     downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by the `poses`
     of its navigation.
     """
-    relief = Ground(split.data).relief
+    relief = DatasetGround(split.data).relief
 
     def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
         (detections,) = detect_in(network, [frame], score_threshold=threshold)
@@ -126,7 +126,7 @@ def road_views(
     split: Frames, poles: Sequence[int], trained: bool, spins: Collection[Spin]
 ) -> dict[Spin, dict[int, RoadView]]:
     """Return what sensors see in `spins`, by spin and number of the pole, of `poles`: see `pseudo_label_samples`."""
-    ground = Ground(split.data)
+    ground = DatasetGround(split.data)
     views: dict[Spin, dict[int, RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
     for pole in poles:

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import build_road_view, road_detector
 from flcav.geometry import Boxes
@@ -24,7 +24,7 @@ def label_roadside(
 
     Boxes to find are those of the unit's detector; what it sees of free ground and of other returns is background.
     """
-    ground, samples = Ground(split.data), dict[str, list[Sample]]()
+    ground, samples = DatasetGround(split.data), dict[str, list[Sample]]()
     find = road_detector(split.data) if poles else None
     for pole in poles:
         for i in split.poles.get(pole, ()):

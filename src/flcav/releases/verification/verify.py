@@ -15,8 +15,8 @@ from flcav.interface.wording import plural
 from flcav.odd.cells import cells_of, full_name
 from flcav.odd.coverage import Document, collect_runs, list_covered, merge_runs
 from flcav.odd.domain import Domain, read_domain
-from flcav.odd.judge import INSIDE, OUTSIDE, UNKNOWN, judge
-from flcav.odd.measure import measure
+from flcav.odd.judge import INSIDE, OUTSIDE, UNKNOWN, judge_frames
+from flcav.odd.measure import measure_domain
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import FrameTruth
@@ -97,10 +97,10 @@ def find_cells(
     documents: dict[str, Document] = {}
     for number, folder in enumerate(folders):
         data = Dataset.open(folder, checked=False)
-        measured = measure(data, [each.number for each in frames if each.data == folder])
+        measured = measure_domain(data, [each.number for each in frames if each.data == folder])
         names = (" x ".join(cell) for cell in cells_of(domain, measured, axes))
         cells |= {(folder, frame): name for frame, name in zip(measured.frames, names, strict=True)}
-        verdicts = judge(domain, measured)
+        verdicts = judge_frames(domain, measured)
         for verdict in counts:
             counts[verdict] += verdicts.count(verdict)
         documents |= {f"{number}_{name}": run for name, run in collect_runs(domain, data, measured).items()}

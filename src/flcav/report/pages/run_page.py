@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
 from flcav.federation.privacy import SEEDED
 from flcav.geometry import Boxes
@@ -279,7 +279,7 @@ def _sweep(work: Path, names: Names, run: Run) -> clouds.ComparedSweep:
     region = run.recipe.with_role("federate")[0]
     data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
     frame = data.frame(looked.frame)
-    points, ground_m = clouds.read_sweep(frame, choose_lidar(frame), Ground(data).relief)
+    points, ground_m = clouds.read_sweep(frame, choose_lidar(frame), DatasetGround(data).relief)
     before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
     return clouds.ComparedSweep(points, ground_m, _boxes(looked.targets), before, after)
 

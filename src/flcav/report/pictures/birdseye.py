@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
-from flcav.dataset.ground import Ground
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, inverse, transform_points
 from flcav.perception.agents import POLE, kind_of
@@ -49,7 +49,7 @@ def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool =
     """Return the view of a frame of `dataset`, `range_m` [m] to each side; with `tracks` its actors' paths as well."""
     agent_from_world = inverse(frame.world_from_agent)
     clouds = [transform_points(frame.agent_from_sensor[name], cloud[:, :3]) for name, cloud in frame.lidar.items()]
-    points, ground = np.concatenate([np.zeros((0, 3)), *clouds]), Ground(dataset)
+    points, ground = np.concatenate([np.zeros((0, 3)), *clouds]), DatasetGround(dataset)
     if ground.relief is None:
         points[:, 2] += ground.height_of(dataset.number(frame.key))
     else:

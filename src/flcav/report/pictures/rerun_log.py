@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
-from flcav.dataset.formats.colours import COLOURS, OTHER, SIGN
+from flcav.dataset.formats.writing import COLOURS, OTHER, SIGN
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse
 from flcav.interface.progress import Report, ignore_progress

@@ -14,11 +14,10 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, path_within, read_file
-from flcav.dataset.formats.layout import describe_numbers, has_kitti_layout
+from flcav.dataset.formats.clouds import describe_numbers, has_kitti_layout
 from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
-from flcav.dataset.payloads import open_image
-from flcav.dataset.upright import turn_upright
-from flcav.geometry import Boxes, heading_vectors, inverse, transform_points, wrap_angle
+from flcav.dataset.payloads import open_image, turn_upright
+from flcav.geometry import Array, Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
 LAYOUT, POINT = "4 columns of float32", "x, y, z [m], intensity 0 to 1"
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
@@ -38,8 +37,8 @@ MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
 class KittiCalibration:
     """Extrinsics and projection of the left colour camera (camera 2)."""
 
-    camera_from_lidar: NDArray[np.float64]  # (4, 4), rectified camera frame
-    image_from_camera: NDArray[np.float64]  # (3, 4) projection to pixels
+    camera_from_lidar: Array  # (4, 4), rectified camera frame
+    image_from_camera: Array  # (3, 4) projection to pixels
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
@@ -98,11 +97,11 @@ class Objects:
     """The N labelled objects of a frame, and its K DontCare regions."""
 
     boxes: Boxes  # (N,) LiDAR frame, KITTI's class names
-    truncation: NDArray[np.float64]  # (N,) share outside the image
+    truncation: Array  # (N,) share outside the image
     occlusion: NDArray[np.int64]  # (N,) 0 fully visible, 1 partly and 2 largely occluded, 3 unknown, -1 none of these
-    alpha: NDArray[np.float64]  # (N,) observation angle [rad]
-    rectangle: NDArray[np.float64]  # (N, 4) left, top, right, bottom [px]
-    unlabelled: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))  # (K, 4) of DontCare regions [px]
+    alpha: Array  # (N,) observation angle [rad]
+    rectangle: Array  # (N, 4) left, top, right, bottom [px]
+    unlabelled: Array = field(default_factory=lambda: np.zeros((0, 4)))  # (K, 4) of DontCare regions [px]
 
     @classmethod
     def none(cls) -> "Objects":
@@ -153,7 +152,7 @@ def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = Fa
     )
 
 
-def _read_levels(truncation: NDArray[np.float64]) -> NDArray[np.float64]:
+def _read_levels(truncation: Array) -> Array:
     """Return the shares that stand for the levels of truncation 0, 1 and 2; other numbers as they are."""
     known = np.isin(truncation, range(len(TRUNCATION)))
     return np.where(known, TRUNCATION[np.where(known, truncation, 0).astype(int)], truncation)

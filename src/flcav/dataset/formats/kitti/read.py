@@ -39,9 +39,9 @@ from flcav.dataset.formats.reading import (
     annotate,
     assign_split,
     choose_split,
+    link_pictures,
     measure_picture,
     name_some,
-    read_pictures,
     unseen_views,
 )
 from flcav.geometry import Boxes, inverse, pose
@@ -170,7 +170,7 @@ def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> Linked
                 for name in pictures
             },
         ),
-        images=read_pictures(pictures),
+        images=link_pictures(pictures),
         agent_at_trigger={} if not pictures or np.allclose(then, np.eye(4), atol=1e-9) else {CAMERA: then},
         files=files,
     )

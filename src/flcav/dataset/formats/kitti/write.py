@@ -11,26 +11,27 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
+from flcav.dataset.formats.writing import (
     SPLITS,
     Exported,
     ExportFormat,
     ExportOptions,
     LeftOut,
     check_rectified,
-    count_points_in_boxes,
+    count_readable_points,
     count_unwritten,
+    find_front_camera,
     lacks_points,
     missing_data_error,
     read_frame,
     select_objects,
     split_scenes,
+    write_file,
 )
-from flcav.dataset.formats.kitti.files import CLASSES as KITTI_CLASSES
-from flcav.dataset.formats.mounts import find_front_camera
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
-from flcav.geometry import inverse, transform_points, wrap_angle
+from flcav.geometry import Array, inverse, transform_points, wrap_angle
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 
@@ -102,8 +103,8 @@ def _write_frame(
             lidar_from_imu=inverse(mounts[lidar]) @ mounts.get(next(iter(frame.imu), ""), np.eye(4)),
         ),
     )
-    _write(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
-    _write(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
+    write_file(folder / "velodyne" / f"{number}.bin", frame.lidar[lidar].astype("<f4").tobytes())
+    write_file(folder / "image_2" / f"{number}.png", encode_png(frame.images[camera].rgb))
     return len(objects), len(regions), left_out + count_unwritten("KITTI", frame, {lidar, camera})
 
 
@@ -129,7 +130,7 @@ def format_label_lines(
     rotation = wrap_angle(np.arctan2(-ahead[:, 2], ahead[:, 0]))
     alpha = wrap_angle(rotation - np.arctan2(bottom[:, 0], bottom[:, 2]))
     level = occlusion_levels(views.occlusion, views.pixels)
-    points, shows = count_points_in_boxes(frame, lidar, frame.lidar[lidar]), views.pixels > 0
+    points, shows = count_readable_points(frame, lidar, frame.lidar[lidar]), views.pixels > 0
     reasons = {
         "outside the image": ~within | (bottom[:, 2] <= 0),
         lacks_points(min_points): points < min_points,
@@ -148,13 +149,13 @@ def format_label_lines(
     return lines, regions, left_out
 
 
-def dont_care(rectangle: NDArray[np.float64]) -> str:
+def dont_care(rectangle: Array) -> str:
     """Return the label line of a DontCare region: (4,) left, top, right, bottom [px]."""
     left, top, right, bottom = (f"{number:.4f}" for number in rectangle)
     return f"DontCare -1 -1 -10 {left} {top} {right} {bottom} -1 -1 -1 -1000 -1000 -1000 -10"
 
 
-def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) -> NDArray[np.int64]:
+def occlusion_levels(occlusion: Array, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return (M,) KITTI's occlusion levels: 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown.
 
     `occlusion` is (M,) in [0, 1] or NaN, `pixels` (M,) the visible ones.
@@ -163,9 +164,7 @@ def occlusion_levels(occlusion: NDArray[np.float64], pixels: NDArray[np.int64]) 
     return np.where((pixels != 0) & ~np.isnan(occlusion), level, UNKNOWN)
 
 
-def format_calibration(
-    intrinsics: NDArray[np.float64], camera_from_lidar: NDArray[np.float64], lidar_from_imu: NDArray[np.float64]
-) -> list[str]:
+def format_calibration(intrinsics: Array, camera_from_lidar: Array, lidar_from_imu: Array) -> list[str]:
     """Return the lines of a calibration file, in the order that readers expect.
 
     `intrinsics` is (3, 3), the transforms are (4, 4).
@@ -181,9 +180,4 @@ def format_calibration(
 
 
 def _write_lines(path: Path, lines: list[str]) -> None:
-    _write(path, "".join(f"{line}\n" for line in lines).encode())
-
-
-def _write(path: Path, data: bytes) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_bytes(data)
+    write_file(path, "".join(f"{line}\n" for line in lines))

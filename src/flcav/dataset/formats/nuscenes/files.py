@@ -1,14 +1,16 @@
-"""nuScenes' file encodings of point clouds, radar sweeps and the map."""
+"""nuScenes' files: encodings of point clouds, radar sweeps and the map; classes, channels, tokens and constant rows."""
 
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from flcav.config import InputError, read_file
-from flcav.dataset.formats.layout import BRIGHTEST
+from flcav.config import InputError, Json, read_file
+from flcav.dataset.formats.clouds import BRIGHTEST, encode_pcd
 from flcav.dataset.formats.reading import check_cloud
+from flcav.geometry import Array
 from flcav.sensors.radar import compute_echo_directions
 from flcav.world.map.town import Town
 
@@ -26,7 +28,7 @@ MOVING_M_S = 0.5  # speed over ground from which a radar return counts as moving
 MOVING, STATIONARY, UNAMBIGUOUS, CERTAIN = 0, 1, 3, 1
 
 
-def encode_lidar(points: NDArray[np.float32], elevations: NDArray[np.float64]) -> bytes:
+def encode_lidar(points: NDArray[np.float32], elevations: Array) -> bytes:
     """Return the bytes of (N, 5) float32 x, y, z [m] in nuScenes' LiDAR frame, intensity 0 to 255, ring.
 
     `points` is (N, 4) x, y, z, intensity [0, 1] in our LiDAR frame (x ahead, y left). The ring is the index of the
@@ -40,7 +42,7 @@ def encode_lidar(points: NDArray[np.float32], elevations: NDArray[np.float64]) -
     return np.column_stack((-y, x, z, intensity * 255, ring)).astype("<f4").tobytes()
 
 
-def read_lidar(path: Path) -> NDArray[np.float32]:
+def read_nuscenes_points(path: Path) -> NDArray[np.float32]:
     """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a file of `encode_lidar`.
 
     Raises `InputError` where it is missing, truncated, or has a point that is not finite or an intensity out of range.
@@ -53,7 +55,7 @@ def read_lidar(path: Path) -> NDArray[np.float32]:
     return check_cloud(cloud, path)
 
 
-def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> bytes:
+def encode_radar(echoes: NDArray[np.float32], velocity: Array) -> bytes:
     """Return a binary PCD file of (N, 5) radar returns: range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
 
     `velocity` is the radar's own (3,) [m/s], in its frame. Only the radial velocity of a return is measured: `vx`, `vy`
@@ -77,22 +79,7 @@ def encode_radar(echoes: NDArray[np.float32], velocity: NDArray[np.float64]) -> 
         rows["dyn_prop"] = np.where(np.abs(over_ground) > MOVING_M_S, MOVING, STATIONARY)
         rows["is_quality_valid"] = 1
     rows["ambig_state"], rows["pdh0"] = UNAMBIGUOUS, CERTAIN
-    kinds = {"f": "F", "i": "I"}
-    fields = [RADAR[name] for name in RADAR.names or ()]
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format",
-        "VERSION 0.7",
-        "FIELDS " + " ".join(RADAR.names or ()),
-        "SIZE " + " ".join(str(field.itemsize) for field in fields),
-        "TYPE " + " ".join(kinds[field.kind] for field in fields),
-        "COUNT " + " ".join("1" for _ in fields),
-        f"WIDTH {len(rows)}",
-        "HEIGHT 1",
-        "VIEWPOINT 0 0 0 1 0 0 0",
-        f"POINTS {len(rows)}",
-        "DATA binary\n",
-    )
-    return "\n".join(header).encode() + rows.tobytes() + b"\n"  # the devkit wants a byte after the last point
+    return encode_pcd(rows) + b"\n"  # the devkit wants a byte after the last point
 
 
 def decode_radar(rows: NDArray[np.void]) -> NDArray[np.float32]:
@@ -121,3 +108,112 @@ def map_mask(town: Town) -> NDArray[np.uint8]:
         pixels = np.column_stack((polygon[:, 0] - x_min, y_max - polygon[:, 1])) / RESOLUTION_M
         draw.polygon([tuple(pixel) for pixel in pixels.tolist()], fill=255)
     return np.asarray(image)
+
+
+Row = dict[str, Json]
+
+VERSION = "v1.0-flcav"
+
+TABLES = (
+    "attribute",
+    "calibrated_sensor",
+    "category",
+    "ego_pose",
+    "instance",
+    "log",
+    "map",
+    "sample",
+    "sample_annotation",
+    "sample_data",
+    "scene",
+    "sensor",
+    "visibility",
+)
+CATEGORIES = {
+    "car": "vehicle.car",
+    "van": "vehicle.car",
+    "truck": "vehicle.truck",
+    "bus": "vehicle.bus.rigid",
+    "motorcycle": "vehicle.motorcycle",
+    "bicycle": "vehicle.bicycle",
+    "pedestrian": "human.pedestrian.adult",
+}
+ATTRIBUTES = (
+    "vehicle.moving",
+    "vehicle.stopped",
+    "vehicle.parked",
+    "cycle.with_rider",
+    "pedestrian.moving",
+    "pedestrian.standing",
+)
+VISIBILITY = (0.4, 0.6, 0.8)  # visible share from which the levels 2, 3 and 4 apply
+MOVES_M_S = 0.2  # speed above which an actor counts as moving
+CAMERAS = {  # channel -> yaw, counter-clockwise from ahead [rad]
+    "CAM_FRONT": 0.0,
+    "CAM_FRONT_LEFT": np.radians(55),
+    "CAM_FRONT_RIGHT": np.radians(-55),
+    "CAM_BACK_LEFT": np.radians(110),
+    "CAM_BACK_RIGHT": np.radians(-110),
+    "CAM_BACK": np.pi,
+}
+RADARS = {
+    "RADAR_FRONT": 0.0,
+    "RADAR_FRONT_LEFT": np.radians(90),
+    "RADAR_FRONT_RIGHT": np.radians(-90),
+    "RADAR_BACK_LEFT": np.radians(170),
+    "RADAR_BACK_RIGHT": np.radians(-170),
+}
+
+
+def token(*names: str | int) -> str:
+    """Return the token of a row, 32 hexadecimal digits of the SHA-256 of its `names`."""
+    return sha256("/".join(map(str, names)).encode()).hexdigest()[:32]
+
+
+def constant_rows() -> dict[str, list[Row]]:
+    """Return table -> rows of all TABLES: `category`, `attribute` and `visibility` filled, the others empty."""
+    shares = ("0 to 40 %", "40 to 60 %", "60 to 80 %", "80 to 100 %")
+    tables: dict[str, list[Row]] = {name: [] for name in TABLES}
+    tables["category"] = [
+        {"token": token("category", name), "name": name, "description": "", "index": i}
+        for i, name in enumerate(dict.fromkeys(CATEGORIES.values()))
+    ]
+    tables["attribute"] = [{"token": token("attribute", name), "name": name, "description": ""} for name in ATTRIBUTES]
+    tables["visibility"] = [
+        {"token": str(i + 1), "level": f"v{share.replace(' to ', '-').removesuffix(' %')}", "description": share}
+        for i, share in enumerate(shares)
+    ]
+    return tables
+
+
+def visibility(occlusion: float) -> str:
+    """Return the token of the visibility level of an object, from its `occlusion` in [0, 1]; "" for NaN, unknown."""
+    if np.isnan(occlusion):
+        return ""
+    return str(int(np.digitize(1 - occlusion, VISIBILITY)) + 1)
+
+
+def attributes(category: str, track: str, speed_m_s: float) -> list[str]:
+    """Return the token of an actor's attribute, e.g. "vehicle.moving"; none where it needs a speed that is NaN.
+
+    It follows from the actor's class, its track id, which says whether it is parked, and its speed.
+    """
+    if np.isnan(speed_m_s) and category not in ("bicycle", "motorcycle"):
+        return []
+    moves = speed_m_s > MOVES_M_S
+    if category == "pedestrian":
+        name = "pedestrian.moving" if moves else "pedestrian.standing"
+    elif category in ("bicycle", "motorcycle"):
+        name = "cycle.with_rider"
+    elif track.startswith("parked"):
+        name = "vehicle.parked"
+    else:
+        name = "vehicle.moving" if moves else "vehicle.stopped"
+    return [token("attribute", name)]
+
+
+def link_rows(rows: list[Row]) -> None:
+    """Set `prev` and `next` of each of the consecutive `rows` to the tokens of its neighbours, "" at the ends."""
+    for row, before, after in zip(rows, [None, *rows], [*rows[1:], None]):
+        row["prev"] = before["token"] if before else ""
+        row["next"] = after["token"] if after else ""

@@ -12,14 +12,12 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from flcav.config import InputError, path_within, read_json, shorten
-from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, decode_radar, read_lidar
-from flcav.dataset.formats.nuscenes.rows import COLUMNS, References, Row, read_table, stream_table
-from flcav.dataset.formats.nuscenes.tables import VERSION
-from flcav.dataset.formats.pcd import read_pcd
+from flcav.dataset.formats.clouds import read_pcd
+from flcav.dataset.formats.nuscenes.files import OURS_FROM_LIDAR, VERSION, decode_radar, read_nuscenes_points
+from flcav.dataset.formats.nuscenes.tables import COLUMNS, References, Row, read_rows_by_token, stream_table
 from flcav.dataset.formats.reading import (
     AgentNames,
     ImportFormat,
@@ -30,38 +28,27 @@ from flcav.dataset.formats.reading import (
     check_sizes,
     choose_split,
     difference_tracks,
+    group_classes,
+    link_pictures,
     pinhole,
-    read_pictures,
     view_boxes,
 )
-from flcav.geometry import inverse, turned_boxes
+from flcav.geometry import Array, inverse, turned_boxes
 from flcav.sensors.frame import Calibration, LinkedFrame
 
-Array = NDArray[np.float64]
 SMALL = [name for name in COLUMNS if name not in ("sample_data", "ego_pose", "sample_annotation")]  # kept as they are
 
-CATEGORIES = {  # other classes keep their names, and so do cycles without a rider
-    "vehicle.car": "car",
-    "vehicle.emergency.police": "car",
-    "vehicle.truck": "truck",
-    "vehicle.trailer": "truck",
-    "vehicle.construction": "truck",
-    "vehicle.emergency.ambulance": "truck",
-    "vehicle.bus.rigid": "bus",
-    "vehicle.bus.bendy": "bus",
-    "human.pedestrian.adult": "pedestrian",
-    "human.pedestrian.child": "pedestrian",
-    "human.pedestrian.construction_worker": "pedestrian",
-    "human.pedestrian.police_officer": "pedestrian",
-}
+# Other classes keep their names, and so do cycles without a rider.
+CATEGORIES = group_classes(
+    car="vehicle.car vehicle.emergency.police",
+    truck="vehicle.truck vehicle.trailer vehicle.construction vehicle.emergency.ambulance",
+    bus="vehicle.bus.rigid vehicle.bus.bendy",
+    pedestrian="human.pedestrian.adult human.pedestrian.child human.pedestrian.construction_worker "
+    "human.pedestrian.police_officer",
+)
 RIDDEN = {"vehicle.bicycle": "bicycle", "vehicle.motorcycle": "motorcycle"}
 RIDER = "cycle.with_rider"
-OCCLUSION = {
-    "1": 0.8,
-    "2": 0.5,
-    "3": 0.3,
-    "4": 0.1,
-}  # middle of what the level says: 0-40 %, 40-60, 60-80, 80-100 visible
+OCCLUSION = {"1": 0.8, "2": 0.5, "3": 0.3, "4": 0.1}  # middle of the level: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP, MOUNTED = "LIDAR_TOP", "calibrated_sensor.json"
 BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
 VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
@@ -86,7 +73,7 @@ class NuscenesSource(LogSource):
         self.folder, self.split = folder, split
         self._tables = _find_tables(folder)
         self._root = self._tables.parent
-        table = {name: read_table(self._tables, name) for name in SMALL}
+        table = {name: read_rows_by_token(self._tables, name) for name in SMALL}
         self._references = References()
         for _ in self._references.check_links(table["sample"].values(), "sample", self._tables / "sample.json"):
             pass
@@ -113,7 +100,7 @@ class NuscenesSource(LogSource):
                     f"sample, beside {shorten(one['filename'])}"
                 )
         used = {row["ego_pose_token"] for rows in self._data.values() for row in rows.values()}
-        self._pose = read_table(self._tables, "ego_pose", lambda row: row["token"] in used)
+        self._pose = read_rows_by_token(self._tables, "ego_pose", lambda row: row["token"] in used)
         self._calibration: dict[str, Calibration] = {}  # by agent
         self._spins, split_of = self._order(table["scene"], table["log"], table["sample"])
         if first_lost is not None and not self._spins:
@@ -279,7 +266,7 @@ class NuscenesSource(LogSource):
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
-        clouds = {name: read_lidar(path[name]) for name in ranging}
+        clouds = {name: read_nuscenes_points(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
         own = self._notes[spin.sample]
         boxes = self._boxes[own]
@@ -309,7 +296,7 @@ class NuscenesSource(LogSource):
                 velocity=self._velocity[own],
                 occlusion=self._occlusion[own],
             ),
-            images=read_pictures(files),
+            images=link_pictures(files),
             radar=radar,
             agent_at_trigger={name: then for name, then in poses.items() if not np.array_equal(then, poses[TOP])},
             files=files,

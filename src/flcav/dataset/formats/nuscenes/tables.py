@@ -1,115 +1,221 @@
-"""nuScenes' tables: constant rows, classes, attributes and channels, tokens, and links between rows."""
+"""nuScenes' tables as streams of rows: a table of gigabytes is never in memory as a whole."""
 
-from hashlib import sha256
+import math
+import sys
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from json import JSONDecodeError, JSONDecoder
+from pathlib import Path
+from typing import Any, TextIO
 
 import numpy as np
 
-from flcav.config import Json
+from flcav.config import InputError, check_is_file, read_json, shorten
+from flcav.dataset.formats.reading import FARTHEST, ROUNDED
+from flcav.interface.wording import plural
 
-Row = dict[str, Json]
+Row = Mapping[str, Any]  # column -> value
 
-VERSION = "v1.0-flcav"
-
-TABLES = (
-    "attribute",
-    "calibrated_sensor",
-    "category",
-    "ego_pose",
-    "instance",
-    "log",
-    "map",
-    "sample",
-    "sample_annotation",
-    "sample_data",
-    "scene",
-    "sensor",
-    "visibility",
-)
-CATEGORIES = {
-    "car": "vehicle.car",
-    "van": "vehicle.car",
-    "truck": "vehicle.truck",
-    "bus": "vehicle.bus.rigid",
-    "motorcycle": "vehicle.motorcycle",
-    "bicycle": "vehicle.bicycle",
-    "pedestrian": "human.pedestrian.adult",
+CHUNK = 1 << 20  # characters read at a time
+COLUMNS = {  # what is read of each table
+    "scene": ("name", "log_token", "first_sample_token"),
+    "log": ("logfile", "vehicle"),
+    "sample": ("timestamp", "scene_token"),
+    "sample_data": (
+        "sample_token",
+        "ego_pose_token",
+        "calibrated_sensor_token",
+        "is_key_frame",
+        "filename",
+        "timestamp",
+    ),
+    "ego_pose": ("translation", "rotation"),
+    "calibrated_sensor": ("sensor_token", "translation", "rotation", "camera_intrinsic"),
+    "sensor": ("channel", "modality"),
+    "category": ("name",),
+    "attribute": ("name",),
+    "instance": ("category_token",),
+    "sample_annotation": ("sample_token", "instance_token", "translation", "size", "rotation"),
 }
-ATTRIBUTES = (
-    "vehicle.moving",
-    "vehicle.stopped",
-    "vehicle.parked",
-    "cycle.with_rider",
-    "pedestrian.moving",
-    "pedestrian.standing",
-)
-VISIBILITY = (0.4, 0.6, 0.8)  # visible share from which the levels 2, 3 and 4 apply
-MOVING_M_S = 0.2  # speed above which an actor counts as moving
-CAMERAS = {  # channel -> yaw, counter-clockwise from ahead [rad]
-    "CAM_FRONT": 0.0,
-    "CAM_FRONT_LEFT": np.radians(55),
-    "CAM_FRONT_RIGHT": np.radians(-55),
-    "CAM_BACK_LEFT": np.radians(110),
-    "CAM_BACK_RIGHT": np.radians(-110),
-    "CAM_BACK": np.pi,
+LINKS = ("prev", "next")  # columns with the token of another row of the table, "" for none
+OPTIONAL = {
+    "sample": LINKS,
+    "sample_data": ("width", "height", *LINKS),
+    "sample_annotation": ("attribute_tokens", "visibility_token", *LINKS),
 }
-RADARS = {
-    "RADAR_FRONT": 0.0,
-    "RADAR_FRONT_LEFT": np.radians(90),
-    "RADAR_FRONT_RIGHT": np.radians(-90),
-    "RADAR_BACK_LEFT": np.radians(170),
-    "RADAR_BACK_RIGHT": np.radians(-170),
-}
+NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
+MODALITIES = ("lidar", "camera", "radar")
+BLANKS = " \t\n\r"
 
 
-def token(*names: str | int) -> str:
-    """Return the token of a row, 32 hexadecimal digits of the SHA-256 of its `names`."""
-    return sha256("/".join(map(str, names)).encode()).hexdigest()[:32]
+class References:
+    """References of rows to rows that are not there: counted by table and column, with the first of each.
 
-
-def constant_rows() -> dict[str, list[Row]]:
-    """Return table -> rows of all TABLES: `category`, `attribute` and `visibility` filled, the others empty."""
-    shares = ("0 to 40 %", "40 to 60 %", "60 to 80 %", "80 to 100 %")
-    tables: dict[str, list[Row]] = {name: [] for name in TABLES}
-    tables["category"] = [
-        {"token": token("category", name), "name": name, "description": "", "index": i}
-        for i, name in enumerate(dict.fromkeys(CATEGORIES.values()))
-    ]
-    tables["attribute"] = [{"token": token("attribute", name), "name": name, "description": ""} for name in ATTRIBUTES]
-    tables["visibility"] = [
-        {"token": str(i + 1), "level": f"v{share.replace(' to ', '-').removesuffix(' %')}", "description": share}
-        for i, share in enumerate(shares)
-    ]
-    return tables
-
-
-def visibility(occlusion: float) -> str:
-    """Return the token of the visibility level of an object, from its `occlusion` in [0, 1]; "" for NaN, unknown."""
-    if np.isnan(occlusion):
-        return ""
-    return str(int(np.digitize(1 - occlusion, VISIBILITY)) + 1)
-
-
-def attributes(category: str, track: str, speed_m_s: float) -> list[str]:
-    """Return the token of an actor's attribute, e.g. "vehicle.moving"; none where it needs a speed that is NaN.
-
-    It follows from the actor's class, its track id, which says whether it is parked, and its speed.
+    Of LINKS only hashes are kept, eight bytes each, since tables have millions of rows.
     """
-    if np.isnan(speed_m_s) and category not in ("bicycle", "motorcycle"):
-        return []
-    moves = speed_m_s > MOVING_M_S
-    if category == "pedestrian":
-        name = "pedestrian.moving" if moves else "pedestrian.standing"
-    elif category in ("bicycle", "motorcycle"):
-        name = "cycle.with_rider"
-    elif track.startswith("parked"):
-        name = "vehicle.parked"
-    else:
-        name = "vehicle.moving" if moves else "vehicle.stopped"
-    return [token("attribute", name)]
+
+    def __init__(self) -> None:
+        self._lost: dict[tuple[str, str], list[str]] = {}  # table and column -> first token, and one for each other
+
+    def check_links(self, rows: Iterable[Row], name: str, path: Path) -> Iterator[Row]:
+        """Yield the rows of a table without their LINKS; then count those that lead to no row, or back in time.
+
+        Raises `InputError` where two rows have one token.
+        """
+        token, time = array("q"), array("q")
+        links = {link: array("q") for link in LINKS}
+        for row in rows:
+            token.append(hash(row["token"]))
+            time.append(row.get("timestamp", 0))
+            for link, own in links.items():
+                own.append(hash(row[link]) if row.get(link) else 0)
+            yield {column: value for column, value in row.items() if column not in LINKS}
+        known, times = np.array(token), np.array(time)
+        order = np.argsort(known, kind="stable")
+        if len(twins := np.flatnonzero(np.diff(known[order]) == 0)):
+            one, other = order[twins[0] : twins[0] + 2].tolist()
+            raise InputError(f"{path}: the rows {one} and {other} have one token; each row has its own")
+        for link, own in links.items():
+            linked = np.flatnonzero(np.array(own))
+            wanted = np.array(own)[linked]
+            at = order[np.minimum(np.searchsorted(known[order], wanted), len(known) - 1)]
+            there = known[at] == wanted
+            self._lost.setdefault((name, link), []).extend(f"of row {row}" for row in linked[~there].tolist())
+            back = (times[at] - times[linked]) * (1 if link == "next" else -1) < 0
+            self._lost.setdefault((name, f"{link} timestamp"), []).extend(
+                f"of row {row}" for row in linked[there & back].tolist()
+            )
+
+    def miss(self, name: str, column: str, token: str) -> None:
+        """Count a reference of a table's row to no row."""
+        self._lost.setdefault((name, column), []).append(shorten(token))
+
+    def notes(self) -> Iterator[str]:
+        """Yield a sentence for each table and column with such references."""
+        for (name, column), lost in self._lost.items():
+            link, _, timed = column.partition(" ")
+            what = "leads back in time" if timed else "is the token of no row"
+            if lost:
+                yield f"{name}.json: '{link}' of {plural(len(lost), 'row')} {what}, first {lost[0]}"
 
 
-def link_rows(rows: list[Row]) -> None:
-    """Set `prev` and `next` of each of the consecutive `rows` to the tokens of its neighbours, "" at the ends."""
-    for row, before, after in zip(rows, [None, *rows], [*rows[1:], None]):
-        row["prev"] = before["token"] if before else ""
-        row["next"] = after["token"] if after else ""
+def keep_all(_row: Row) -> bool:
+    """Return True."""
+    return True
+
+
+def read_rows_by_token(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> dict[str, Row]:
+    """Return token -> row of a table, the rows that are `kept`.
+
+    Raises `InputError` as `stream_table`, and where two rows have one token.
+    """
+    rows: dict[str, Row] = {}
+    for row in stream_table(folder, name, kept):
+        if rows.setdefault(row["token"], row) is not row:
+            raise InputError(f"{folder / name}.json: two rows have the token {shorten(row['token'])}")
+    return rows
+
+
+def stream_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> Iterator[Row]:
+    """Yield the rows of the table `name` in `folder` that are `kept`, with token, COLUMNS and the OPTIONAL they have.
+
+    Raises `InputError` where the file is missing or no table, or a row lacks one of COLUMNS.
+    """
+    path, wanted, also = folder / f"{name}.json", sorted({"token", *COLUMNS[name]}), OPTIONAL.get(name, ())
+    for number, row in enumerate(_stream_list(path)):
+        if not isinstance(row, dict) or not row.keys() >= set(wanted):
+            lost = next(column for column in wanted if column not in row) if isinstance(row, dict) else "token"
+            raise InputError(f"{path}: row {number} has no '{lost}'")
+        own = {column: row[column] for column in (*wanted, *also) if column in row}
+        if odd := [column for column, value in own.items() if not _fits(column, value)]:
+            raise InputError(f"{path}: row {number} has a '{odd[0]}' that is none: {shorten(own[odd[0]])}")
+        if kept(own):
+            yield {column: _share(value) if column.endswith("token") else value for column, value in own.items()}
+
+
+def _share(token: object) -> object:
+    """Return the one string that is equal to a token: it is in many rows, and once in memory."""
+    return sys.intern(token) if isinstance(token, str) else token
+
+
+def _stream_list(path: Path) -> Iterator[object]:
+    """Yield the elements of the JSON list in a file, one at a time; raises `InputError` where there is none."""
+    check_is_file(path, None)  # it is read in pieces
+    try:
+        with path.open(encoding="utf-8-sig") as file:
+            yield from _decode_list(file, path)
+    except JSONDecodeError as error:
+        raise InputError(f"{path}: not JSON ({error.msg})") from None
+    except InputError:
+        raise
+    except (IsADirectoryError, ValueError, RecursionError) as error:
+        raise InputError(f"{path}: not JSON ({error})") from None
+
+
+def _decode_list(file: TextIO, path: Path) -> Iterator[object]:
+    """Yield the elements of a JSON list; an element is taken once what follows it has been read, too."""
+    decoder, text, more = JSONDecoder(), "", CHUNK
+    while (read := file.read(CHUNK)) and not (text := read.lstrip(BLANKS)):
+        pass
+    if not text.startswith("["):
+        read_json(path)
+        raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
+    begin, at = True, 1
+    while True:
+        try:
+            end = _skip(text, at)
+            if not begin or text[end : end + 1] != "]":  # an empty list
+                element, end = decoder.raw_decode(text, end)
+                end = _skip(text, end)
+                if text[end : end + 1] not in (",", "]"):
+                    raise JSONDecodeError("Expecting ',' delimiter", text, end)
+                yield element
+        except JSONDecodeError:  # the element may go on in what is not read yet
+            if not (read := file.read(more)):
+                raise
+            text, at, more = text[at:] + read, 0, 2 * more
+            continue
+        if text[end] == "]":
+            break
+        begin, at, more = False, end + 1, CHUNK
+    rest = text[end + 1 :]
+    while not rest.strip(BLANKS) and (rest := file.read(CHUNK)):
+        pass
+    if rest:
+        raise JSONDecodeError("Extra data", rest, 0)
+
+
+def _skip(text: str, at: int) -> int:
+    """Return the place of the next character that is no white space."""
+    while at < len(text) and text[at] in BLANKS:
+        at += 1
+    return at
+
+
+def _fits(column: str, value: object) -> bool:
+    """Return whether a value can be one of a column of COLUMNS or OPTIONAL."""
+    if column in NUMBERS:
+        return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or _has_length_1(value))
+    if column == "camera_intrinsic":
+        return value == [] or (isinstance(value, list) and len(value) == 3 and all(_are_numbers(r, 3) for r in value))
+    if column == "modality":
+        return value in MODALITIES
+    if column == "timestamp":
+        return isinstance(value, int)
+    if column in ("width", "height"):
+        return value is None or isinstance(value, int)
+    if column == "attribute_tokens":
+        return isinstance(value, list) and all(isinstance(token, str) for token in value)
+    return isinstance(value, bool if column == "is_key_frame" else str)
+
+
+def _has_length_1(quaternion: Any) -> bool:
+    return abs(math.hypot(*quaternion) - 1) <= ROUNDED
+
+
+def _are_numbers(values: object, count: int) -> bool:
+    return (
+        isinstance(values, list)
+        and len(values) == count
+        and all(isinstance(value, int | float) and abs(value) < FARTHEST for value in values)
+    )

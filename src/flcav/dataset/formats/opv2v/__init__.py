@@ -1,1 +1,1 @@
-"""OPV2V: written (`write`) and read (`read`). Xu et al., "OPV2V", ICRA 2022."""
+"""OPV2V: its `files`, a source of frames (`read`), the export (`write`). Xu et al., "OPV2V", ICRA 2022."""

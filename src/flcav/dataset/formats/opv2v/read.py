@@ -15,12 +15,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError, read_file, read_yaml
-from flcav.dataset.formats.kitti.files import read_points
-from flcav.dataset.formats.layout import BRIGHTEST, has_kitti_layout
-from flcav.dataset.formats.opv2v.about import CAMERAS, EGO, RADIANS, About, read_about
-from flcav.dataset.formats.opv2v.write import FOLDERS, KMH, from_carla
-from flcav.dataset.formats.pcd import read_pcd
+from flcav.config import InputError, read_yaml
+from flcav.dataset.formats.opv2v.files import (
+    CAMERAS,
+    EGO,
+    FOLDERS,
+    KMH,
+    RADIANS,
+    About,
+    from_carla,
+    read_about,
+    read_cloud,
+    read_raw_cloud,
+)
 from flcav.dataset.formats.reading import (
     AgentNames,
     ImportFormat,
@@ -28,29 +35,25 @@ from flcav.dataset.formats.reading import (
     LogSource,
     PosePairs,
     annotate,
-    check_cloud,
     check_sizes,
     choose_split,
+    link_pictures,
     measure_picture,
     name_folders,
     name_place,
     name_some,
     pinhole,
-    read_pictures,
     view_boxes,
 )
-from flcav.geometry import Boxes, heading_vectors, inverse, turned_boxes
+from flcav.geometry import Array, Boxes, heading_vectors, inverse, turned_boxes
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-
-Array = NDArray[np.float64]
 
 PERIOD_S = 0.1
 LIDAR, CATEGORY = "lidar", "car"
 CATEGORIES = {"policecar": "car", "longvehicle": "car", "motorcyle": "motorcycle"}  # V2X-Real's with another name here
 CLOUDS, PICTURES = (".pcd", ".bin"), (".png", ".jpeg", ".jpg")
-POINT = 4  # numbers of a raw point: x, y, z [m], intensity
 DIGITS = 9  # of mounts, which are computed of poses
 PROTOCOL = "data_protocol.yaml"
 
@@ -185,7 +188,7 @@ class Opv2vSource(LogSource):
                 view_boxes(boxes, pictures),
                 velocity=velocity,
             ),
-            images=read_pictures(files),
+            images=link_pictures(files),
             agent_at_trigger={name: world @ inverse(mounts[name]) for name, world in placed.items()},
             files=files,
         )
@@ -200,34 +203,6 @@ def _read_points(stem: Path) -> NDArray[np.float32]:
     if path is None:
         raise InputError(f"{stem.with_suffix(CLOUDS[0])}: no such file")
     return read_cloud(path) if path.suffix == CLOUDS[0] else read_raw_cloud(path)
-
-
-def read_raw_cloud(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a raw cloud with y to the right.
-
-    Points that are not finite are left out; intensities may reach 255. Raises `InputError` for other files.
-    """
-    data = read_file(path)
-    if not data or len(data) % (4 * POINT):
-        return read_points(path)  # which says what it is
-    rows = np.frombuffer(data, "<f4").reshape(-1, POINT)
-    rows = rows[np.isfinite(rows).all(axis=1)] * np.array([1, -1, 1, 1], np.float32)
-    if len(rows) and 1 < rows[:, 3].max() <= BRIGHTEST:
-        rows[:, 3] /= np.float32(BRIGHTEST)
-    return rows if has_kitti_layout(rows.tobytes()) else read_points(path)
-
-
-def read_cloud(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a PCD file, whose red channel the intensity is."""
-    rows = read_pcd(path)
-    try:
-        x, y, z, colour = (rows[name] for name in ("x", "y", "z", "rgb"))
-    except ValueError:
-        raise InputError(f"{path}: not a point cloud of OPV2V, which has the fields x, y, z, rgb") from None
-    red = (np.ascontiguousarray(colour).view("<u4") >> 16) & 255
-    with np.errstate(invalid="ignore"):  # signalling NaNs, which are refused
-        points = np.stack((x, -y, z, red / np.float32(255)), axis=1).astype(np.float32)
-    return check_cloud(points, path)
 
 
 def _calibrate(stem: Path) -> Calibration:

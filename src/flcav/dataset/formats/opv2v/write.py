@@ -10,33 +10,32 @@ from typing import Any, TypedDict
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike, NDArray
 
-from flcav.dataset.formats.exporter import (
+from flcav.dataset.formats.opv2v.files import FOLDERS, KMH, MIRRORED, carla_pose, encode_cloud
+from flcav.dataset.formats.writing import (
     Exported,
     ExportFormat,
     ExportOptions,
     LeftOut,
+    agent_velocities,
+    assign_channels,
     check_rectified,
-    count_points_in_boxes,
+    count_readable_points,
     count_unwritten,
     lacks_points,
     missing_data_error,
+    optical_yaw,
     read_frame,
     select_objects,
     split_with_validation,
+    write_file,
 )
-from flcav.dataset.formats.mounts import agent_velocities, assign_channels, optical_yaw
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import BODY_FROM_OPTICAL
-from flcav.sources.carla.frames import MIRROR, MapFrame
 
-Array = NDArray[np.float64]
-
-FOLDERS = {"train": "train", "val": "validate", "test": "test"}
 VEHICLES = ("car", "van", "truck", "bus")
 CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera0": 0.0,
@@ -45,8 +44,6 @@ CAMERAS = {  # yaw, counter-clockwise from ahead [rad]
     "camera3": np.pi,
 }
 FIRST_CAR, FIRST_POLE, FIRST_TRACK = 1001, 2001, 10001  # OpenCOOD takes the agent whose number sorts first as the ego
-KMH = 3.6
-MIRRORED = np.diag((*MIRROR, 1.0))
 FAST_DUMPER = getattr(yaml, "CSafeDumper", yaml.SafeDumper)  # a PyYAML built without libyaml has only the slow one
 
 
@@ -94,7 +91,7 @@ def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: 
             exported.left_out.update(count_unwritten("OPV2V", frame, written))
             counts.update(frames=1, objects=len(vehicles))
         protocol = {"recipe": dataset.manifest.recipe, "numbers": numbers}
-        (folder / "data_protocol.yaml").write_text(yaml.safe_dump(protocol, sort_keys=False), encoding="utf-8")
+        write_file(folder / "data_protocol.yaml", yaml.safe_dump(protocol, sort_keys=False))
         counts["scenarios"] += 1
     return exported
 
@@ -126,40 +123,18 @@ def agent_numbers(agents: list[str]) -> dict[str, int]:
     }
 
 
-def carla_pose(world_from_body: Array) -> list[float]:
-    """Return OPV2V's [x, y, z [m], roll, yaw, pitch [degrees]], in CARLA's frame, of a (4, 4) `world_from_body`.
-
-    The body's axes are x ahead, y left, z up.
-    """
-    location, (pitch, yaw, roll) = MapFrame().to_transform(world_from_body)
-    return [*location, roll, yaw, pitch]
-
-
-def from_carla(values: ArrayLike) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
-
-    `values` may also be the (4, 4) matrix of that pose in CARLA's frame, OpenCOOD's `x_to_world`.
-    """
-    numbers = np.asarray(values, np.float64)
-    if numbers.shape == (4, 4):
-        return MIRRORED @ numbers @ MIRRORED
-    x, y, z, roll, yaw, pitch = numbers.tolist()
-    return MapFrame().from_transform((x, y, z), (pitch, yaw, roll))
-
-
 def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], speed_m_s: float) -> set[str]:
     """Write the files of a frame; return the sensors whose measurements they hold."""
     lidar, points = next(iter(frame.lidar.items()))
-    folder.mkdir(parents=True, exist_ok=True)
     time = f"{frame.index:06d}"
-    (folder / f"{time}.pcd").write_bytes(encode_pcd(points))
+    write_file(folder / f"{time}.pcd", encode_cloud(points))
     world_from_lidar = frame.world_from_sensor(lidar)
     mounts = frame.calibration.agent_from_sensor
     cameras = assign_channels({name: optical_yaw(mounts[name]) for name in frame.images}, CAMERAS)
     about: dict[str, Any] = {}
     for name, camera in sorted(cameras.items(), key=lambda pair: pair[1]):
         check_rectified(frame, name, "OPV2V")
-        (folder / f"{time}_{camera}.png").write_bytes(encode_png(frame.images[name].rgb))
+        write_file(folder / f"{time}_{camera}.png", encode_png(frame.images[name].rgb))
         world_from_camera = frame.world_from_sensor(name) @ BODY_FROM_OPTICAL.T
         about[camera] = {
             "cords": carla_pose(world_from_camera),
@@ -175,7 +150,7 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], 
         "true_ego_pos": list(ego),
         "vehicles": vehicles,
     }
-    (folder / f"{time}.yaml").write_text(yaml.dump(about, Dumper=FAST_DUMPER), encoding="utf-8")
+    write_file(folder / f"{time}.yaml", yaml.dump(about, Dumper=FAST_DUMPER))
     return {lidar, *cameras}
 
 
@@ -187,7 +162,7 @@ def _vehicles(
     Other actors are counted by reason.
     """
     truth, boxes = frame.annotations, frame.annotations.boxes
-    few = count_points_in_boxes(frame, *next(iter(frame.lidar.items()))) < min_points
+    few = count_readable_points(frame, *next(iter(frame.lidar.items()))) < min_points
     labelled, left_out = select_objects("OPV2V", boxes.label, VEHICLES, {lacks_points(min_points): few})
     vehicles: dict[int, Opv2vVehicle] = {}
     for i in np.flatnonzero(labelled):
@@ -203,19 +178,3 @@ def _vehicles(
             "speed": float(np.linalg.norm(truth.velocity[i]) * KMH),
         }
     return vehicles, left_out
-
-
-def encode_pcd(points: NDArray[np.float32]) -> bytes:
-    """Return a binary PCD v0.7 file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
-
-    The intensity is the red channel of the colour, as in OPV2V.
-    """
-    red = np.clip(np.rint(points[:, 3] * 255), 0, 255).astype("<u4") << 16
-    rows = np.column_stack((points[:, :3] * np.array([1, -1, 1], np.float32), red.view("<f4"))).astype(
-        "<f4", copy=False
-    )
-    header = (
-        "# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\nFIELDS x y z rgb\nSIZE 4 4 4 4\nTYPE F F F F\n"
-        f"COUNT 1 1 1 1\nWIDTH {len(rows)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(rows)}\nDATA binary\n"
-    )
-    return header.encode() + rows.tobytes()

@@ -1,0 +1,1 @@
+"""CARLA: a source of frames from its simulator, and a server of its protocol on a live world of flcav."""

@@ -1,0 +1,199 @@
+"""Traffic of a scene in CARLA: vehicles of its Traffic Manager and its walkers, drawn by the recipe's seed."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, cast
+
+import numpy as np
+
+from flcav.carla.frames import MapFrame, mirror
+from flcav.carla.recording.session import Session
+from flcav.config import InputError
+from flcav.geometry import Array, Boxes, turned_boxes
+from flcav.sources.recipe import CarlaRecipe
+
+if TYPE_CHECKING:
+    import carla
+
+CATEGORIES = ("car", "van", "truck", "bus", "motorcycle", "bicycle")  # as in CARLA's attribute base_type
+ALONE = "vehicle.tesla.model3"  # blueprint of the vehicles that record
+NARROWEST_M = 0.6  # width of two-wheelers, whose boxes in CARLA may have none
+THINNEST_M = 0.05  # side of any box
+
+
+@dataclass(frozen=True)
+class TrackedBody:
+    """An actor of CARLA's, or a parked vehicle of its map, with its box."""
+
+    number: int  # CARLA's; 0 of a parked vehicle, which is no actor
+    track: str
+    category: str
+    size: tuple[float, float, float]  # length, width, height [m]
+    middle: Array  # (4, 4) of the box: in the actor's frame, of a parked vehicle in the world's
+
+    def actor_from_foot(self) -> Array:
+        """Return the (4, 4) pose of the ground centre of the box in the actor's frame."""
+        foot = self.middle.copy()
+        foot[:3, 3] -= foot[:3, 2] * self.size[2] / 2
+        return foot
+
+
+@dataclass(frozen=True)
+class State:
+    """The N bodies that are in town at a tick."""
+
+    bodies: tuple[TrackedBody, ...]
+    boxes: Boxes  # (N,) world frame
+    velocity: Array  # (N, 3) world [m/s]
+    acceleration: Array  # (N, 3) world [m/s^2]
+
+
+def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generator) -> dict[str, "carla.Vehicle"]:
+    """Return agent or track -> vehicle, of those that record and of the others, driven by the Traffic Manager.
+
+    Raises `InputError` where the map has not enough spawn points for the vehicles that record.
+    """
+    library, points = session.world.get_blueprint_library(), session.world.get_map().get_spawn_points()
+    every = sorted((each for each in library.filter("vehicle.*") if _category(each)), key=lambda each: each.id)
+    own = next((each for each in every if each.id == ALONE), None)
+    if own is None:
+        raise InputError(f"CARLA at {session.address} has no blueprint {ALONE}, which records")
+    places = [points[i] for i in rng.permutation(len(points))]
+    names = [f"cav{i}" for i in range(recipe.cavs)] + [f"veh{i}" for i in range(recipe.vehicles)]
+    found: dict[str, carla.Vehicle] = {}
+    for name in names:
+        blueprint = own if name.startswith("cav") else every[int(rng.integers(len(every)))]
+        if blueprint.has_attribute("color"):
+            colours = blueprint.get_attribute("color").recommended_values
+            blueprint.set_attribute("color", colours[int(rng.integers(len(colours)))])
+        blueprint.set_attribute("role_name", name)
+        vehicle = None
+        while places and vehicle is None:
+            vehicle = cast("carla.Vehicle | None", session.world.try_spawn_actor(blueprint, places.pop()))
+        if vehicle is not None:
+            found[name] = vehicle
+        elif name.startswith("cav"):
+            raise InputError(f"CARLA at {session.address} has no free spawn point for {name}: lower 'cavs'")
+    for vehicle in found.values():
+        vehicle.set_autopilot(True, session.manager.get_port())
+    return found
+
+
+def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generator) -> dict[str, "carla.Actor"]:
+    """Return track -> walker, each on its way somewhere on the navigation mesh; fewer where there is no room."""
+    import carla
+
+    library = session.world.get_blueprint_library()
+    kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda each: each.id)
+    control = library.find("controller.ai.walker")
+    found: dict[str, carla.Actor] = {}
+    drivers = []
+    for number in range(recipe.pedestrians if kinds else 0):
+        place = session.world.get_random_location_from_navigation()
+        if place is None:
+            raise InputError(
+                f"CARLA at {session.address} has no navigation mesh for walkers here: set 'pedestrians' to 0"
+            )
+        kind = kinds[int(rng.integers(len(kinds)))]
+        kind.set_attribute("role_name", f"ped{number}")
+        walker = session.world.try_spawn_actor(kind, carla.Transform(place))
+        if walker is not None:
+            found[f"ped{number}"] = walker
+            drivers.append(session.world.spawn_actor(control, carla.Transform(), attach_to=walker))
+    session.tick()  # a controller starts after the tick that its walker appears at
+    for driver in drivers:
+        driver.start()
+        target = session.world.get_random_location_from_navigation()
+        if target is not None:
+            driver.go_to_location(target)
+    return found
+
+
+def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: MapFrame) -> list[TrackedBody]:
+    """Return the bodies of a world: all its vehicles and walkers, and the vehicles that are parked in its map.
+
+    Those that others than us have spawned are called `other` and CARLA's number.
+    """
+    import carla
+
+    track = {actor.id: name for name, actor in spawned.items()}
+    bodies = []
+    for actor in session.world.get_actors():
+        category = "pedestrian" if actor.type_id.startswith("walker.") else _category(actor)
+        if category and (actor.type_id.startswith(("walker.", "vehicle."))):
+            middle, size = _read_box(actor.bounding_box, MapFrame(), category)
+            bodies.append(TrackedBody(actor.id, track.get(actor.id, f"other{actor.id}"), category, size, middle))
+    parked: list[tuple[tuple[float, ...], str, tuple[Array, tuple[float, float, float]]]] = []
+    for category in ("car", "truck", "bus", "motorcycle", "bicycle"):
+        things = session.world.get_environment_objects(getattr(carla.CityObjectLabel, category.capitalize()))
+        for middle, size in (_read_box(thing.bounding_box, frame, category) for thing in things):
+            parked.append((tuple(middle[:3, 3].tolist()), category, (middle, size)))
+    parked.sort(key=lambda each: each[:2])  # their numbers may differ when the map is loaded anew
+    bodies += [TrackedBody(0, f"parked{i}", kind, size, middle) for i, (_, kind, (middle, size)) in enumerate(parked)]
+    return bodies
+
+
+def read_state(snapshot: "carla.WorldSnapshot", bodies: list[TrackedBody], frame: MapFrame) -> State:
+    """Return the bodies that a snapshot has, and the parked ones, with their boxes and motion."""
+    present, middles, velocity, acceleration = [], [], [], []
+    for body in bodies:
+        found = snapshot.find(body.number) if body.number else None
+        if body.number and found is None:
+            continue
+        present.append(body)
+        middles.append(body.middle if found is None else read_pose(found.get_transform(), frame) @ body.middle)
+        velocity.append((0.0, 0.0, 0.0) if found is None else read_vector(found.get_velocity()))
+        acceleration.append((0.0, 0.0, 0.0) if found is None else read_vector(found.get_acceleration()))
+    placed = np.array(middles).reshape(-1, 4, 4)
+    count = len(present)
+    return State(
+        tuple(present),
+        turned_boxes(
+            placed[:, :3, 3],
+            np.array([body.size for body in present]).reshape(count, 3),
+            placed[:, :3, :3],
+            np.array([body.category for body in present], np.str_).reshape(count),
+        ),
+        np.array(velocity).reshape(count, 3),
+        np.array(acceleration).reshape(count, 3),
+    )
+
+
+def read_pose(transform: "carla.Transform", frame: MapFrame) -> Array:
+    """Return the (4, 4) pose in the town's world, of a transform of CARLA's."""
+    at, turn = transform.location, transform.rotation
+    return frame.from_transform((at.x, at.y, at.z), (turn.pitch, turn.yaw, turn.roll))
+
+
+def make_transform(pose: Array, frame: MapFrame) -> "carla.Transform":
+    """Return CARLA's transform of a (4, 4) pose in the town's world."""
+    import carla
+
+    (x, y, z), (pitch, yaw, roll) = frame.to_transform(pose)
+    return carla.Transform(carla.Location(x, y, z), carla.Rotation(pitch=pitch, yaw=yaw, roll=roll))
+
+
+def read_vector(vector: "carla.Vector3D") -> Array:
+    """Return a direction (3,) of CARLA's in our axes."""
+    return mirror(np.array((vector.x, vector.y, vector.z)))
+
+
+def _read_box(box: "carla.BoundingBox", frame: MapFrame, category: str) -> tuple[Array, tuple[float, float, float]]:
+    """Return the (4, 4) middle and the size [m] of a box, which is in the map's frame or in its actor's."""
+    import carla
+
+    middle = read_pose(carla.Transform(box.location, box.rotation), frame)
+    narrowest = NARROWEST_M if category in ("motorcycle", "bicycle") else THINNEST_M
+    length, width, height = (2 * side for side in (box.extent.x, box.extent.y, box.extent.z))
+    return middle, (max(length, THINNEST_M), max(width, narrowest), max(height, THINNEST_M))
+
+
+def _category(thing: "carla.Actor | carla.ActorBlueprint") -> str:
+    """Return the category of a vehicle or of its blueprint; empty where CARLA does not say one of CATEGORIES."""
+    import carla
+
+    if isinstance(thing, carla.ActorBlueprint):
+        told = thing.get_attribute("base_type").as_str() if thing.has_attribute("base_type") else ""
+    else:
+        told = thing.attributes.get("base_type", "")
+    return told.lower() if told.lower() in CATEGORIES else ""

@@ -1,0 +1,233 @@
+"""The actors that clients know, each with its body in the live world, and how vehicles among them are driven."""
+
+from collections.abc import Collection, Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from flcav.carla.frames import MapFrame, mirror, mirror_spin, to_rotation
+from flcav.carla.server import wire
+from flcav.carla.server.blueprints import FLOAT, TRIGGER
+from flcav.carla.server.sensors import SensorClock
+from flcav.carla.server.sight import Sensor
+from flcav.carla.server.wire import AckermannControl, BoundingBox, Transform, VehicleControl
+from flcav.geometry import Array, rotations
+from flcav.sensors.frame import SEMANTICS
+from flcav.world.commands import Grip
+from flcav.world.dynamics.bodies import ControlledBody
+from flcav.world.dynamics.vehicle import make_blueprint
+from flcav.world.live import LiveWorld
+from flcav.world.snapshot import Snapshot
+
+NOTHING = (0.0, 0.0, 0.0)
+STILL = (NOTHING, NOTHING, NOTHING)
+FIRST_LIMIT_KMH = 30.0  # CARLA's speed limit of a vehicle that has passed no sign
+STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
+
+
+class Counters:
+    """The numbers of actors, streams, frames and episodes, which a server never uses twice."""
+
+    def __init__(self) -> None:
+        self.actor = self.episode = self.frame = self.stream = 0
+
+    def next_actor(self) -> int:
+        """Return a number for an actor."""
+        self.actor += 1
+        return self.actor
+
+    def next_stream(self) -> int:
+        """Return a number for a stream."""
+        self.stream += 1
+        return self.stream
+
+
+class ActorPose(NamedTuple):
+    """Where an actor is, and how it moves."""
+
+    pose: Array  # (4, 4) world from body
+    location: wire.Vector
+    rotation: wire.Vector
+    motion: Sequence[wire.Vector]  # velocity, angular velocity, acceleration
+
+
+@dataclass
+class ServedActor:
+    """An actor, as clients know it."""
+
+    id: int
+    description: wire.Description
+    transform: Transform
+    pose: Array  # (4, 4) world from actor: the ground under a vehicle's middle, a walker's middle
+    name: str = ""  # of its body in the live world; empty without one
+    category: str = ""  # of that body
+    size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # length, width, height [m]
+    paint: wire.Vector | None = None  # linear RGB, of a vehicle that a client spawned
+    parent: int = 0
+    mount: Array | None = None  # (4, 4) parent from actor, of one that is attached
+    stream: int = 0  # of a sensor
+    sensor: Sensor | None = None
+    clock: SensorClock | None = None
+    light: int | None = None  # row of its approach, of a traffic light
+    sign: str = ""  # its id in the map, of a traffic sign
+    box: BoundingBox | None = None  # of a traffic light or sign
+    motion: Sequence[wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
+    control: wire.VehicleControl = STANDING
+    walk: wire.WalkerControl = WAITING
+    ackermann: wire.AckermannControl | None = None
+    sticky: bool = True  # keeps its control; else it has one for a tick alone
+    told: bool = False  # has got a control since the last tick
+    limit_kmh: float = FIRST_LIMIT_KMH  # of speed, by the last sign that it passed
+    lamps: int = 0  # flags of a vehicle's lamps
+    simulated: bool = True
+    falling: bool = True
+    guided_s: float = 0.0  # time at which its AI last placed a walker
+    constant: Array | None = None  # (3,) velocity that is kept up, in the body's frame [m/s]
+    events: list[bytes] = field(default_factory=list)
+
+    @property
+    def kind(self) -> str:
+        """The first part of its blueprint's name."""
+        return self.description.id.partition(".")[0]
+
+    @property
+    def lift(self) -> float:
+        """The height of its origin above its underside [m]: CARLA's walkers have theirs in the middle."""
+        return self.size[2] / 2 if self.category == "pedestrian" else 0.0
+
+    def bounding_box(self) -> BoundingBox:
+        """Return its box in its own frame."""
+        if self.box is not None:
+            return self.box._replace(actor_id=self.id)
+        length, width, height = self.size
+        middle = (0.0, 0.0, height / 2 - self.lift)
+        return BoundingBox(middle, (length / 2, width / 2, height / 2), actor_id=self.id)
+
+    def record(self, port: int) -> wire.ActorRecord:
+        """Return it as clients get it; `port` is that of the streams."""
+        token = wire.pack_token(self.stream, port) if self.stream else b""
+        return wire.ActorRecord(self.id, self.parent, self.description, self.bounding_box(), self.tags(), token)
+
+    def tags(self) -> bytes:
+        """Return CARLA's semantic tags."""
+        if self.light is not None:
+            return bytes([SEMANTICS["traffic_light"]])
+        if self.sign:
+            return bytes([SEMANTICS["traffic_sign"]])
+        if not self.category:
+            return b""
+        names = {"van": "car", "prop": "static"}
+        return bytes([SEMANTICS[names.get(self.category, self.category)]])
+
+    def take(self, place: ActorPose) -> None:
+        """Take a place; the origin of a walker is its middle, `lift` above its feet."""
+        self.pose, self.motion = place.pose, place.motion
+        raised = self.lift * self.pose[:3, 2]
+        self.pose[:3, 3] += raised
+        (x, y, z), (dx, dy, dz) = place.location, mirror(raised).tolist()
+        self.transform = Transform((x + dx, y + dy, z + dz), place.rotation)
+
+
+def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[ActorPose]:
+    """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
+    trace = snapshot.trace
+    tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = rotations(yaw, *tilt.T)
+    poses[:, :3, 3] = position
+    spin = np.column_stack((np.zeros((count, 2)), trace.yaw_rate[0, :count]))
+    columns = (
+        frame.to_location(position),
+        to_rotation(np.column_stack((yaw, tilt))),
+        mirror(trace.velocity[0, :count]),
+        np.degrees(mirror_spin(spin)),
+        mirror(trace.acceleration[0, :count]),
+    )
+    rows = zip(*((map(tuple, column.tolist())) for column in columns))
+    return [ActorPose(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
+
+
+PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
+SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
+SETTLE_S = 0.5  # time in which a difference of speed is to be made up
+STOPPED_MPS = 0.05
+
+
+def choose_gear(control: VehicleControl, speed_mps: float) -> int:
+    """Return the gear of a vehicle: the driver's, or that of an automatic gearbox at its speed."""
+    if control.manual:
+        return control.gear
+    return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
+
+
+def find_grip(box: ServedActor, point: Array) -> float | None:
+    """Return the share of a dry road's friction in a box of friction; None where `point` (3,) is not in the box."""
+    told = {each.id: float(each.value) for each in box.description.attributes if each.type == FLOAT}
+    half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]
+    inside = np.abs(box.pose[:3, :3].T @ (point - box.pose[:3, 3])) <= half
+    return min(told["friction"], 1.0) if inside.all() else None
+
+
+def list_grips(actors: Collection[ServedActor], bodies: Iterable[ControlledBody]) -> list[Grip]:
+    """Return how the tyres of vehicles hold, by the last box of friction that each is in, where that has changed."""
+    known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
+    boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []
+    for body in bodies:
+        if (actor := known.get(body.name)) is not None:
+            shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
+            share = shares[-1] if shares else 1.0
+            if body.grip != share:
+                changed.append(Grip(body.name, share))
+    return changed
+
+
+def steer_towards(
+    told: AckermannControl, now: VehicleControl, speed_mps: float, limit_rad: float, dt_s: float
+) -> VehicleControl:
+    """Return the control of a vehicle with the greatest steering angle `limit_rad` at `speed_mps`, for one step."""
+    steer = min(max(told.steer / limit_rad, -1.0), 1.0)
+    if told.steer_speed > 0:
+        most = told.steer_speed / limit_rad * dt_s
+        steer = min(max(steer, now.steer - most), now.steer + most)
+    wanted = (told.speed - speed_mps) / SETTLE_S
+    if told.acceleration > 0:
+        wanted = min(max(wanted, -told.acceleration), told.acceleration)
+    backwards = told.speed < 0
+    push = -wanted if backwards else wanted
+    if abs(told.speed) < STOPPED_MPS and abs(speed_mps) < STOPPED_MPS:
+        return VehicleControl(steer=steer, brake=1.0, hand_brake=True)
+    if push >= 0:
+        return VehicleControl(throttle=min(push / PULL_MPS2, 1.0), steer=steer, reverse=backwards)
+    return VehicleControl(steer=steer, brake=min(-push / BRAKE_MPS2, 1.0), reverse=backwards)
+
+
+WHEEL_M = 0.35  # radius
+TORQUE = [[0.0, 400.0], [1890.0, 500.0], [5729.0, 400.0]]  # of the engine over its speed [N m, 1/min]
+GEARS = [[4.0, 0.5, 0.65], [2.0, 0.5, 0.65]]  # ratio, shares of the speed at which it shifts
+STEERING = [[0.0, 1.0], [20.0, 0.9], [120.0, 0.7]]  # share of the angle over the speed [km/h]
+
+
+def describe_physics(vehicle: ServedActor, world: LiveWorld) -> list[Any]:
+    """Return a vehicle's physics: those of its size, and CARLA's defaults for what plays no part here."""
+    made = make_blueprint(vehicle.category, 0, vehicle.size)
+    steer = float(np.degrees(made.steer_limit_rad))
+    wheels = []
+    for front in (True, False):
+        for left in (True, False):
+            along = made.wheelbase_m / 2 * (1 if front else -1)
+            across = vehicle.size[1] * 0.4 * (1 if left else -1)
+            x, y, z = (vehicle.pose @ (along, across, WHEEL_M, 1.0))[:3]
+            place = [100.0 * x, -100.0 * y, 100.0 * z]  # [cm]
+            turns, hand = (steer, 0.0) if front else (0.0, 3000.0)
+            wheels.append([3.5, 0.25, turns, 100 * WHEEL_M, 1500.0, hand, 2.0, 17.0, 1000.0, place])
+    engine = [TORQUE, 5729.0, 1.0, 0.15, 2.0, 0.35]
+    gearbox = [True, 0.5, 10.0, 4.0, GEARS]
+    return [*engine, *gearbox, made.mass_kg, 0.3, [0.45, 0.0, -0.3], STEERING, wheels, True]
+
+
+def describe_telemetry(vehicle: ServedActor, speed_mps: float) -> list[Any]:
+    """Return a vehicle's telemetry."""
+    control = vehicle.control
+    wheel = [3.5] + [0.0] * 10
+    return [speed_mps, control.steer, control.throttle, control.brake, 1000.0, max(control.gear, 1), 0.3, [wheel] * 4]

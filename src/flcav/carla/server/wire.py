@@ -1,0 +1,413 @@
+"""The wire format of CARLA 0.9.16: values of remote procedure calls, batch commands and sensor streams.
+
+A call is the MessagePack array [0, id, method, [[is async], argument, ...]], its reply [1, id, nil, response]; messages
+follow each other without a length. Records are arrays of their fields, so the named tuples here are packed as they are.
+An optional is [false] or [true, value], a variant [index, value]; a response is [[1, value]], [[false]] where there is
+none, or [[0, [message]]]. Streams are little-endian: u32 size and payload, beginning with a header of 48 bytes.
+Locations are in metres, rotations pitch, yaw and roll in degrees, both in CARLA's left-handed frame.
+"""
+
+import struct
+from collections.abc import Sequence
+from enum import IntEnum
+from functools import lru_cache
+from types import UnionType
+from typing import Any, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import msgpack
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import Json
+
+VERSION = "0.9.16"
+HEADER = struct.Struct("<QQd6f")
+WORLD = struct.Struct("<Qdf3iI")
+VEHICLE = struct.Struct("<3f3?ifB?IB")
+WALKER = struct.Struct("<4f?")
+LIGHT = struct.Struct("<32s4fI?B")
+TOKEN = struct.Struct("<IHBB16s")
+ACTOR = struct.Struct("<IB6f3f3f3f54s")  # the last are of its kind: `VEHICLE`, `WALKER` or `LIGHT`
+SEMANTIC_POINT = np.dtype([("xyz", "<f4", 3), ("cosine", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
+FARTHEST = 1e9  # numbers beyond are refused
+ACTIVE, TCP = 1, 1
+
+Vector = tuple[float, float, float]
+Packed = Json | bytes  # a value on the wire
+
+
+class WireError(ValueError):
+    """A message that is none of CARLA 0.9.16."""
+
+
+class Stream(IntEnum):
+    """The kind of a sensor's stream."""
+
+    COLLISION = 0
+    DEPTH = 1
+    GNSS = 4
+    IMU = 5
+    LANE_INVASION = 6
+    OBSTACLE = 7
+    RADAR = 9
+    SEMANTIC_LIDAR = 10
+    LIDAR = 11
+    RGB = 13
+    SEMANTIC = 14
+    INSTANCE = 15
+    WORLD = 17
+
+
+class Transform(NamedTuple):
+    """A pose."""
+
+    location: Vector
+    rotation: Vector
+
+
+class BoundingBox(NamedTuple):
+    """A box in the frame of its actor, or of the world."""
+
+    location: Vector
+    extent: Vector  # half of its length, width and height
+    rotation: Vector = (0.0, 0.0, 0.0)
+    actor_id: int = 0
+
+
+class Attribute(NamedTuple):
+    """The value of an attribute of an actor."""
+
+    id: str
+    type: int  # 1 Bool, 2 Int, 3 Float, 4 String, 5 RGB
+    value: str
+
+
+class Description(NamedTuple):
+    """The blueprint of an actor with its attributes."""
+
+    uid: int
+    id: str
+    attributes: tuple[Attribute, ...]
+
+
+class Variation(NamedTuple):
+    """An attribute of a blueprint."""
+
+    id: str
+    type: int
+    value: str
+    recommended: tuple[str, ...]
+    modifiable: bool
+    restricted: bool  # to the recommended values
+
+
+class Definition(NamedTuple):
+    """A blueprint."""
+
+    uid: int
+    id: str
+    tags: str  # with commas
+    attributes: tuple[Variation, ...]
+
+
+class ActorRecord(NamedTuple):
+    """An actor."""
+
+    id: int
+    parent: int
+    description: Description
+    box: BoundingBox
+    tags: bytes
+    token: bytes  # of a sensor's stream; empty without one
+
+
+class EpisodeSettings(NamedTuple):
+    """The settings of an episode."""
+
+    synchronous: bool = False
+    no_rendering: bool = False
+    fixed_dt_s: float | None = None
+    substepping: bool = True
+    substep_s: float = 0.01
+    substeps: int = 10
+    culling_m: float = 0.0
+    ragdolls: bool = True
+    tile_m: float = 3000.0
+    active_m: float = 2000.0
+    spectator_ego: bool = True
+
+    def packed(self) -> list[Any]:
+        """Return the array on the wire."""
+        fixed = [False] if self.fixed_dt_s is None else [True, self.fixed_dt_s]
+        return [self.synchronous, self.no_rendering, fixed, *self[3:]]
+
+
+class WeatherParameters(NamedTuple):
+    """CARLA's weather: percentages, degrees and metres."""
+
+    cloudiness: float = 0.0
+    precipitation: float = 0.0
+    precipitation_deposits: float = 0.0
+    wind_intensity: float = 0.0
+    sun_azimuth_angle: float = 0.0
+    sun_altitude_angle: float = 0.0
+    fog_density: float = 0.0
+    fog_distance: float = 0.0
+    fog_falloff: float = 0.0
+    wetness: float = 0.0
+    scattering_intensity: float = 0.0
+    mie_scattering_scale: float = 0.0
+    rayleigh_scattering_scale: float = 0.0331
+    dust_storm: float = 0.0
+
+
+class VehicleControl(NamedTuple):
+    """The pedals and the steering wheel of a vehicle."""
+
+    throttle: float = 0.0
+    steer: float = 0.0  # -1 to 1, positive to the right
+    brake: float = 0.0
+    hand_brake: bool = False
+    reverse: bool = False
+    manual: bool = False
+    gear: int = 0
+
+
+class AckermannControl(NamedTuple):
+    """A steering angle and a speed to be reached."""
+
+    steer: float  # [rad], positive to the right
+    steer_speed: float
+    speed: float  # [m/s]
+    acceleration: float
+    jerk: float
+
+
+class WalkerControl(NamedTuple):
+    """Direction and speed of a walker."""
+
+    direction: Vector = (1.0, 0.0, 0.0)
+    speed: float = 0.0  # [m/s]
+    jump: bool = False
+
+
+class CollisionEvent(NamedTuple):
+    """What a collision sensor sends."""
+
+    actor: ActorRecord
+    other: ActorRecord
+    impulse: Vector  # [N s]
+
+
+class ObstacleEvent(NamedTuple):
+    """What an obstacle sensor sends."""
+
+    actor: ActorRecord
+    other: ActorRecord
+    distance: float  # [m]
+
+
+# The calls that the commands of a batch stand for, by number; their fields are the arguments.
+COMMANDS: tuple[str, ...] = (
+    "spawn",
+    "destroy_actor",
+    "apply_control_to_vehicle",
+    "apply_ackermann_control_to_vehicle",
+    "apply_control_to_walker",
+    "apply_physics_control",
+    "set_actor_transform",
+    "set_walker_state",
+    "set_actor_target_velocity",
+    "set_actor_target_angular_velocity",
+    "add_actor_impulse",
+    "add_actor_force",
+    "add_actor_angular_impulse",
+    "add_actor_torque",
+    "set_actor_simulate_physics",
+    "set_actor_enable_gravity",
+    "set_actor_autopilot",
+    "show_vehicle_debug_telemetry",
+    "set_vehicle_light_state",
+    "set_actor_location",
+    "console_command",
+    "set_traffic_light_state",
+)
+
+
+# ---- calls
+
+
+class Call(NamedTuple):
+    """A remote procedure call."""
+
+    number: int | None  # of its reply; None: a notification, without one
+    method: str
+    arguments: tuple[Any, ...]
+
+
+def pack_value(value: Any) -> bytes:
+    """Return a value as MessagePack."""
+    packed = msgpack.packb(value, unicode_errors="surrogateescape")
+    assert packed is not None, "it returns bytes; its types say that it may not"
+    return packed
+
+
+def read_call(message: Any) -> Call:
+    """Return the call of an unpacked message; raises `WireError` where it is none."""
+    match message:
+        case [0, int(number), str(method), [_, *arguments]]:
+            return Call(number, method, tuple(arguments))
+        case [2, str(method), [_, *arguments]]:
+            return Call(None, method, tuple(arguments))
+    raise WireError("a message that is no call of CARLA 0.9.16")
+
+
+def succeed(value: Any) -> list[Any]:
+    """Return the response with a value."""
+    return [[1, value]]
+
+
+DONE: list[Any] = [[False]]  # the response without one
+
+
+def fail(message: str) -> list[Any]:
+    """Return the response of a refused call."""
+    return [[0, [message]]]
+
+
+def pack_reply(number: int, response: Any) -> bytes:
+    """Return the bytes of a reply."""
+    return pack_value([1, number, None, response])
+
+
+def read(kind: Any, value: Any) -> Any:
+    """Return an unpacked value as the type `kind`: a number, text, bytes, named tuple, tuple or optional of these.
+
+    Raises `WireError` where it is none. `Any` and `Packed` take everything.
+    """
+    return _reader(kind)(value)
+
+
+@lru_cache(maxsize=256)
+def _reader(kind: Any) -> Any:
+    """Return the function that reads values of a type."""
+    if kind in (Any, Packed):
+        return lambda value: value
+    if kind is float:
+        return _read_float
+    if kind is int:
+        return _read_int
+    if kind in (bool, str, bytes):
+        return lambda value: _read_plain(kind, value)
+    if get_origin(kind) in (Union, UnionType):
+        inner = _reader(next(each for each in get_args(kind) if each is not type(None)))
+        return lambda value: _read_optional(inner, value)
+    if get_origin(kind) is tuple:
+        parts = get_args(kind)
+        if parts[-1] is Ellipsis:
+            each = _reader(parts[0])
+            return lambda value: tuple(each(part) for part in _array(value))
+        return lambda value: _read_fields(tuple, tuple(map(_reader, parts)), value)
+    fields = tuple(_reader(hint) for hint in get_type_hints(kind).values())
+    return lambda value: _read_fields(kind._make, fields, value)
+
+
+def _array(value: Any) -> list[Any]:
+    if not isinstance(value, list):
+        raise WireError("a value where a list belongs")
+    return value
+
+
+def _read_fields(make: Any, fields: tuple[Any, ...], value: Any) -> Any:
+    if len(_array(value)) != len(fields):
+        raise WireError(f"{len(value)} fields where {len(fields)} belong")
+    return make([field(part) for field, part in zip(fields, value, strict=True)])
+
+
+def _read_optional(inner: Any, value: Any) -> Any:
+    match value:
+        case [False]:
+            return None
+        case [True, inside]:
+            return inner(inside)
+    raise WireError("a value where an optional belongs")
+
+
+def _read_float(value: Any) -> float:
+    if type(value) not in (int, float) or not abs(value) < FARTHEST:
+        raise WireError("a value where a finite number belongs")
+    return float(value)
+
+
+def _read_int(value: Any) -> int:
+    if type(value) is not int:
+        raise WireError("a value where a whole number belongs")
+    return value
+
+
+def _read_plain(kind: type, value: Any) -> Any:
+    if type(value) is not kind:
+        raise WireError(f"a value where a {kind.__name__} belongs")
+    return value
+
+
+# ---- streams
+
+
+def pack_token(stream: int, port: int) -> bytes:
+    """Return the token of a stream at a port of the host that the client is connected to."""
+    return TOKEN.pack(stream, port, TCP, 0, b"")
+
+
+def pack_header(kind: Stream, frame: int, time_s: float, transform: Transform) -> bytes:
+    """Return the header of a payload: the frame, its time and the sensor's pose."""
+    return HEADER.pack(kind, frame, time_s, *transform.location, *transform.rotation)
+
+
+def pack_world(episode: int, platform_s: float, dt_s: float, actors: Sequence[bytes]) -> bytes:
+    """Return the body of the world's state."""
+    return WORLD.pack(episode, platform_s, dt_s, 0, 0, 0, 0) + b"".join(actors)
+
+
+def pack_actor(actor: int, transform: Transform, motion: Sequence[Vector], union: bytes = b"") -> bytes:
+    """Return the state of one actor; `motion` is velocity [m/s], angular velocity [deg/s] and acceleration [m/s^2]."""
+    return ACTOR.pack(
+        actor, ACTIVE, *transform.location, *transform.rotation, *motion[0], *motion[1], *motion[2], union
+    )
+
+
+def pack_vehicle(control: VehicleControl, gear: int, limit_kmh: float, light: int, at_light: bool, by: int) -> bytes:
+    """Return the state of a vehicle: its control, the speed limit, and the light that it stands at (actor `by`)."""
+    return VEHICLE.pack(*control[:6], gear, limit_kmh, light, at_light, by, 0)
+
+
+def pack_walker(control: WalkerControl) -> bytes:
+    """Return the state of a walker."""
+    return WALKER.pack(*control.direction, control.speed, control.jump)
+
+
+def pack_light(
+    sign: str, times_s: tuple[float, float, float], elapsed_s: float, pole: int, frozen: bool, state: int
+) -> bytes:
+    """Return the state of a traffic light: its id in OpenDRIVE, the times of green, yellow and red, its colour."""
+    return LIGHT.pack(sign.encode()[:31], *times_s, elapsed_s, pole, frozen, state)
+
+
+def pack_sign(sign: str) -> bytes:
+    """Return the state of a traffic sign: its id in OpenDRIVE."""
+    return sign.encode()[:31]
+
+
+def pack_image(width: int, height: int, fov_deg: float, bgra: NDArray[np.uint8]) -> bytes:
+    """Return the body of an image (H, W, 4) of blue, green, red and alpha."""
+    return struct.pack("<IIf", width, height, fov_deg) + bgra.tobytes()
+
+
+def pack_lidar(angle_rad: float, per_channel: NDArray[np.integer], points: NDArray[Any]) -> bytes:
+    """Return the body of a sweep: points channel after channel, as rows of float32 or of `SEMANTIC_POINT`."""
+    return struct.pack("<fI", angle_rad, len(per_channel)) + per_channel.astype("<u4").tobytes() + points.tobytes()
+
+
+def pack_record(record: Any) -> bytes:
+    """Return the body of what is sent as MessagePack: GNSS, IMU, collisions and obstacles."""
+    return pack_value(record)

@@ -1,1 +1,0 @@
-"""Consistency checks of a dataset; each yields one sentence per problem."""

@@ -1,1 +1,0 @@
-"""MCAP files with Foxglove's schemas, for Foxglove and any other reader of MCAP: written (`write`)."""

@@ -1,0 +1,224 @@
+"""Checks over several frames: blocked LiDARs, empty boxes, motion against velocity, and sweeps that are there twice."""
+
+import contextlib
+from collections import Counter, defaultdict
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.dataset.layout import FILES, payload_path, read_manifest, table_path
+from flcav.dataset.payloads import POINTS
+from flcav.dataset.tables import read_table
+from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse
+from flcav.interface.wording import plural
+from flcav.sensors.frame import Frame
+from flcav.world.trace import Trace
+
+CLOSE_M = 1.0  # points closer to the LiDAR are from its mount or an obstruction
+MOST, ALMOST_ALL = 0.5, 0.95  # shares of close points from which the view is blocked, and almost entirely
+LONGEST_STEP_S = 1.0  # longer steps are skipped: the velocities at both ends do not predict the motion
+DRIFT_M, DRIFT_MPS = 0.3, 2.5  # tolerance of a position predicted from velocities: constant, and per second
+NEAR_M = 40.0  # boxes within are those of which every LiDAR has points
+OUT_OF_REACH_M = 1000.0  # no LiDAR measures as far
+NEAR_SIZES = 10.0  # so many times its longest side is the same for a smaller box
+LIFT_M = 0.2  # lower part of a box whose points may be the ground's
+HIDDEN = 0.5  # occlusion from which a box may be empty
+SECTOR_DEG = 2.0  # width of the azimuth sectors in which a LiDAR's range is taken
+FEWEST_BOXES, FEWEST_OBJECTS = 5, 3  # boxes of which a share is told, and objects that they are of
+
+
+class BlockedViews:
+    """Detector of blocked LiDARs: counts the points close to each LiDAR over all frames of a dataset."""
+
+    def __init__(self) -> None:
+        self._points: Counter[tuple[str, str]] = Counter()  # by agent and LiDAR
+        self._close: Counter[tuple[str, str]] = Counter()
+
+    def add(self, frame: Frame) -> None:
+        """Add the points of one frame to the counts."""
+        for name, points in frame.lidar.items():
+            with np.errstate(invalid="ignore"):  # signalling NaNs, which `check_values` reports
+                close = np.linalg.norm(points[:, :3].astype(np.float64), axis=1) < CLOSE_M
+            self._points[frame.agent, name] += len(points)
+            self._close[frame.agent, name] += int(close.sum())
+
+    def problems(self) -> Iterator[str]:
+        """Yield a sentence for each LiDAR with more than a share MOST of its points closer than CLOSE_M."""
+        for (agent, name), count in self._points.items():
+            share = self._close[agent, name] / max(count, 1)
+            told = f"{share:.1%} of its {plural(count, 'point')} lie within {CLOSE_M:g} m of it"
+            if share >= ALMOST_ALL:
+                yield f"{agent}: '{name}' sees almost nothing but its own mount: {told}"
+            elif share > MOST:
+                yield f"{agent}: the view of '{name}' is blocked: {told}"
+
+
+@dataclass
+class _Tally:
+    """Boxes of an agent, or of all."""
+
+    boxes: int = 0
+    far: int = 0  # out of any LiDAR's reach
+    near: int = 0  # that a LiDAR must have points of
+    empty: int = 0  # of these without a point
+    objects: set[tuple[str, str]] = field(default_factory=set)  # scene and track of the empty ones
+    first: str = ""  # track and frame of one that is empty, or far
+
+    def problem(self) -> str:
+        """Return what is wrong with most of the boxes; "" where nothing is."""
+        if self.boxes >= FEWEST_BOXES and self.far > MOST * self.boxes:
+            return (
+                f"{self.far} of {self.boxes} boxes are more than {OUT_OF_REACH_M:g} m from the LiDARs, as {self.first} "
+                "is: boxes and poses are not in one frame, or not in metres"
+            )
+        if self.near >= FEWEST_BOXES and len(self.objects) >= FEWEST_OBJECTS and self.empty > MOST * self.near:
+            return (
+                f"{self.empty} of {self.near} boxes within {NEAR_M:g} m in view of the LiDARs have no points "
+                f"above the ground, as {self.first} has none: boxes, poses and points do not fit together; check the "
+                "units and the order of angles, the units of lengths, and the frames"
+            )
+        return ""
+
+
+class EmptyBoxes:
+    """Detector of boxes that are not where the objects are: counts the near ones without points over all frames.
+
+    A box counts within NEAR_M of a LiDAR that measures farther in its direction and has beams at its height, unless it
+    is known to be occluded. Of right boxes few are empty, with any LiDAR and in any weather; of wrong ones most are.
+    """
+
+    def __init__(self) -> None:
+        self._tallies: dict[str, _Tally] = defaultdict(_Tally)  # by agent
+        self._all = _Tally()
+
+    def add(self, frame: Frame) -> None:
+        """Add the boxes of one frame to the counts; a frame with points or boxes that are not finite is skipped."""
+        boxes = frame.annotations.boxes
+        if not len(boxes) or not np.isfinite(boxes.array()).all():
+            return
+        near, away, points = np.zeros(len(boxes), bool), np.full(len(boxes), np.inf), np.zeros(len(boxes), np.int64)
+        raised = _raise_floors(boxes)
+        for name, cloud in frame.lidar.items():
+            world_from_lidar = frame.world_from_sensor(name)
+            if not len(cloud) or not np.isfinite(cloud).all() or not np.isfinite(world_from_lidar).all():
+                continue
+            local = raised.transform(inverse(world_from_lidar))
+            away = np.minimum(away, np.linalg.norm(local.center, axis=1))
+            near |= _are_in_view(local, cloud)
+            points += count_points_in_boxes(cloud, raised, world_from_lidar)
+        near &= ~(frame.annotations.occlusion > HIDDEN)
+        far, empty = (away > OUT_OF_REACH_M) & np.isfinite(away), near & (points == 0)
+        for tally in (self._all, self._tallies[frame.agent]):
+            tally.boxes += int(np.isfinite(away).sum())
+            tally.far += int(far.sum())
+            tally.near += int(near.sum())
+            tally.empty += int(empty.sum())
+            named = frame.annotations.track[empty | far].tolist()
+            tally.objects |= {(frame.scene, track) for track in named}
+            tally.first = tally.first or (f"'{named[0]}' in {frame.key}" if named else "")
+
+    def problems(self) -> Iterator[str]:
+        """Yield a sentence where most boxes of all agents are wrong, or else for each agent of which they are."""
+        if told := self._all.problem():
+            yield told
+            return
+        yield from (f"{agent}: {told}" for agent, tally in self._tallies.items() if (told := tally.problem()))
+
+
+def _raise_floors(boxes: Boxes) -> Boxes:
+    """Return the boxes without their lowest LIFT_M."""
+    lift = np.minimum(LIFT_M, boxes.size[:, 2] / 2)
+    up = np.zeros_like(boxes.center)
+    up[:, 2] = lift
+    return replace(boxes, center=boxes.center + up / 2, size=boxes.size - up)
+
+
+def _are_in_view(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return (M,) whether boxes in the LiDAR's frame are near it, with returns of `points` (N, 4) from beyond them.
+
+    Returns from beyond are in the same direction, at any height; boxes below all beams are not in view, nor are those
+    between two.
+    """
+    x, y, z = points[:, :3].T.astype(np.float64)
+    level, away = np.hypot(x, y), np.hypot(*boxes.center[:, :2].T)
+    sectors = round(360 / SECTOR_DEG)
+
+    def sector(ahead: Array, left: Array) -> NDArray[np.int64]:
+        return np.floor(np.degrees(np.arctan2(left, ahead)) / SECTOR_DEG).astype(np.int64) % sectors
+
+    reach = np.zeros(sectors)
+    np.maximum.at(reach, sector(x, y), level)
+    beyond = reach[sector(*boxes.center[:, :2].T)] > away + np.linalg.norm(boxes.size, axis=1) / 2
+    slopes, half = np.sort(z / np.maximum(level, 1e-9)), boxes.size[:, 2] / 2
+    low, high = (
+        np.searchsorted(slopes, (boxes.center[:, 2] + side) / np.maximum(away, 1e-9)) for side in (-half, half)
+    )
+    near = away <= np.minimum(NEAR_M, NEAR_SIZES * boxes.size.max(axis=1))
+    return near & beyond & ((low < high) | (low == len(slopes)))
+
+
+def check_motion(scene: str, trace: Trace) -> Iterator[str]:
+    """Check that every actor moves between instants as its recorded velocities predict, by the trapezoidal rule.
+
+    Yields one sentence for each actor that does not, about its worst step.
+    """
+    step_s = np.diff(trace.time_s)[:, None]
+    moved = np.diff(trace.position, axis=0)
+    expected = (trace.velocity[1:] + trace.velocity[:-1]) / 2 * step_s[..., None]
+    away = np.linalg.norm((moved - expected)[..., :2], axis=2)
+    known = (step_s <= LONGEST_STEP_S) & ~np.isnan(away)
+    excess = np.where(known, away - (DRIFT_M + DRIFT_MPS * step_s), -1.0)
+    for actor in np.flatnonzero(excess.max(axis=0, initial=-1.0) > 0):
+        t = int(excess[:, actor].argmax())
+        speeds = np.linalg.norm(trace.velocity[t : t + 2, actor], axis=1)
+        yield (
+            f"scene '{scene}': {trace.category[actor]} '{trace.actor[actor]}' moves "
+            f"{np.linalg.norm(moved[t, actor]):.2f} m from {trace.time_s[t]:g} s to {trace.time_s[t + 1]:g} s, "
+            f"at recorded speeds of {speeds[0]:.1f} and {speeds[1]:.1f} m/s"
+        )
+
+
+class CloudPlace(NamedTuple):
+    """A point cloud's place: its dataset, the scene and the split of that; the split is empty where it has none."""
+
+    folder: Path
+    split: str
+    scene: str
+
+
+def find_copies(folders: Sequence[Path]) -> list[str]:
+    """Return a sentence for each two splits, of one dataset or of two, in which the same point clouds are.
+
+    Folders that hold no whole dataset are left out: `validate` says what they lack.
+    """
+    first: dict[str, CloudPlace] = {}  # by checksum
+    shared: dict[tuple[tuple[Path, str], tuple[Path, str]], list[tuple[str, str]]] = defaultdict(list)
+    for folder in folders:
+        with contextlib.suppress(InputError):
+            for digest, cloud in _list_clouds(folder):
+                one = first.setdefault(digest, cloud)
+                if one.split != cloud.split and one.scene != cloud.scene:  # else the name says it
+                    shared[one[:2], cloud[:2]].append((one.scene, cloud.scene))
+    return [
+        f"{one} (split '{split}') and {other} (split '{other_split}'): leakage, they share {len(scenes)} point clouds, "
+        f"the first is of the scenes '{scenes[0][0]}' and '{scenes[0][1]}'"
+        for ((one, split), (other, other_split)), scenes in shared.items()
+    ]
+
+
+def _list_clouds(folder: Path) -> Iterator[tuple[str, CloudPlace]]:
+    """Yield checksum and place of the point clouds of a dataset, without the empty ones."""
+    manifest = read_manifest(folder)
+    split_of, own = manifest.split_of, str(manifest.recipe.get("split", ""))
+    frames = read_table(folder / table_path("frames"), "frames").select(["key", "scene", "lidar"]).to_pylist()
+    files = read_table(folder / table_path(FILES), FILES).to_pydict()
+    digests = {path: digest for path, size, digest in zip(files["path"], files["bytes"], files["sha256"]) if size}
+    for row in frames:
+        for lidar in row["lidar"]:
+            if digest := digests.get(payload_path(lidar, row["key"], POINTS)):
+                yield digest, CloudPlace(folder, split_of.get(row["scene"], own), row["scene"])

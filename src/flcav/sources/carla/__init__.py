@@ -1,1 +1,0 @@
-"""CARLA: our world for its clients."""

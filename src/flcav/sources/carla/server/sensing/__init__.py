@@ -1,1 +1,0 @@
-"""The sensors of CARLA's clients: what each sends at one tick, as bytes."""
