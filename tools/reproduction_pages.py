@@ -63,8 +63,8 @@ from flcav.experiments.studies import signs as signs_tables
 from flcav.experiments.studies import trajectory as trajectory_tables
 from flcav.experiments.studies import weather as weather_tables
 from flcav.experiments.studies.run import EvaluationT, Study, StudyResult, results_of_json
-from flcav.pipeline.results.run import Run, Summary
-from flcav.pipeline.running import RESULTS, seed_folders
+from flcav.runs.results.run import Run, Summary
+from flcav.runs.running import RESULTS, seed_folders
 from flcav.storage.files import write_bytes
 from flcav.storage.records import from_json
 

@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from flcav.network.ledger import Ledger
-from flcav.pipeline.alone import federate_regions
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results.groups import Term
+from flcav.runs.alone import federate_regions
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.results.groups import Term
 
 DOCS = Path(__file__).parents[2] / "docs" / "groups.md"
 

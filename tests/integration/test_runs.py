@@ -19,12 +19,12 @@ from flcav.experiments.fig6a.results import MEAN
 from flcav.experiments.placement.records import COVERAGE, NEAR, TOWN, TRAFFIC
 from flcav.experiments.placement.run import prove_placement
 from flcav.experiments.run_tables import judge_anew
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
-from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.run import Run, Summary
-from flcav.pipeline.results.training import StageResult, Watched
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.training import StageResult, Watched
+from flcav.runs.steps.graph import Graph
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town
 

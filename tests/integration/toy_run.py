@@ -8,8 +8,8 @@ from typing import Any
 
 from flcav.experiments.arms.run import ArmsResult
 from flcav.experiments.fig6a.results import AllocationResult
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.running import RESULTS
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.running import RESULTS
 
 Studied = tuple[Path, ArmsResult, AllocationResult]
 TOY = Path(__file__).parent / "toy.yaml"

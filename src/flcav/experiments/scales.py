@@ -1,6 +1,6 @@
 """Run recipes at the scale "quick" of experiments: the same pipeline on fewer frames."""
 
-from flcav.pipeline.recipe import RunRecipe
+from flcav.runs.recipe import RunRecipe
 
 
 def use_demo_size(recipe: RunRecipe) -> RunRecipe:

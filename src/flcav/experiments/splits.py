@@ -6,7 +6,7 @@ from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.perception.study import RecipeFields
-from flcav.pipeline.engine import Work
+from flcav.runs.engine import Work
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 

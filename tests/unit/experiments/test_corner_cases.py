@@ -29,7 +29,7 @@ from flcav.experiments.corner_cases.tables import corner_case_tables
 from flcav.geometry import Boxes
 from flcav.perception.objects.evaluate import score_detections
 from flcav.perception.objects.truth import FrameTruth
-from flcav.pipeline.recipe import MAIN, load_run_recipe
+from flcav.runs.recipe import MAIN, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.world.shapes import PARKED_ONLY, RARE, SHAPES
 

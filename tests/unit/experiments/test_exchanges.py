@@ -36,8 +36,8 @@ from flcav.network.radio.propagation import PathState
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.arms import check_federations, resolve_settings
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
+from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
 

@@ -5,7 +5,7 @@ import pytest
 
 from flcav.experiments.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
 from flcav.optimization.graph import to_problem
-from flcav.pipeline.tables import load_history
+from flcav.runs.tables import load_history
 
 pytestmark = pytest.mark.slow
 

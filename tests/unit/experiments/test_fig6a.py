@@ -17,11 +17,11 @@ from flcav.experiments.fig6a.results import (
 )
 from flcav.experiments.fig6a.run import BUDGETS, PLANS, STAGES, _collect, budget_recipes, draw_allocation, summarise
 from flcav.experiments.fig6a.tables import tables
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results.plans import Placed, Pole
-from flcav.pipeline.results.run import LinkUse
 from flcav.report.charts.plans import predicted_and_realised
+from flcav.runs.provenance import provenance
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.results.plans import Placed, Pole
+from flcav.runs.results.run import LinkUse
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.estimates import Estimate
 

@@ -26,8 +26,8 @@ from flcav.experiments.gap.run import (
     draw_megabytes,
 )
 from flcav.experiments.gap.tables import gap_tables
-from flcav.pipeline.recipe import MAIN, load_run_recipe
-from flcav.pipeline.results.training import LabelQuality
+from flcav.runs.recipe import MAIN, load_run_recipe
+from flcav.runs.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/gap"))

@@ -17,9 +17,9 @@ from flcav.experiments.distillation.run import (
     compare_labels,
 )
 from flcav.experiments.distillation.tables import tables
-from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
-from flcav.pipeline.results.run import Spent
-from flcav.pipeline.results.training import LabelQuality
+from flcav.runs.recipe import EDGE, MAIN, load_run_recipe
+from flcav.runs.results.run import Spent
+from flcav.runs.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/distillation"))

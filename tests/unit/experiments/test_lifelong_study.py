@@ -9,10 +9,10 @@ from PIL import Image
 
 from flcav.experiments.lifelong.run import ARMS, LifelongResult, compare_lifelong, count_mended, draw_lifelong
 from flcav.experiments.lifelong.tables import lifelong_tables
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results.lifelong import LifelongArm, Passed
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_rounds
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.results.lifelong import LifelongArm, Passed
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/lifelong"))

@@ -12,8 +12,8 @@ from flcav.geometry import Boxes
 from flcav.perception.card import Card
 from flcav.perception.images import CameraView
 from flcav.perception.objects.evaluate import ObjectsEvaluation
-from flcav.pipeline.provenance import provenance
 from flcav.report.pictures.clouds import real_frame
+from flcav.runs.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 
 

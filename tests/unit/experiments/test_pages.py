@@ -6,8 +6,8 @@ from reproduction_pages import TABLES, fill, fill_folder, tables_of
 
 from flcav.config import InputError, read_json
 from flcav.experiments.arms.run import ARMS, ArmsResult, order_arms
-from flcav.pipeline.results.run import Summary
-from flcav.pipeline.running import RESULTS
+from flcav.runs.results.run import Summary
+from flcav.runs.running import RESULTS
 from flcav.storage.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"

@@ -40,7 +40,7 @@ from flcav.experiments.redundant_tasks.scenarios import (
 from flcav.experiments.redundant_tasks.tables import redundant_tasks_tables
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.engine import run_steps
+from flcav.runs.engine import run_steps
 from flcav.storage.records import from_json
 
 

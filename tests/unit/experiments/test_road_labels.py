@@ -6,7 +6,7 @@ from flcav.experiments.roadside.detector import RoadDetectorResult
 from flcav.experiments.roadside.labels import RoadLabels, grade_labels
 from flcav.experiments.roadside.tables import detector_tables
 from flcav.geometry import Boxes
-from flcav.pipeline.provenance import provenance
+from flcav.runs.provenance import provenance
 
 
 def cars(*rows: tuple[float, float, float]) -> Boxes:

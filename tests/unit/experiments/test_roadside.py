@@ -16,7 +16,7 @@ from flcav.experiments.roadside.ranges import EDGES_M as SENSOR_EDGES_M
 from flcav.experiments.roadside.ranges import SHARED, LidarModel, SensorRanges
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
-from flcav.pipeline.provenance import provenance
+from flcav.runs.provenance import provenance
 from flcav.sensors.rig import RIGS, Rig
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import load_town

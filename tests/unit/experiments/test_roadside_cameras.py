@@ -20,7 +20,7 @@ from flcav.experiments.roadside.tables import fig4_tables
 from flcav.fusion.association import PairedShot, Pairs
 from flcav.fusion.registration import Offset
 from flcav.geometry import Boxes
-from flcav.pipeline.provenance import provenance
+from flcav.runs.provenance import provenance
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
 NONE = np.zeros(0, np.int64)

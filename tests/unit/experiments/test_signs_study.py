@@ -8,7 +8,7 @@ from flcav.experiments.studies.run import SeedResult, StudyRecordings, StudyResu
 from flcav.experiments.studies.signs import STUDY, tables
 from flcav.perception.card import Card
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
-from flcav.pipeline.provenance import provenance
+from flcav.runs.provenance import provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.seeds import mean_over_seeds

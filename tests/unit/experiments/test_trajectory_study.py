@@ -11,7 +11,7 @@ from flcav.experiments.studies.trajectory import CAMERAS, STUDY, tables
 from flcav.perception.card import Card
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
-from flcav.pipeline.provenance import provenance
+from flcav.runs.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 
 

@@ -14,10 +14,10 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.recipe import CLOUD, Training
-from flcav.pipeline.steps.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.training.checkpoints import LAST, Checkpoint, FederationCheckpoints
-from flcav.pipeline.training.learning import Learning, Strategies, make_clients
+from flcav.runs.recipe import CLOUD, Training
+from flcav.runs.steps.cloud import CloudFederation, RegionStart, federate_cloud
+from flcav.runs.training.checkpoints import LAST, Checkpoint, FederationCheckpoints
+from flcav.runs.training.learning import Learning, Strategies, make_clients
 
 
 def test_divergence_is_the_mean_relative_distance_from_the_mean() -> None:

@@ -30,11 +30,11 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import quality, road_average
-from flcav.pipeline.labels.quality import measure_labels, read_history
-from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.results.training import Found
+from flcav.runs.frames import Frames
+from flcav.runs.labels import quality, road_average
+from flcav.runs.labels.quality import measure_labels, read_history
+from flcav.runs.labels.road_average import RoadAverageLabels
+from flcav.runs.results.training import Found
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.world.map.layers import MapLane, MapLayers
 
@@ -296,7 +296,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     def detections(network, frames, **how):
         return [seen_cars[len(frames[0].lidar["lidar"])]]
 
-    monkeypatch.setattr("flcav.pipeline.labels.sightings.detect_in", detections)
+    monkeypatch.setattr("flcav.runs.labels.sightings.detect_in", detections)
     truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     how, errors = Distillation(), NavigationErrors(position_m=0.05, heading_deg=0.1)

@@ -23,9 +23,9 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
-from flcav.pipeline.poles import Sites
-from flcav.pipeline.radio import driving as prediction
-from flcav.pipeline.radio.driving import (
+from flcav.runs.poles import Sites
+from flcav.runs.radio import driving as prediction
+from flcav.runs.radio.driving import (
     DrivenRounds,
     Fleet,
     drive_rounds,
@@ -34,7 +34,7 @@ from flcav.pipeline.radio.driving import (
     measure_uplinks,
     predict_air_s,
 )
-from flcav.pipeline.recipe import CLOUD, Stragglers, draw_stragglers
+from flcav.runs.recipe import CLOUD, Stragglers, draw_stragglers
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 MB = 1_000_000

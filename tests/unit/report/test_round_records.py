@@ -13,15 +13,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
-from flcav.pipeline.analysis.caveats import PLACED_BARE
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import LEDGER
-from flcav.pipeline.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
-from flcav.pipeline.training.checkpoints import Checkpoint
-from flcav.pipeline.training.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
+from flcav.runs.analysis.caveats import PLACED_BARE
+from flcav.runs.recipe import CLOUD, EDGE, MAIN
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import LEDGER
+from flcav.runs.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
+from flcav.runs.training.checkpoints import Checkpoint
+from flcav.runs.training.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 
 
 def entry(link: Link, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:

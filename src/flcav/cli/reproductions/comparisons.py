@@ -11,8 +11,8 @@ from flcav.cli.reproductions.targets import EXCHANGES, Target
 from flcav.cli.terminal import echo, when_interrupted
 
 if TYPE_CHECKING:
-    from flcav.pipeline.recipe import RunRecipe
-    from flcav.pipeline.results.run import Run
+    from flcav.runs.recipe import RunRecipe
+    from flcav.runs.results.run import Run
 
 IMPORTED = "quarter"  # map of the package, imported into the folder of the proof of placement
 
@@ -36,7 +36,7 @@ def _demo_arms(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName,
 def _fig6a_allocation(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale: Stale) -> None:
     from flcav.cli.steps import live_steps
     from flcav.experiments.fig6a.run import BUDGETS, budget_recipes, compare_plans, draw_allocation, plans_differ
-    from flcav.pipeline.running import run_several
+    from flcav.runs.running import run_several
     from flcav.storage.files import write_bytes, write_json
 
     recipe = _load_sized("allocation", scale)
@@ -70,7 +70,7 @@ def _gap(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName, stale
     from flcav.experiments.gap.megabytes import trace_bytes
     from flcav.experiments.gap.run import TOWN, compare_gap, draw_gap, draw_megabytes
     from flcav.experiments.scales import shrink_recipe
-    from flcav.pipeline.running import WORK
+    from flcav.runs.running import WORK
 
     recipe, runs = _run_seeds(Target.gap, "gap", out, seeds, scale, jobs, engine, stale, shrink_recipe)
     curves = [trace_bytes(run, out / f"seed{run.recipe.seed}" / WORK, TOWN) for run in runs]
@@ -118,7 +118,7 @@ def _placement(out: Path, seeds: int, scale: str, jobs: int, engine: EngineName,
     from flcav.experiments.placement.overlaps import describe_overlaps, list_overlaps
     from flcav.experiments.placement.run import draw_proof, list_regions, prove_placement
     from flcav.experiments.scales import shrink_recipe
-    from flcav.pipeline.running import WORK
+    from flcav.runs.running import WORK
 
     asked = _load_sized("placement", scale, shrink_recipe)
     import_map(IMPORTED, out)
@@ -155,7 +155,7 @@ def _corner_cases(out: Path, seeds: int, scale: str, jobs: int, engine: EngineNa
     from flcav.experiments.corner_cases.run import compare_corner_cases, draw_corner_cases
     from flcav.experiments.scales import shrink_recipe
     from flcav.interface import progress
-    from flcav.pipeline.running import WORK
+    from flcav.runs.running import WORK
 
     how: Any = (seeds, scale, jobs, engine, stale, shrink_recipe)
     recipe, runs = _run_seeds(Target.corner_cases, "corner_cases", out, *how)
@@ -208,7 +208,7 @@ def _run_seeds(
     Imported towns are looked for in `beside`.
     """
     from flcav.cli.steps import live_steps
-    from flcav.pipeline.running import run_seeds
+    from flcav.runs.running import run_seeds
 
     recipe = _load_sized(name, scale, shrink)
     with live_steps(target.value) as notify:
@@ -220,7 +220,7 @@ def _run_seeds(
 def _load_sized(name: str, scale: str, shrink: "Callable[[RunRecipe], RunRecipe] | None" = None) -> "RunRecipe":
     """Return the package's recipe `runs/<name>`; unless scale is paper, `shrink` of it (None: at the demo's size)."""
     from flcav.experiments.scales import use_demo_size
-    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.runs.recipe import load_run_recipe
     from flcav.sources.recipe import recipe_path
 
     recipe = load_run_recipe(recipe_path(f"runs/{name}"))

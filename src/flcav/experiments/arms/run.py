@@ -10,14 +10,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from flcav.config import Json
-from flcav.pipeline.analysis.findings import name_stage
-from flcav.pipeline.analysis.histories import gap_closed
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
-from flcav.pipeline.results.plans import Pole
-from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.runs.analysis.findings import name_stage
+from flcav.runs.analysis.histories import gap_closed
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.runs.results.plans import Pole
+from flcav.runs.results.run import Run
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Judged, judge_means

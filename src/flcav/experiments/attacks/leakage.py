@@ -38,9 +38,9 @@ from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.federation.leakage import draw_leakage
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record

@@ -25,9 +25,9 @@ from flcav.federation.strategies.median import Median
 from flcav.federation.strategies.trimmed_mean import TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.interface.progress import Report, ignore_progress
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.federation.withstood import draw_withstood
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.storage.records import Record

@@ -9,13 +9,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from flcav.config import Json
-from flcav.pipeline.analysis.histories import gap_closed
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.training import LabelQuality
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.runs.analysis.histories import gap_closed
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.results.training import LabelQuality
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means
 from flcav.storage.records import Record

@@ -1,6 +1,6 @@
 """Seconds of the rounds of an arm: its messages on the radio links of the region's recorded training drives.
 
-Round n of a region is driven in the n-th scene of its training data, as in `flcav.pipeline.radio.driving`. The
+Round n of a region is driven in the n-th scene of its training data, as in `flcav.runs.radio.driving`. The
 ledger says what each vehicle sent and received in the round, so that every arm has seconds, also one whose federation
 knew of no network. Training takes no time here: the arms train alike.
 """
@@ -14,11 +14,11 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_clients
 from flcav.network.clock.work import ClientWork, work_of_messages
 from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.links import RadioLinks
-from flcav.pipeline.arms import name_steps
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.radio.driving import link_scenes
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
-from flcav.pipeline.results.plans import Placed
+from flcav.runs.arms import name_steps
+from flcav.runs.frames import Frames
+from flcav.runs.radio.driving import link_scenes
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe
+from flcav.runs.results.plans import Placed
 
 
 def link_regions(recipe: RunRecipe, task: str, work: Path, rounds: int) -> dict[str, list[RadioLinks]]:

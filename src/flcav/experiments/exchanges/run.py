@@ -20,12 +20,12 @@ from flcav.experiments.cloud_rounds import span_divergence
 from flcav.experiments.exchanges.clock import link_regions, mean_round_s
 from flcav.federation.divergence import RoundDivergence
 from flcav.network.ledger import Ledger
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import WORK
 from flcav.report import style
 from flcav.report.charts.federation.exchanges import Mark, draw_exchanges
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.running import WORK
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Judged, judge_means
 from flcav.storage.records import LEFT_OUT, Record

@@ -18,10 +18,10 @@ from flcav.optimization.curves.fitting import Fit, fit_additive
 from flcav.optimization.curves.history import History, article_histories
 from flcav.optimization.curves.levels import level_seeds
 from flcav.optimization.graph import Layers, build_graph
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.tables import load_history
 from flcav.report import style
 from flcav.report.charts import curves as curve_charts
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.tables import load_history
 from flcav.storage.records import Record
 
 Array = NDArray[np.float64]

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 
 from flcav.experiments.fig6a.results import EQUAL, JOINT, MEAN, AllocationSeed, AtBudgets, PlanFinding
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN
+from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds

@@ -4,8 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from flcav.config import Json
-from flcav.pipeline.provenance import Provenance
-from flcav.pipeline.results.run import LinkUse
+from flcav.runs.provenance import Provenance
+from flcav.runs.results.run import LinkUse
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.records import Record

@@ -26,12 +26,12 @@ from flcav.experiments.fig6a.results import (
     Planned,
     StageAP,
 )
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.tables import load_history
 from flcav.report import style
 from flcav.report.charts import plans
+from flcav.runs.provenance import provenance
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.tables import load_history
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.seeds import mean_over_seeds
 

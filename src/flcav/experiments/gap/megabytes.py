@@ -15,11 +15,11 @@ from flcav.network.ledger import BYTES_PER_MB, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import load_network
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CENTRAL, EDGE, MAIN, MORE_EDGE, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import LEDGER, WEIGHTS
-from flcav.pipeline.training.checkpoints import load_round_network
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import CENTRAL, EDGE, MAIN, MORE_EDGE, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import LEDGER, WEIGHTS
+from flcav.runs.training.checkpoints import load_round_network
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 
 FEDERATED: Mapping[str, str] = {"edge FL on tracks": MAIN, "edge FL on ground truth": "truth"}  # by name: arm

@@ -1,7 +1,7 @@
 """Groups on request against a fixed roster: accuracy by megabytes of uplink, at equal megabytes and after the plan.
 
 Ten vehicles drive with a network that knows six of eight weathers. In one setting all of them meet the other two, in
-the other three do. A group is called as in stage II of a run (`flcav.pipeline.training.groups`): who errs asks, all
+the other three do. A group is called as in stage II of a run (`flcav.runs.training.groups`): who errs asks, all
 offer, the lead chooses by their data, and the group dissolves when its loss on held-back pictures has levelled off.
 """
 
@@ -33,11 +33,11 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
 from flcav.network.messages import pack, send
 from flcav.perception.weather.task import WEATHER
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import EDGE, Requests
-from flcav.pipeline.training.groups import Levelled, choose_members, has_levelled, weigh_offers
 from flcav.report import style
 from flcav.report.charts.federation.groups import draw_by_megabytes
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import EDGE, Requests
+from flcav.runs.training.groups import Levelled, choose_members, has_levelled, weigh_offers
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.storage.records import Record
 

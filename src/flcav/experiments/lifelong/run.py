@@ -10,13 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from flcav.config import Json
-from flcav.pipeline.lifelong import NOTHING, PLAIN, REPLAY
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results.lifelong import LifelongArm
-from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_conditions
+from flcav.runs.lifelong import NOTHING, PLAIN, REPLAY
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.results.lifelong import LifelongArm
+from flcav.runs.results.run import Run
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means
 from flcav.storage.records import Record

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from flcav.experiments.placement.records import Pair
-from flcav.pipeline.recipe import RunRecipe
+from flcav.runs.recipe import RunRecipe
 from flcav.world.map.town import load_town
 
 

@@ -20,8 +20,8 @@ from flcav.perception.errors import MISS, PerceptionError
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.pseudo_labels import road_views
+from flcav.runs.frames import Frames
+from flcav.runs.labels.pseudo_labels import road_views
 from flcav.world.line_of_sight import find_visible
 from flcav.world.map.town import Town
 from flcav.world.trace import Trace

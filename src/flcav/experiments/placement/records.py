@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Annotated
 
 from flcav.config import Json
-from flcav.pipeline.provenance import Provenance
+from flcav.runs.provenance import Provenance
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.records import LEFT_OUT, Record
 

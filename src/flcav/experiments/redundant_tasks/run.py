@@ -32,10 +32,10 @@ from flcav.experiments.redundant_tasks.scenarios import (
 from flcav.experiments.splits import record_split
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes, Times, Values
-from flcav.pipeline.engine import Notify, Step, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
+from flcav.runs.engine import Notify, Step, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.bootstrap import share_scenes
 from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream

@@ -24,9 +24,9 @@ from flcav.geometry import Boxes, inverse, wrap_angle, yaw_of
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.matching import assign_targets
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_errors
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream

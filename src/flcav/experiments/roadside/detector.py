@@ -21,9 +21,9 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import match
 from flcav.perception.objects.truth import CARS, LOOKALIKE
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_recall
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.bootstrap import bootstrap_over_scenes

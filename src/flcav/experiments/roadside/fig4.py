@@ -28,9 +28,9 @@ from flcav.perception.foreground import frame_reader, pole_backgrounds
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.truth import CARS
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.suites import Shown, draw_suites
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sensors.calibration import CalibrationError
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource

@@ -23,9 +23,9 @@ from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.model import CONFIGURATIONS
 from flcav.perception.objects.truth import choose_lidar, in_range, network_from_lidar
-from flcav.pipeline.frames import Frames, group_frames
-from flcav.pipeline.labels.pseudo_labels import Spin, road_views, select_frames_near
-from flcav.pipeline.poles import find_sites
+from flcav.runs.frames import Frames, group_frames
+from flcav.runs.labels.pseudo_labels import Spin, road_views, select_frames_near
+from flcav.runs.poles import find_sites
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 

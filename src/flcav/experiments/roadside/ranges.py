@@ -23,9 +23,9 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.foreground import frame_reader
 from flcav.perception.metrics.matching import assign_targets
 from flcav.perception.objects.predict import detect
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_ranges
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -20,9 +20,9 @@ from flcav.driving.measures import Drive
 from flcav.driving.scenarios import spread_scenarios
 from flcav.driving.studies.importance import paired_difference
 from flcav.interface.progress import Report, ignore_progress
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.safety import draw_trade_off
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.estimates import Estimate
 from flcav.storage.records import Record
 

@@ -39,11 +39,11 @@ from flcav.perception.objects.predict import (
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import CARS, FrameTruth, asked_of, choose_lidar, select_class
 from flcav.perception.ops.rotated import Kind
-from flcav.pipeline.engine import Notify, Step, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.clouds import CloudSeries, cloud_statistics
 from flcav.report.pictures.clouds import real_frame
+from flcav.runs.engine import Notify, Step, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.storage.records import LEFT_OUT, Class, Record
 
 RECIPE: dict[str, Any] = {  # of the simulated scenes

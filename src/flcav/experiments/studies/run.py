@@ -18,8 +18,8 @@ from flcav.perception.study import RecipeFields, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, Request, train_network
 from flcav.perception.weights import load_network
-from flcav.pipeline.engine import Notify, Step, Work, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
+from flcav.runs.engine import Notify, Step, Work, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim

@@ -5,8 +5,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from flcav.pipeline.results.lifelong import LifelongArm
 from flcav.report import style
+from flcav.runs.results.lifelong import LifelongArm
 from flcav.statistics.estimates import Estimate
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY)  # of conditions, in turn

@@ -14,21 +14,6 @@ from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
-from flcav.pipeline.analysis.caveats import PLACED_BARE
-from flcav.pipeline.analysis.costs import list_arm_costs, list_home_costs, tell_gain
-from flcav.pipeline.analysis.findings import WORDS
-from flcav.pipeline.arms import Names
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.radio.driving import CLOCK
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.run import ArmCost, LinkUse, Run
-from flcav.pipeline.results.saved import ERRORS
-from flcav.pipeline.results.tests import SweepComparison, SweepDetections
-from flcav.pipeline.results.training import TOGETHER
-from flcav.pipeline.running import WORK
-from flcav.pipeline.steps.testing import LOOK
-from flcav.pipeline.training.records import list_rounds
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.charts.lifelong import draw_rounds
@@ -36,6 +21,21 @@ from flcav.report.charts.runs import STAGES, Row
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
+from flcav.runs.analysis.caveats import PLACED_BARE
+from flcav.runs.analysis.costs import list_arm_costs, list_home_costs, tell_gain
+from flcav.runs.analysis.findings import WORDS
+from flcav.runs.arms import Names
+from flcav.runs.frames import Frames
+from flcav.runs.radio.driving import CLOCK
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.run import ArmCost, LinkUse, Run
+from flcav.runs.results.saved import ERRORS
+from flcav.runs.results.tests import SweepComparison, SweepDetections
+from flcav.runs.results.training import TOGETHER
+from flcav.runs.running import WORK
+from flcav.runs.steps.testing import LOOK
+from flcav.runs.training.records import list_rounds
 from flcav.storage.files import write_bytes
 
 CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))

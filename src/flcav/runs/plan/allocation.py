@@ -1,0 +1,190 @@
+"""Allocation of both uplink budgets to the samples and rounds of all tasks, by learning curves of earlier runs."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from flcav.config import InputError, parse_config
+from flcav.interface.wording import plural
+from flcav.network.ledger import LinkMegabytes
+from flcav.network.plan import MessageSizes, StagePlan, price
+from flcav.optimization.allocation.allocate import TaskAllocation
+from flcav.optimization.allocation.baselines import baseline
+from flcav.optimization.allocation.fleet import allocate_fleet
+from flcav.optimization.allocation.vehicles import Shares
+from flcav.optimization.curves.fitting import fit
+from flcav.optimization.curves.history import History
+from flcav.optimization.problem import Problem
+from flcav.optimization.solvers.branches import call_vehicles
+from flcav.runs.arms import PlanRule
+from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, PlanLimits
+from flcav.runs.results.plans import Plan, TaskPlan
+
+
+@dataclass(frozen=True)
+class PlanRequest:
+    """One task as the planner sees it: weight, message sizes, and its learning history or fixed plan."""
+
+    name: str
+    weight: float
+    sizes: MessageSizes
+    pool: int  # samples available for upload
+    history: History | None  # None: the plan is fixed
+    fixed: FixedPlan | None
+    train_s: float = 0.0  # time that a vehicle trains in one round [s]
+    air_s: Mapping[str, float] = field(default_factory=dict)  # time of a round's messages on the air [s], by region
+
+
+@dataclass(frozen=True)
+class PlanSettings:
+    """Budgets, bounds and topology of the federation, common to the plans of all tasks."""
+
+    budgets_mb: LinkMegabytes
+    headroom: float
+    limits: PlanLimits
+    edge_groups: tuple[int, ...]  # vehicles of each edge server
+    edge_rounds_per_cloud_round: int
+    group_samples: tuple[int, ...] = ()  # samples that the vehicles of each edge server hold, of each task
+    horizon_s: float | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
+    speeds: Mapping[str, float] = field(default_factory=dict)  # of every vehicle, in the order of the edge servers
+    called: tuple[int, int] | None = None  # least and most vehicles of a group on request; None: the plan calls nobody
+    overlap: float = 0.0  # share of a further vehicle's data that those called before it have
+
+    def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
+        """Return the transfers of a task with these counts."""
+        return StagePlan(samples, edge_rounds, cloud_rounds, self.edge_groups, self.edge_rounds_per_cloud_round)
+
+
+def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRule) -> tuple[Plan, Problem | None]:
+    """Return the plan of all tasks, and the allocation problem that was solved for those without a fixed plan.
+
+    Fixed plans are paid first; the problem is None where all are fixed. Raises `InputError` where the budgets do not
+    cover the fixed plans, `Infeasible` where the rest does not cover the lower bounds of the other tasks.
+    """
+    plans: dict[str, TaskPlan] = {}
+    left = np.array([frame.budgets_mb.wireless_mb, frame.budgets_mb.wireline_mb]) * (1 - frame.headroom)
+    for task in tasks:
+        if task.fixed is not None:
+            plans[task.name] = _fixed(task, task.fixed, frame)
+            left -= (plans[task.name].wireless_mb, plans[task.name].wireline_mb)
+    if (left < 0).any():
+        raise InputError(
+            f"budgets_mb: the fixed plans take {-left.min():.1f} MB more than "
+            f"{'wireless' if left[0] == left.min() else 'wireline'} carries with a headroom of {frame.headroom:.0%}"
+        )
+    learned = [task for task in tasks if task.history is not None]
+    problem = _problem(learned, frame, left) if learned else None
+    if problem is not None:
+        allotted, shares = (baseline(problem, rule).tasks, {}) if rule != "joint" else allocate_tasks(problem)
+        for task, own in zip(learned, allotted, strict=True):
+            plans[task.name] = make_task_plan(task.sizes, own, problem, shares)
+    return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
+
+
+def allocate_tasks(problem: Problem) -> tuple[Sequence[TaskAllocation], Shares]:
+    """Return the best plan and, of vehicles with names, each one's share of it."""
+    plan, shares = allocate_fleet(problem)
+    return plan.tasks, shares
+
+
+def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarray) -> Problem:
+    """Return the allocation problem, as `flcav allocate` reads it."""
+    wireless, wireline = budgets_mb.tolist()
+    values = {
+        "budgets_mb": {"wireless": wireless, "wireline": wireline},
+        "edge_rounds_per_cloud_round": frame.edge_rounds_per_cloud_round,
+        "horizon_s": frame.horizon_s,
+        "tasks": [_task(task, frame) for task in tasks],
+    }
+    problem = parse_config(Problem, values, "the run's allocation problem")
+    if frame.called is None:
+        return problem
+    least, most = (min(each, max(frame.edge_groups)) for each in frame.called)
+    narrowed = (call_vehicles(task, least, most, frame.edge_rounds_per_cloud_round) for task in problem.tasks)
+    return problem.model_copy(update={"tasks": tuple(narrowed)})
+
+
+def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
+    assert task.history is not None
+    k, all_ = frame.edge_rounds_per_cloud_round, max(frame.edge_groups)
+    found = fit(task.history, model=_choose_model(task.history, frame), group_samples=frame.group_samples, k=k)
+    least, most = frame.limits.samples
+    most = task.pool if most is None else min(most, task.pool)
+    measured = task.history.resources.max(axis=0)
+    edge, cloud = (
+        (low, max(low, int(reached)) if cap is None else cap)
+        for (low, cap), reached in zip((frame.limits.edge_rounds, frame.limits.cloud_rounds), measured[1:], strict=True)
+    )
+    return {
+        "name": task.name,
+        "weight": task.weight,
+        "sample_mb": task.sizes.sample_mb,
+        "model_mb": task.sizes.model_mb,
+        "exchange_mb": task.sizes.exchange_mb,
+        "labels_mb": task.sizes.labels_mb,
+        "edge_groups": list(frame.edge_groups),
+        "called": None if frame.called is None else [1, all_],
+        "worth": None if frame.called is None else [(1 - frame.overlap) ** number for number in range(all_)],
+        "limits": {
+            "samples": [min(least, most), most],
+            "edge_rounds": edge,
+            "cloud_rounds": cloud,
+        },
+        "train_s": task.train_s,
+        "vehicle_train_s": {
+            name: task.train_s / speed + task.air_s.get(name.rpartition("/")[0], 0.0)
+            for name, speed in frame.speeds.items()
+        },
+        "curve": found.curve.model_dump(),
+    }
+
+
+def _choose_model(history: History, frame: PlanSettings) -> Literal["best", "effective", "federated"]:
+    """Return the model of the learning curve: the best, or where the plan calls vehicles one that knows their data."""
+    if frame.called is None:
+        return "best"
+    several = len(frame.group_samples) > 1 and np.ptp(history.resources[:, 2]) > 0
+    return "federated" if several else "effective"
+
+
+def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan:
+    if fixed.samples > task.pool:
+        raise InputError(f"tasks.{task.name}.plan: {plural(fixed.samples, 'sample')}; the pools hold {task.pool}")
+    counts = (fixed.samples, fixed.edge_rounds, fixed.cloud_rounds)
+    cost = price(frame.stage_plan(*counts), task.sizes)
+    return _task_plan(counts, cost, task.sizes, None)
+
+
+def make_task_plan(sizes: MessageSizes, own: TaskAllocation, problem: Problem, shares: Shares) -> TaskPlan:
+    """Return the plan of a task by its allocation in `problem`: scores predicted after each stage, rounds to join."""
+    task = next(each for each in problem.tasks if each.name == own.name)
+    k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
+    curve = task.curve if own.called is None else call_vehicles(task, own.called, own.called, k).curve
+    spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
+    predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
+    joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
+    return _task_plan(counts, LinkMegabytes(own.wireless_mb, own.wireline_mb), sizes, predicted, joins, own.called)
+
+
+def _task_plan(
+    counts: tuple[int, int, int],
+    cost: LinkMegabytes,
+    sizes: MessageSizes,
+    predicted: Mapping[str, float] | None,
+    joins: Mapping[str, tuple[int, ...]] | None = None,
+    called: int | None = None,
+) -> TaskPlan:
+    return TaskPlan(
+        *counts,
+        wireless_mb=cost.wireless_mb,
+        wireline_mb=cost.wireline_mb,
+        sample_mb=sizes.sample_mb,
+        model_mb=sizes.model_mb,
+        predicted=predicted,
+        joins=joins,
+        exchange_mb=sizes.exchange_mb,
+        labels_mb=sizes.labels_mb,
+        called=called,
+    )

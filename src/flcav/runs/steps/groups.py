@@ -1,0 +1,284 @@
+"""Formation of a group in stage II: vehicles check the deployed network, send requests and offers, and are selected."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.config import InputError
+from flcav.federation.runtimes.embedded import update_bytes
+from flcav.federation.runtimes.link import NOTHING, UNREADABLE, Ask, open_questions
+from flcav.federation.runtimes.metered import Account
+from flcav.federation.trainable import Weights
+from flcav.network.ledger import Ledger
+from flcav.network.messages import send
+from flcav.perception.objects.samples import Sample
+from flcav.perception.outcomes import score_network
+from flcav.perception.task import Task
+from flcav.perception.weights import to_arrays
+from flcav.runs.engine import Work
+from flcav.runs.frames import Frames
+from flcav.runs.labels.roadside import label_roadside
+from flcav.runs.poles import find_sites
+from flcav.runs.radio.driving import link_scenes
+from flcav.runs.recipe import EDGE, Requests
+from flcav.runs.results.groups import Checked, Group, Term
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.training import Pretrained
+from flcav.runs.steps.settings import FederationSettings, RegionInputs
+from flcav.runs.training.fl_requests import answer_requests, take_requests
+from flcav.runs.training.groups import (
+    ABSENT,
+    NO_LINK,
+    SERVER_RANGE,
+    GroupWatch,
+    choose_members,
+    find_in_range,
+    find_lead,
+    read_losses,
+    weigh_offers,
+)
+from flcav.runs.training.learning import Learning, load_stage_network
+from flcav.runs.training.members import (
+    ASKS,
+    CHECK,
+    HELD,
+    LOSS,
+    MESSAGE,
+    OFFER,
+    REQUEST,
+    SCENE,
+    Member,
+    Offer,
+    Picked,
+    Unreadable,
+    hold_back,
+    read_position,
+)
+from flcav.statistics.streams import derive_seed
+
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.deployed import RegionalDeployment
+
+EVERY_SCENE = 10**6  # more than there are
+AnswerT = TypeVar("AnswerT")
+Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_places`
+
+
+@dataclass(frozen=True)
+class Called:
+    """A group that was called, or not, in a region."""
+
+    group: Group
+    samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
+    watch: GroupWatch
+    task: Task
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group
+
+    @property
+    def vehicles(self) -> list[str]:
+        """Return the members that are vehicles."""
+        return [*self.group.members]
+
+    def dissolve(self, folder: Path, before: Path, shown: Frames | None, most_rounds: int, ask: Ask) -> Group:
+        """Return the group after its rounds; members tell what the network in `folder` does on what they held back.
+
+        Of the frames `shown` its score is told beside that of the network in the folder `before`.
+        """
+        if not self.group.members:
+            return self.group
+        ended, scores = load_stage_network(self.task, folder), tuple[float, ...]()
+        reached = read_losses(self.watch.hear(ask, to_arrays(ended), counted=False))
+        if shown is not None:
+            networks = (load_stage_network(self.task, before), ended)
+            scores = tuple(score_network(self.task, each, shown.data, shown.vehicles) for each in networks)
+        vehicles = {name: replace(each, after=reached.get(name)) for name, each in self.group.vehicles.items()}
+        over = "the loss has levelled off" if self.watch.over else "the plan's rounds are over"
+        losses = tuple(self.watch.losses)
+        led = tuple(term for term in self.terms if term.first < len(losses) or term.first == 1)
+        about: Any = {"losses": losses, "most_rounds": most_rounds, "dissolved": over, "terms": led, "scores": scores}
+        return replace(self.group, vehicles=vehicles, **about)
+
+
+def call_group(
+    work: Work,
+    settings: FederationSettings,
+    inputs: RegionInputs,
+    how: Requests,
+    samples: Mapping[str, Sequence[Any]],
+    book: Ledger,
+    most: int | None = None,
+    poles: Sequence[int] = (),
+    deployed: "RegionalDeployment | None" = None,
+) -> Called:
+    """Return the group that a region's vehicles form, `most` of them by the plan; requests and offers enter `book`.
+
+    Units on the `poles` join, if `how` says so, that are in range of one that asked; what they send crosses no radio.
+    Vehicles that are `deployed` answer there, and those whose FL requests wait in their fleet have asked.
+
+    Who asks is there when the vehicle that errs most is first there. Raises `InputError` where pretraining has no loss,
+    and `BudgetExceeded`.
+    """
+    learning = settings.learning.resolve()
+    task, frozen = learning.task, load_stage_network(learning.task, work.inputs[inputs.pretrain])
+    validated = Pretrained.load(work.inputs[inputs.pretrain]).validated
+    if not validated:
+        raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
+    limit, split = how.excess * validated[-1].loss, Frames.open(work.inputs[inputs.frames])
+    places = find_places(split, inputs.region, [name for name in sorted(samples) if len(samples[name])])
+    members = make_members(learning, frozen, how, limit, samples, places)
+    with open_questions(members, deployed, Account(book, EDGE, task.name, "wireless")) as ask:
+        uplink, entered = Uplink(ask, book, task.name), len(book.entries)
+        vehicles = uplink.check([*members])
+        taken = take_requests(deployed, work.folder, [*members], task.name)
+        before = {name: own for name, own in taken.read().items() if name in vehicles}
+        vehicles |= {name: replace(vehicles[name], asks=True, told=own.loss) for name, own in before.items()}
+        asked = sorted((name for name, own in vehicles.items() if own.asks), key=lambda name: -vehicles[name].error)
+        if not asked:
+            return Called(Group(limit, vehicles, "", stayed=uplink.silent), {}, GroupWatch(how, {}), task)
+        scene = int(np.flatnonzero(np.isfinite(places[asked[0]]).all(axis=1))[0])
+        positions = {name: places[name][scene] for name in vehicles if np.isfinite(places[name][scene]).all()}
+        for name, own in before.items():
+            uplink.enter(name, *(message.encode() for message in taken.messages[name]))
+            positions[name] = np.array([own.x, own.y, positions[name][2] if name in positions else 0.0])
+        asking = [name for name in vehicles if name in asked and name in positions and name not in before]
+        positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
+        present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
+        if not present:
+            return Called(Group(limit, vehicles, "nobody", stayed=uplink.silent), {}, GroupWatch(how, {}), task)
+        placed = Placed.load(work.inputs[inputs.place])
+        lead = find_lead(positions, present, find_servers(split, placed, inputs), how.range_m)
+        near = find_in_range(positions, present, how.range_m)
+        linked = find_linked(settings, learning, split, placed, scene, inputs.region, near, how.link_s)
+        offers = uplink.hear(OFFER, linked, Offer.read)
+    stayed = {name: ABSENT for name in vehicles if name not in positions}
+    stayed |= {name: SERVER_RANGE for name in positions if name not in near}
+    stayed |= {name: NO_LINK for name in near if name not in linked}
+    stayed |= uplink.silent
+    if not offers:
+        return Called(Group(limit, vehicles, lead, stayed=stayed), {}, GroupWatch(how, {}), task)
+    chosen = choose_members(how, [name for name in asked if name in offers], weigh_offers(offers), stayed, most)
+    answer_requests(deployed, taken, chosen.members)
+    held = {name: members[name] for name in chosen.members if len(members[name].held)}
+    watch = GroupWatch(how, held, [float(np.mean([vehicles[name].before for name in held])) if held else 0.0])
+    sent = sum(entry.bytes for entry in book.entries[entered:] if entry.direction == "up")
+    units: dict[str, list[Sample]] = {}
+    if how.roadside:
+        there = find_units(split, inputs, poles, positions, present, how.range_m)
+        spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in split.vehicles}
+        units = label_roadside(split, there, spins, frozen.config, inputs.region)
+    group = Group(limit, vehicles, lead, chosen.members, chosen.quality, chosen.stayed, sent, roadside=tuple(units))
+    return Called(group, {name: members[name].data for name in chosen.members} | units, watch, task)
+
+
+def make_members(
+    learning: Learning, network: Any, how: Requests, limit: float, samples: Mapping[str, Sequence[Any]], places: Places
+) -> dict[str, Member]:
+    """Return the vehicles' parts in a group: each holds some of its samples back, and trains on the others."""
+    weights, seed, members = to_arrays(network), derive_seed(learning.seed, "offer"), dict[str, Member]()
+    for name, at in places.items():
+        trained, held = (Picked(samples[name], own) for own in hold_back(len(samples[name]), how.held_back))
+        about = learning.task, network.config, learning.batch, trained, held, weights
+        members[name] = Member(*about, limit, seed, at)
+    return members
+
+
+@dataclass(frozen=True)
+class Uplink:
+    """Uplink of a region's vehicles before a group: what they are asked, and the messages that they send."""
+
+    ask: Ask
+    book: Ledger
+    task: str
+    silent: dict[str, str] = field(default_factory=dict)  # by client why nothing is heard of it
+
+    def check(self, clients: Sequence[str]) -> dict[str, Checked]:
+        """Return the checks of clients: they are for the record, and no messages on the radio."""
+        replies, found = self.ask(CHECK, clients, counted=False), dict[str, Checked]()
+        for name, answer in replies.answers.items():
+            told: Any = answer
+            try:
+                found[name] = Checked(int(told[HELD][0]), float(told[LOSS][0]), asks=bool(told[ASKS][0]))
+            except (KeyError, IndexError, TypeError, ValueError) as error:
+                self.silent[name] = f"{UNREADABLE}: {error}"
+        self.silent.update(replies.missing)
+        return found
+
+    def hear(
+        self, question: str, clients: Sequence[str], read: Callable[[bytes], AnswerT], arrays: Weights = NOTHING
+    ) -> dict[str, AnswerT]:
+        """Return what `read` makes of the clients' messages, which enter the ledger."""
+        replies, found = self.ask(question, clients, arrays), dict[str, AnswerT]()
+        for name, answer in replies.answers.items():
+            message = answer.get(MESSAGE, np.zeros(0, np.uint8)).tobytes()
+            self.enter(name, message)
+            try:
+                found[name] = read(message)
+            except Unreadable as error:
+                self.silent[name] = f"{UNREADABLE}: {error}"
+        self.silent.update(replies.missing)
+        return found
+
+    def enter(self, client: str, *messages: bytes) -> None:
+        """Enter a client's messages; raises `BudgetExceeded`."""
+        for message in messages:
+            send(self.book, message, stage=EDGE, task=self.task, link="wireless", direction="up", client=client)
+
+
+def find_units(
+    split: Frames,
+    inputs: RegionInputs,
+    poles: Sequence[int],
+    positions: Mapping[str, NDArray[np.float64]],
+    asked: Sequence[str],
+    range_m: float,
+) -> list[int]:
+    """Return those of the poles that are in range of one that asked."""
+    sites = find_sites(split, split if inputs.recorded else None)
+    places = {f"pole{n}": at for n, at in zip(sites.number.tolist(), sites.position, strict=True) if n in poles}
+    near = find_in_range({**positions, **places}, asked, range_m)
+    return [pole for pole in poles if f"pole{pole}" in near]
+
+
+def find_places(split: Frames, region: str, clients: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+    """Return where (scenes, 3) [m] each client is when it is first in each scene of a split; NaN where it is not."""
+    keys = split.data.keys
+    scenes = {scene: number for number, scene in enumerate(dict.fromkeys(keys[i].scene for i in split.vehicles))}
+    found = {name: np.full((len(scenes), 3), np.nan) for name in clients}
+    for i in split.vehicles:
+        name, scene = f"{region}/{keys[i].agent}", scenes[keys[i].scene]
+        if name in found and np.isnan(found[name][scene, 0]):
+            found[name][scene] = split.data.world_from_agent(i)[:3, 3]
+    return found
+
+
+def find_servers(split: Frames, placed: Placed, inputs: RegionInputs) -> dict[str, NDArray[np.float64]]:
+    """Return the positions (3,) [m] of the units on the poles with sensors, or on the one with most traffic."""
+    if not placed.poles:
+        return {}
+    sites, poles = find_sites(split, split if inputs.recorded else None), placed.chosen or (placed.densest,)
+    pairs = zip(sites.number.tolist(), sites.position, strict=True)
+    return {f"pole{number}": position for number, position in pairs if number in poles}
+
+
+def find_linked(
+    settings: FederationSettings,
+    learning: Learning,
+    split: Frames,
+    placed: Placed,
+    scene: int,
+    region: str,
+    clients: Sequence[str],
+    most_s: float,
+) -> list[str]:
+    """Return the clients whose update, alone on the air, takes so many seconds at most; all without a network."""
+    network = settings.federation.network
+    if network is None:
+        return [*clients]
+    links = link_scenes(split, placed, network, EVERY_SCENE, learning.seed)[scene]
+    bits = 8 * update_bytes(to_arrays(learning.build_network()), settings.federation.upload)
+    rates = dict(zip(links.vehicle, links.rate_bps[0].max(axis=1).tolist(), strict=True))
+    return [name for name in clients if bits <= most_s * rates.get(name.removeprefix(f"{region}/"), 0.0)]

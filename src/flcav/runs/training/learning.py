@@ -1,0 +1,93 @@
+"""Settings of a task's training in a run, the clients of its federations, and the networks that stages end with."""
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from flcav.federation.rounds import Schedule
+from flcav.federation.rules import Rules
+from flcav.federation.strategies import Strategy
+from flcav.federation.trainable import Weights
+from flcav.perception.client import TaskClient
+from flcav.perception.distillation import OutputClient, SharedSamples
+from flcav.perception.task import Task, build_network, find_configuration
+from flcav.perception.weights import load_network
+from flcav.runs.recipe import Training
+from flcav.runs.results.saved import WEIGHTS
+from flcav.statistics.streams import derive_seed
+
+
+@dataclass(frozen=True)
+class Learning:
+    """Settings of a task's training in a run: network configuration, schedule, and seed."""
+
+    task: Task
+    network: str | None  # name of the configuration
+    training: Training
+    seed: int
+
+    @property
+    def batch(self) -> int:
+        """Return the batch size: samples of an optimiser step."""
+        return self.training.batch or self.task.practice.batch
+
+    @property
+    def config(self) -> Any:
+        """Return the network's configuration."""
+        return find_configuration(self.task, self.network)
+
+    def build_network(self) -> Any:
+        """Return a network with initial weights drawn from the seed."""
+        return build_network(self.task, self.config, self.seed)
+
+    def schedule(
+        self, rounds: int, steps: int, *names: str, earlier: int = 0, restart: float | None = None
+    ) -> Schedule:
+        """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream.
+
+        The learning rate falls over the first rounds after pretraining; where there were `earlier` ones, it stays at
+        its end. Restarted, at `restart`, it loses what the earlier rounds reached: reproductions/runs/retraining.
+        """
+        rate, training = self.task.practice.learning_rate, self.training
+        first = restart or (training.final_rate if earlier else training.local_rate)
+        return Schedule(rounds, steps, first * rate, training.final_rate * rate, derive_seed(self.seed, *names))
+
+
+def regional_weights(region: str) -> str:
+    """Return the name of the file of a region's own model, of a stage III with personal arrays."""
+    return f"weights-{region}.safetensors"
+
+
+def load_stage_network(task: Task, folder: Path, region: str | None = None) -> Any:
+    """Return the trained network of the stage in `folder`; with a `region` its own model."""
+    return load_network(task, folder / (WEIGHTS if region is None else regional_weights(region)))
+
+
+@dataclass(frozen=True)
+class Strategies:
+    """Strategies of stage III: of edge servers with their vehicles, and of the cloud with edge servers."""
+
+    edge: Strategy
+    cloud: Strategy
+
+
+def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence[Any]]) -> dict[str, TaskClient]:
+    """Return a federation's clients by vehicle; vehicles without samples are left out."""
+    return {
+        name: TaskClient(learning.task, config, samples[name], batch=learning.batch)
+        for name in sorted(samples)
+        if len(samples[name])
+    }
+
+
+def give_outputs(clients: Mapping[str, TaskClient], shared: SharedSamples, start: Weights) -> dict[str, OutputClient]:
+    """Return clients that send outputs on `shared` samples, and begin with a network of the weights `start`."""
+    return {name: OutputClient(client, shared, start) for name, client in clients.items()}
+
+
+def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
+    """Return strategies and rules, as far as they are not the defaults, in words: what a checkpoint is of."""
+    changed = rules.model_dump(mode="json", include=set(Rules.model_fields), exclude_defaults=True)
+    return f"{strategy} by {json.dumps(changed)}" if changed else str(strategy)
