@@ -22,8 +22,8 @@ from flcav.runs.engine import Work
 from flcav.runs.frames import Frames, list_window
 from flcav.runs.labels.tracks import WINDOW_S, load_tracks
 from flcav.runs.results.run import Run
-from flcav.runs.steps.graph import Graph
-from flcav.runs.steps.tracking import TrackSettings, track_step
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.tracking import TrackSettings, track_step
 from flcav.runs.training.learning import load_stage_network
 
 BOUND_S, BOUND_MB = 120, 1000

@@ -22,7 +22,7 @@ from flcav.runs.frames import Frames
 from flcav.runs.labels.quality import RETURNS
 from flcav.runs.labels.tracks import load_tracks
 from flcav.runs.results.training import Pretrained
-from flcav.runs.steps.regions import load_stage_network
+from flcav.runs.stages.regions import load_stage_network
 from flcav.storage.markdown import format_table
 
 OVERLAP, TOUCH = 0.5, 0.1  # IoU in 3D of a right label, and of a track that has to do with an object

@@ -31,7 +31,7 @@ from flcav.runs.engine.workers import perform
 from flcav.runs.provenance import provenance
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, load_run_recipe
 from flcav.runs.results.saved import LEDGER, RESULT, WEIGHTS
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.streams import stream
 from flcav.storage.files import sha256
 

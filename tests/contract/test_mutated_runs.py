@@ -9,7 +9,7 @@ from mutations import mutate
 
 from flcav.config import InputError
 from flcav.runs.recipe import load_run_recipe
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 
 TOY = Path(__file__).parents[1] / "integration" / "toy.yaml"
 

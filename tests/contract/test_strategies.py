@@ -28,7 +28,7 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.runs.engine import Step
 from flcav.runs.recipe import Federation, load_run_recipe
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.sources.recipe import recipe_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "06_bring_your_own_strategy.py"

@@ -7,7 +7,7 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import LedgerEntry
 from flcav.runs.engine import Work
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 
 
 def perform(recipe: RunRecipe, made: Path, out: Path, names: Sequence[str]) -> None:

@@ -18,7 +18,7 @@ from flcav.runs.labels.sightings import draw_clock_offset, navigate
 from flcav.runs.labels.tracks import load_tracks
 from flcav.runs.recipe import EDGE, MAIN, RunRecipe
 from flcav.runs.running import run
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 
 pytestmark = pytest.mark.slow
 

@@ -7,8 +7,8 @@ import yaml
 
 from flcav.network.ledger import Ledger
 from flcav.runs.alone import federate_regions
+from flcav.runs.extras.groups.rows import Term
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.results.groups import Term
 
 DOCS = Path(__file__).parents[2] / "docs" / "groups.md"
 

@@ -45,7 +45,7 @@ from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.results.tests import Difference
 from flcav.runs.results.training import Pretrained, StageResult
 from flcav.runs.running import RESULTS, run
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.runs.tables import parse_history
 from flcav.statistics.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town

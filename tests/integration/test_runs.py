@@ -24,7 +24,7 @@ from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import Run, Summary
 from flcav.runs.results.training import StageResult, Watched
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town
 

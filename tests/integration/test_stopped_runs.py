@@ -21,7 +21,7 @@ from flcav.runs.comparing import compare
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, load_run_recipe
 from flcav.runs.results.training import Pretrained
 from flcav.runs.running import run
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.verdicts import UNDECIDED
 
 pytestmark = pytest.mark.slow

@@ -86,7 +86,7 @@ def _describe(result: "StageResult") -> str:
     told += f", {sum(seconds):.1f} s on the network" if seconds else ""
     rest = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
     told = ", ".join([told, *filter(None, rest)])
-    return told if result.group is None else f"{told}; {result.group.describe()}"
+    return "; ".join([told, *result.describe_rows().values()])
 
 
 def _telling(notify: "Notify") -> "Notify":

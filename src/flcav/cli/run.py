@@ -150,8 +150,8 @@ def _tell(results: "list[Run]", summary: "Summary | None") -> None:
         for name, arm in results[0].arms.items():
             if arm.privacy is not None:
                 echo(f"{name}, {TOGETHER}: {arm.privacy.describe()}")
-        for arm in results[0].lifelong or ():
-            echo(f"lifelong, {arm.task}, {arm.describe()}")
+        for row in results[0].describe_rows():
+            echo(row)
         if PLACED_BARE in results[0].caveats:
             echo(f"privacy: {PLACED_BARE}")
         return

@@ -21,9 +21,9 @@ from flcav.runs.recipe import EDGE, MAIN, RunRecipe
 from flcav.runs.results.saved import WEIGHTS, Saved
 from flcav.runs.results.training import PrivacySpent, ScoredRound, StageResult, Watched
 from flcav.runs.rigs import tell_rigs
-from flcav.runs.steps.edge import EdgeSettings, edge_step
-from flcav.runs.steps.graph import Graph
-from flcav.runs.steps.settings import make_step
+from flcav.runs.stages.federating import EdgeSettings, federate_step
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.settings import make_step
 from flcav.runs.training.checkpoints import LAST, LOSS, Checkpoint
 from flcav.runs.training.private_rounds import PrivateTraining, compose_trainings, count_private_rounds
 from flcav.runs.training.timing import TrainTimes, read_times, summarise_times
@@ -153,7 +153,7 @@ def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapp
     frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
     name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
     asked: EdgeSettings = edge.arguments["settings"]
-    scored = make_step(name, edge_step, asked.model_copy(update={"validation": frames}))
+    scored = make_step(name, federate_step, asked.model_copy(update={"validation": frames}))
     return replace(scored, means=means)
 
 

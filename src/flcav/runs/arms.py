@@ -34,6 +34,7 @@ from flcav.runs.recipe import (
     RunRecipe,
     Training,
 )
+from flcav.runs.registry import ARM_CHECKS, CALLS, load_all
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan", "calls")  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
@@ -135,7 +136,7 @@ def name_repeat(arm: str, repeat: int) -> str:
 def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: int, arm: Arm) -> Setting:
     learned = _learns(recipe, arm.plan)
     federation = Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation))
-    calls = _find_calls(recipe, federation) if learned else None
+    calls = find_calls(recipe, federation) if learned else None
     return Setting(
         name,
         repeat,
@@ -155,16 +156,13 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.uploads,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
-        learned and recipe.replan != "none" and calls == _find_calls(recipe, recipe.federation),
+        learned and recipe.replan != "none" and calls == find_calls(recipe, recipe.federation),
     )
 
 
-def _find_calls(recipe: RunRecipe, how: Federation) -> Calls | None:
-    """Return what a plan chooses the vehicles of a group on request from; None for a fixed roster."""
-    if how.requests is None:
-        return None
-    most = how.requests.most or max(map(recipe.vehicles, recipe.with_role("federate")))
-    return Calls(1, most, how.requests.overlap)
+def find_calls(recipe: RunRecipe, how: Federation) -> Calls | None:
+    """Return the numbers of vehicles that a plan chooses from; None where all of a region take part."""
+    return next((found for find in load_all(CALLS) if (found := find(recipe, how)) is not None), None)
 
 
 def _learns(recipe: RunRecipe, rule: PlanRule) -> bool:
@@ -212,11 +210,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     how = setting.federation
     edge, cloud = find_strategies(how)
     selection, privacy = how.selection, how.privacy
-    if isinstance(edge, FedBuff) and setting.central is None:
-        _check_buffers(recipe, setting)
-    lifelong = recipe.lifelong is not None and setting.name == MAIN
-    if (how.requests is not None or lifelong) and setting.central is None:
-        _check_requests(recipe, setting, edge)
+    for check in load_all(ARM_CHECKS) if setting.central is None else ():
+        check(recipe, setting, edge)
     if how.network is not None and selection.rule == "importance":
         raise InputError("federation.network: importance selection draws the clients after they have trained")
     if how.network is not None and selection.unbiased:
@@ -277,7 +272,7 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
         )
     if predicted:
         why, instead = "federation.network: a predicted deadline leaves other numbers of vehicles to its rounds", ""
-    elif how.selection.rule == "all" and _plans_joiners(recipe, setting):
+    elif how.selection.rule == "all" and plans_joiners(recipe, setting):
         why = "horizon_s: a plan by speeds or the time of messages leaves other numbers of vehicles to its rounds"
         instead = "; choose another 'selection' than all, or leave out horizon_s"
         if how.secure is not None:
@@ -288,38 +283,6 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
         raise InputError(f"{why}, and noise is for one number{instead}")
     if needs_known_number(strategy):
         raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
-
-
-def _check_buffers(recipe: RunRecipe, setting: Setting) -> None:
-    """Raise `InputError` where an arm's rounds are buffers, and no clock is theirs, or something goes by rounds."""
-    if setting.federation.network is None:
-        raise InputError("strategy fedbuff: vehicles go on at their own pace, by the clock of 'federation.network'")
-    if _plans_joiners(recipe, setting):
-        raise InputError("strategy fedbuff: nobody joins rounds by a plan; leave out horizon_s")
-    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
-        raise InputError("strategy fedbuff: labels 'road-average' are made anew before a round that all begin together")
-
-
-def _check_requests(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where an arm's groups on request do not go with its strategy, rules or labels."""
-    how, told = setting.federation, "requests: how many vehicles a group has is not known before"
-    if isinstance(strategy, FedBuff | FedMD) or needs_known_number(strategy):
-        raise InputError(f"{told}, and {type(strategy).__name__} needs a known roster")
-    if how.selection.rule != "all" or how.least_clients is not None or how.secure is not None:
-        raise InputError(f"{told}; leave out 'selection', 'least_clients' and 'secure'")
-    if how.privacy is not None:
-        raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
-    if _plans_joiners(recipe, setting):
-        raise InputError("requests: nobody joins rounds by a plan; leave out horizon_s")
-    if how.requests is not None and how.requests.roadside:
-        for task, kind in setting.labels.items():
-            if not LABEL_SOURCES[kind].trained or LABEL_SOURCES[kind].averaged:
-                raise InputError(
-                    f"requests.roadside: units label by their trained detector, and the labels of '{task}' are "
-                    f"'{kind}'; choose 'road' or 'road+tracks'"
-                )
-    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
-        raise InputError("requests: vehicles check the network by labels of their own, not by those of 'road-average'")
 
 
 def _check_bare_labels(setting: Setting) -> None:
@@ -334,7 +297,7 @@ def _check_bare_labels(setting: Setting) -> None:
         )
 
 
-def _plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:
+def plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:
     """Return whether a plan says which vehicles join a round, as it does where it times each of them."""
     speeds = any(recipe.speeds(region) for region in recipe.with_role("federate"))
     timed = recipe.federation.network is not None or speeds

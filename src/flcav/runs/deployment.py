@@ -8,11 +8,8 @@ from flcav.config import InputError
 from flcav.federation.runtimes.link import check_deployable
 from flcav.runs.engine import Step
 from flcav.runs.label_sources import LABEL_SOURCES
-from flcav.runs.steps.cloud import cloud_step
-from flcav.runs.steps.edge import edge_step
-from flcav.runs.steps.graph import Graph
-
-FEDERATING = (edge_step, cloud_step)
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.settings import FederationSettings
 
 
 def check_clients(graph: Graph, arms: Iterable[str], runtime: str) -> None:
@@ -45,4 +42,8 @@ def deploy(graph: Graph, runtime: str, fleet: Path | None, engine: str = "proces
 
         RegionalDeployment(fleet, graph.vehicles)  # says now that it is not up
     where = {"runtime": runtime, "fleet": "" if fleet is None else str(fleet.absolute())}
-    return tuple(replace(step, means=where) if step.run in FEDERATING else step for step in graph.steps)
+    return tuple(replace(step, means=where) if _federates(step) else step for step in graph.steps)
+
+
+def _federates(step: Step) -> bool:
+    return isinstance(step.arguments["settings"], FederationSettings)

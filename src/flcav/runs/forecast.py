@@ -24,14 +24,14 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.runs.arms import Setting, check_federations
 from flcav.runs.frames import Frames, deal_frames, make_recording_recipe, record_frames
-from flcav.runs.lifelong import LEARNING, Lifelong
 from flcav.runs.plan.allocation import PlanRequest, make_plan
 from flcav.runs.plan.exchanges import measure_exchange
 from flcav.runs.plan.updates import model_mb
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
+from flcav.runs.registry import FORECASTS, load_all
 from flcav.runs.results.training import PrivacySpent
-from flcav.runs.steps.graph import Graph
-from flcav.runs.steps.planning import FirstPlanSettings, frame_plan
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.planning import FirstPlanSettings, frame_plan
 from flcav.runs.tables import parse_history
 from flcav.runs.training.learning import make_clients
 from flcav.runs.training.private_rounds import (
@@ -268,16 +268,5 @@ def _list_seconds(
                 rounds_done = {PRETRAIN: 0, EDGE: main.edge_rounds, CLOUD: main.cloud_rounds}.get(stage, 0)
                 trained = names.stage(MAIN, stage, region, task)
                 yield once(names.rounds(trained, region), (1 + rounds_done) * watched * own.test_s)
-        if recipe.lifelong is not None:
-            yield _count_lifelong_s(graph, recipe.lifelong, task, plans[MAIN][task].edge_rounds, own)
-
-
-def _count_lifelong_s(graph: Graph, lifelong: Lifelong, task: str, rounds: int, own: _Measured) -> float:
-    """Return the time of lifelong learning [s], if a group of all vehicles forms in every condition of both arms."""
-    size, steps = graph.recipe.sized_splits, graph.settings[MAIN].training[task].local_steps
-    count = len(lifelong.conditions)
-    trained = rounds * steps * sum(graph.vehicles[each] for each in lifelong.conditions)
-    tested = count**2 * size.test.scenes * size.test.spins * size.test.cavs
-    watched = size.validation.scenes * size.validation.spins * size.validation.cavs
-    watched *= (1 + rounds) * count * (count + 1) // 2
-    return len(LEARNING) * (trained * own.step_s + (tested + watched) * own.test_s)
+        for further in load_all(FORECASTS):
+            yield further(graph, task, plans[MAIN][task].edge_rounds, own.step_s, own.test_s)

@@ -17,7 +17,7 @@ from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
-from flcav.runs.lifelong import Lifelong
+from flcav.runs.registry import RECIPE_CHECKS, FederationFields, RecipeFields, load_all
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
@@ -135,27 +135,6 @@ def draw_stragglers(how: Stragglers, vehicles: Sequence[str], seed: int, region:
     """Return the speed of each straggler among a region's vehicles; others have 1."""
     drawn: list[int] = stream(seed, "stragglers", region).permutation(len(vehicles)).tolist()
     return {vehicles[number]: 1 / how.slower for number in sorted(drawn[: round(how.share * len(vehicles))])}
-
-
-class Requests(Config):
-    """Groups on request instead of a fixed roster, in stage II: who asks, who is called, and when a group dissolves."""
-
-    excess: float = Field(
-        default=1.5, gt=0, le=1000
-    )  # a vehicle asks whose loss on held-back frames is above so many times that at the end of pretraining
-    held_back: float = Field(default=0.25, gt=0, lt=1)  # share of its labelled frames that a vehicle does not train on
-    range_m: float = Field(default=300.0, gt=0, le=10_000)  # of V2X, between vehicles and from them to an edge server
-    most: int | None = Field(
-        default=None, ge=1, le=1000
-    )  # members at most, with those that ask; a plan by a history chooses from 1 to that many; default: all
-    overlap: float = Field(
-        default=0.0, ge=0, lt=1
-    )  # share of a further vehicle's data that those called before it have, in such a plan
-    least_quality: float = Field(default=0.5, ge=0, le=1)  # of a member's data, relative to the best that are offered
-    link_s: float = Field(default=10.0, gt=0)  # longest time of an update alone on the air, where there is a network
-    roadside: bool = False  # whether units on poles in range join, with what they see and their own detector's labels
-    patience: int = Field(default=2, ge=1, le=1000)  # rounds by which the loss on held-back frames has to fall
-    least_gain: float = Field(default=0.01, ge=0, lt=1)  # share of the loss that these have to gain
 
 
 class FixedPlan(Config):
@@ -279,8 +258,8 @@ class PlacementSettings(Config):
 StrategySpec = str | Mapping[str, Mapping[str, Any]]  # a name, or a name with settings
 
 
-class Federation(Rules):
-    """Settings of federated learning: strategies, and the rules of the vehicles' rounds."""
+class _Strategies(Rules):
+    """Strategies, and the rules of the vehicles' rounds."""
 
     strategy: StrategySpec = "fedavg"  # name, or {name: settings}; module:NAME of your own
     cloud_strategy: StrategySpec | None = (
@@ -296,7 +275,11 @@ class Federation(Rules):
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
-    requests: Requests | None = None  # stage II with groups on request; default: all vehicles of a region
+
+
+class Federation(FederationFields, _Strategies):
+    """Settings of federated learning: strategies, the rules of the vehicles' rounds, and those of extras."""
+
     cloud_topics: RosNamespace | None = None  # edge servers and cloud exchange parameters by ROS 2 topics below it
 
 
@@ -347,23 +330,8 @@ class Arm(Config):
         return stages
 
 
-class RunRecipe(Config):
-    """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
-
-    The seed determines traffic, sensor noise and initial weights. docs/runs.md describes every field. Raises pydantic's
-    `ValidationError` for a recipe that cannot be run; `load_run_recipe` raises `InputError` with one sentence instead.
-
-    >>> from flcav import RunRecipe
-    >>> recipe = RunRecipe.model_validate({
-    ...     "tasks": {"objects": {"history": "objects"}},
-    ...     "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
-    ...     "budgets_mb": {"wireless": 100, "wireline": 80},
-    ... })
-    >>> recipe.with_role("federate"), recipe.vehicles("grid"), recipe.placement.rule
-    (('grid',), 3, 'vrcsp')
-    """
-
-    document: ClassVar = "a run recipe"
+class _Scene(Config):
+    """What is run: tasks, regions, budgets, rules."""
 
     seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
     retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers
@@ -396,7 +364,26 @@ class RunRecipe(Config):
     )  # errors of vehicles' poses and clocks, in labels of tracks and road sensors; or "estimated"
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
-    lifelong: Lifelong | None = None  # conditions that come one after another; None: no lifelong learning
+
+
+class RunRecipe(RecipeFields, _Scene):
+    """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
+
+    The seed determines traffic, sensor noise and initial weights. docs/runs.md describes every field. Raises pydantic's
+    `ValidationError` for a recipe that cannot be run; `load_run_recipe` raises `InputError` with one sentence instead.
+
+    >>> from flcav import RunRecipe
+    >>> recipe = RunRecipe.model_validate({
+    ...     "tasks": {"objects": {"history": "objects"}},
+    ...     "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate", "vehicles": 3}},
+    ...     "budgets_mb": {"wireless": 100, "wireline": 80},
+    ... })
+    >>> recipe.with_role("federate"), recipe.vehicles("grid"), recipe.placement.rule
+    (('grid',), 3, 'vrcsp')
+    """
+
+    document: ClassVar = "a run recipe"
+
     primary_claims: tuple[str, ...] = Field(
         default=(), max_length=3
     )  # what the run is made to decide: edge, cloud, elsewhere, or arms by name; they are corrected apart from others
@@ -440,8 +427,8 @@ class RunRecipe(Config):
         )
         if replays and not all(task.pretrains for task in self.tasks.values()):
             raise ValueError("federation.replay: the cloud trains on samples of stage I, and a plan has none")
-        if self.lifelong is not None:
-            self._check_lifelong(self.lifelong)
+        for check in load_all(RECIPE_CHECKS):
+            check(self)
         if MAIN in self.arms:
             raise ValueError(f"arms: '{MAIN}' is the run itself; choose another name")
         for name, arm in self.arms.items():
@@ -454,26 +441,6 @@ class RunRecipe(Config):
                 f"placement.tasks: '{sorted(unknown)[0]}' is none of the run's tasks: {', '.join(self.tasks)}"
             )
         return self
-
-    def _check_lifelong(self, own: Lifelong) -> None:
-        federating = self.with_role("federate")
-        if odd := [each for each in own.conditions if each not in federating]:
-            raise ValueError(f"lifelong.conditions: '{odd[0]}' is none of {', '.join(federating)}")
-        if not all(task.pretrains for task in self.tasks.values()):
-            raise ValueError("lifelong: vehicles ask by the loss at the end of pretraining, and a plan has none")
-        try:
-            parse_config(Requests, self._name_requests(own), "lifelong.requests")
-        except InputError as error:
-            raise ValueError(str(error)) from None
-
-    def _name_requests(self, own: Lifelong) -> dict[str, Any]:
-        return (self.federation.requests or Requests()).model_dump() | dict(own.requests)
-
-    def lifelong_requests(self) -> Requests:
-        """Return the groups on request of lifelong learning; raises ValueError of a recipe without it."""
-        if self.lifelong is None:
-            raise ValueError("lifelong: the recipe has none")
-        return Requests.model_validate(self._name_requests(self.lifelong))
 
     def _check_arm(self, name: str, arm: Arm) -> None:
         if arm.central in (PRETRAIN, ALL) and not all(task.pretrains for task in self.tasks.values()):

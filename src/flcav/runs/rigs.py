@@ -13,7 +13,7 @@ from flcav.perception.tasks import task_named
 from flcav.runs.engine import Notify
 from flcav.runs.frames import make_recording_recipe
 from flcav.runs.recipe import SPLITS_OF
-from flcav.runs.steps.outline import Outline
+from flcav.runs.stages.outline import Outline
 
 RIG = "rig"  # reported in the place of a step
 

@@ -15,7 +15,7 @@ from flcav.runs.recipe import RunRecipe, load_run_recipe
 from flcav.runs.results.run import Run, Summary
 from flcav.runs.rigs import tell_rigs
 from flcav.runs.spread import list_spreads
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.runs.tables import append_records
 from flcav.runs.training.records import save_rounds
 

@@ -34,7 +34,7 @@ from flcav.runs.frames import group_frames
 from flcav.runs.recipe import EDGE, SPLITS_OF, RunRecipe
 from flcav.runs.results.plans import Plan
 from flcav.runs.results.saved import LEDGER
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.sensors.frame import Frame
 
 SCENES = 2

@@ -11,8 +11,8 @@ from flcav.experiments.lifelong.run import ARMS, LifelongResult, compare_lifelon
 from flcav.experiments.lifelong.tables import lifelong_tables
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_rounds
+from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
 from flcav.runs.recipe import load_run_recipe
-from flcav.runs.results.lifelong import LifelongArm, Passed
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/lifelong"))

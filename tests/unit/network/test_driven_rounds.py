@@ -368,7 +368,7 @@ def test_a_cloud_round_waits_for_the_slowest_region_and_the_wireline() -> None:
     grid = drive([made_links(TIMES, {"cav0": GOOD})], rounds=4)
     two = drive([made_links(TIMES, {"cav0": GOOD}), made_links(TIMES, {"cav0": GOOD, "cav2": GOOD})], rounds=4)
     settings = NetworkSettings(wireline=Wireline(rate_mbps=8.0, latency_s=0.5))
-    both = join_regions({"grid": grid, "ring": two}, 2, settings, 2 * MB)
+    both = join_regions({"grid": grid, "ring": two}, 2, 2 * settings.wireline.seconds(2 * MB))
     assert both.rules == grid.rules
     assert both.seconds[CLOUD] == pytest.approx([2 * 2.5 + 7 + 13] * 2)
     assert both.seconds["grid"] == pytest.approx([7.0] * 4)

@@ -15,11 +15,12 @@ from flcav.optimization.curves.history import History
 from flcav.optimization.problem import Problem
 from flcav.optimization.verification.allocation import verify_allocation
 from flcav.runs.arms import Names, resolve_settings
+from flcav.runs.extras.groups.choosing import choose_members
+from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan
 from flcav.runs.plan.replanning import remake_plan
-from flcav.runs.recipe import PlanLimits, Requests, RunRecipe
+from flcav.runs.recipe import PlanLimits, RunRecipe
 from flcav.runs.tables import parse_history, read_history
-from flcav.runs.training.groups import choose_members
 
 SIZES = MessageSizes(sample_mb=0.4, model_mb=1.4)
 LIMITS = PlanLimits(edge_rounds=(1, 12), cloud_rounds=(0, 6))

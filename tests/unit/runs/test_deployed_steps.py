@@ -8,7 +8,7 @@ import pytest
 from flcav.config import InputError
 from flcav.runs.deployment import deploy
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 
 
 def graph_of(**changes: Any) -> Graph:

@@ -9,6 +9,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 from federated_recipes import PRIVACY, settings
+from federations import cloud_federation, edge_federation, federate_cloud, federate_edge
 from line_task import LineTask, Slope
 from safetensors.numpy import load_file
 
@@ -31,17 +32,16 @@ from flcav.runs.plan.updates import UpdateForm, model_mb, update_forms
 from flcav.runs.recipe import Federation, Training
 from flcav.runs.results.saved import WEIGHTS
 from flcav.runs.results.training import StatisticsScore
-from flcav.runs.steps.cloud import (
-    CloudFederation,
-    RegionStart,
-    federate_cloud,
+from flcav.runs.stages.rounds import RegionStart
+from flcav.runs.training.checkpoints import round_path
+from flcav.runs.training.learning import (
+    Learning,
+    Strategies,
     keep_statistics,
+    load_stage_network,
+    make_clients,
     score_statistics,
 )
-from flcav.runs.training import statistics
-from flcav.runs.training.checkpoints import round_path
-from flcav.runs.training.edge_rounds import EdgeFederation, federate_edge
-from flcav.runs.training.learning import Learning, Strategies, load_stage_network, make_clients
 from flcav.runs.training.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
 from flcav.statistics.streams import derive_seed
 
@@ -60,7 +60,7 @@ def test_the_cloud_s_replay_is_one_more_in_its_averages_and_sends_nothing(tmp_pa
     for folder, cloud in (("without", None), ("with", replay)):
         book = Ledger(LinkMegabytes(1.0, 1.0))
         where: Any = (Strategies(FEDAVG, FEDAVG), book, tmp_path / folder, ignore_progress)
-        federation = CloudFederation(
+        federation = cloud_federation(
             learning, network, regions, dict.fromkeys(regions, 1), *where, replay=cloud, replay_share=0.3
         )
         federate_cloud(federation, 1, Rules())
@@ -97,7 +97,7 @@ def test_a_network_is_scored_with_each_region_s_own_statistics(tmp_path: Path, m
         seen.append(to_arrays(network))
         return float(len(seen))
 
-    monkeypatch.setattr(statistics, "score_network", score)
+    monkeypatch.setattr("flcav.runs.training.learning.score_network", score)
     frames: Any = SimpleNamespace(data=None, vehicles=[1, 2, 3])
     found = score_statistics(cast(Task, WEATHER), network, tmp_path, {"grid": frames, "ring": frames})
     assert found == (StatisticsScore("ring", 3, averaged=1.0, own=2.0),)  # none of grid were kept
@@ -155,7 +155,7 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     ends = []
     for folder in (tmp_path / "timed", tmp_path / "plain"):
         how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), folder, ignore_progress)
-        federation = EdgeFederation(learning, network, clients, learning.schedule(3, 2, "edge", "a"), *how)
+        federation = edge_federation(learning, network, clients, learning.schedule(3, 2, "edge", "a"), *how)
         federate_edge(federation, Rules(), timed=folder.name == "timed")
         ends.append({path.name: path.read_bytes() for path in folder.iterdir() if path.name != TIMES})
     assert ends[0] == ends[1]
@@ -164,7 +164,7 @@ def test_the_cpu_time_of_every_training_is_kept_and_changes_nothing(tmp_path: Pa
     secret = Rules.model_validate({"privacy": PRIVACY, "selection": {"rule": "uniform", "clients": 1}})
     how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "secret", ignore_progress)
     schedule = learning.schedule(1, 2, "edge", "a")
-    federate_edge(EdgeFederation(learning, network, clients, schedule, *how), secret, timed=True)
+    federate_edge(edge_federation(learning, network, clients, schedule, *how), secret, timed=True)
     assert not (tmp_path / "secret" / TIMES).exists()  # its lines would name who was drawn
 
 
@@ -174,7 +174,7 @@ def test_unbiased_federations_are_timed_too(tmp_path: Path) -> None:
     how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
     schedule = learning.schedule(2, 1, "edge", "a")
     rules = Rules.model_validate({"selection": {"rule": "uniform", "clients": 2, "unbiased": True}})
-    federate_edge(EdgeFederation(learning, learning.build_network(), clients, schedule, *how), rules, timed=True)
+    federate_edge(edge_federation(learning, learning.build_network(), clients, schedule, *how), rules, timed=True)
     assert sum(map(len, read_times(tmp_path).values())) == 2 * 2
 
 
@@ -202,7 +202,7 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
     where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
-    federation = CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *where)
+    federation = cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *where)
     federate_cloud(federation, 2, Rules(personal=("bias",)))
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     assert np.array_equal(found["a"]["weight"], found["b"]["weight"])
@@ -222,7 +222,7 @@ def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
     where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
     rules = Rules.model_validate({"personal": {"pull": 0.5}})
-    federate_cloud(CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, rules)
+    federate_cloud(cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, rules)
     found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
     for name in ("weight", "bias"):
         assert found["a"][name] != found["b"][name]
@@ -248,13 +248,13 @@ def test_the_note_of_a_round_names_who_failed_in_it(tmp_path: Path) -> None:
     for rounds in (2, 3):  # the third goes on from the checkpoint of the second
         how = (FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "edge", report)
         schedule = learning.schedule(rounds, 1, "edge", "a")
-        federate_edge(EdgeFederation(learning, network, clients, schedule, *how), Rules())
+        federate_edge(edge_federation(learning, network, clients, schedule, *how), Rules())
     names = [f"{name} (OSError('no power'))" for name in ("a/cav0", "a/cav2")]
     assert notes == ["failed or lost: " + ", ".join(names)] * 3
     notes.clear()
     start = {"a": RegionStart(clients, to_arrays(network), earlier=0)}
     where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / "cloud", report)
-    federate_cloud(CloudFederation(learning, network, start, dict.fromkeys(start, 2), *where), 2, Rules())
+    federate_cloud(cloud_federation(learning, network, start, dict.fromkeys(start, 2), *where), 2, Rules())
     assert notes == ["failed or lost: " + ", ".join(f"{name} in 2" for name in names)] * 2
 
 
@@ -273,12 +273,12 @@ def test_both_stages_in_two_processes_end_with_the_bytes_of_one_also_where_label
         regions = {name: {each: clients[each] for each in clients if each.startswith(name)} for name in ("a", "b")}
         folders = [tmp_path / f"{stage}-{processes}-{renewed}" for stage in ("edge", "cloud")]
         how = (Ledger(LinkMegabytes(1.0, 1.0)), folders[0], ignore_progress)
-        edge = EdgeFederation(learning, network, regions["a"], schedule, FEDAVG, 0, *how)
+        edge = edge_federation(learning, network, regions["a"], schedule, FEDAVG, 0, *how)
         federate_edge(replace(edge, relabel=renew if renewed else None), Rules(), processes=processes)
         starts = {name: RegionStart(own, to_arrays(network), earlier=3) for name, own in regions.items()}
         where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folders[1], ignore_progress)
         federate_cloud(
-            CloudFederation(learning, network, starts, dict.fromkeys(starts, 2), *where),
+            cloud_federation(learning, network, starts, dict.fromkeys(starts, 2), *where),
             2,
             Rules(),
             processes=processes,
@@ -311,7 +311,7 @@ def test_cloud_rounds_begin_the_learning_rate_anew_where_that_is_asked_for_and_s
     for rate, expected in ((None, [0.1, 0.1]), (0.4, [0.4, 0.1])):
         how = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / str(rate), ignore_progress)
         federate_cloud(
-            CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *how, rate=rate), 2, Rules()
+            cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *how, rate=rate), 2, Rules()
         )
         assert rates == pytest.approx(expected)
         rates.clear()
@@ -326,7 +326,7 @@ def test_a_share_of_the_pretrained_weights_is_in_the_result_of_stage_three(tmp_p
     books = {share: Ledger(LinkMegabytes(1.0, 1.0)) for share in (0.0, 0.75)}
     for share, book in books.items():
         how = (Strategies(FEDAVG, FEDAVG), book, tmp_path / str(share), ignore_progress)
-        federation = CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *how, start_share=share)
+        federation = cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *how, start_share=share)
         federate_cloud(federation, 3, Rules())
     found = to_arrays(load_stage_network(learning.task, tmp_path / "0.75"))
     rounds = [load_file(round_path(tmp_path / "0.0", number)) for number in (2, 3)]
@@ -359,7 +359,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         schedule = learning.schedule(rounds, 2, "edge", "a")
         book = Ledger(LinkMegabytes(1.0, 1.0))
         how, begun = (FEDAVG, earlier, book, folder, report), []
-        federation = EdgeFederation(
+        federation = edge_federation(
             *(learning, network, clients["a"], schedule, *how),
             relabel=lambda round_, weights: begun.append(round_),
         )
@@ -379,7 +379,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         how = (Strategies(FEDAVG, FEDAVG), book, folder, report)
         return len(
             federate_cloud(
-                CloudFederation(learning, network, starts, dict.fromkeys(starts, edge_rounds), *how), 9, rules
+                cloud_federation(learning, network, starts, dict.fromkeys(starts, edge_rounds), *how), 9, rules
             )
         )
 

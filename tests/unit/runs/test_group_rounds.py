@@ -1,12 +1,12 @@
 """The rounds of a group in stage II: a lead that leaves, roadside units, a loss that has levelled off."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
 
 import numpy as np
 import pytest
+from federations import edge_federation, federate_edge
 from line_task import LineTask, Slope
 
 from flcav.federation.rules import Rules
@@ -17,30 +17,35 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.runs.recipe import Requests, Training
-from flcav.runs.results.groups import Group, Term
+from flcav.runs.extras.groups import forming
+from flcav.runs.extras.groups.choosing import GroupWatch
+from flcav.runs.extras.groups.forming import Called
+from flcav.runs.extras.groups.members import Member, measure_loss
+from flcav.runs.extras.groups.rows import Group, Term
+from flcav.runs.extras.groups.settings import Requests
+from flcav.runs.recipe import Training
 from flcav.runs.results.saved import WEIGHTS
-from flcav.runs.steps import groups
-from flcav.runs.steps.groups import Called
-from flcav.runs.training.edge_rounds import EdgeFederation, federate_edge
-from flcav.runs.training.groups import GroupWatch
 from flcav.runs.training.learning import Learning, load_stage_network, make_clients
-from flcav.runs.training.members import Member, measure_loss
 
 LEARNING = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1, start_share=0.0), 3)
 NAMES = ("a/cav0", "a/cav1", "a/cav2")
 
 
 def federate_group(
-    folder: Path, outages: dict[tuple[int, str], Outage], rounds: int = 3, **about: Any
+    folder: Path,
+    outages: dict[tuple[int, str], Outage],
+    rounds: int = 3,
+    terms: tuple[Term, ...] = (),
+    roadside: tuple[str, ...] = (),
+    watch: GroupWatch | None = None,
 ) -> tuple[bytes, Ledger]:
     """Run a group's rounds; return its weights and ledger."""
     book, samples = Ledger(LinkMegabytes(1.0, 1.0)), {name: [np.float32(i)] for i, name in enumerate(NAMES)}
     clients, schedule = make_clients(LEARNING, Slope(), samples), LEARNING.schedule(rounds, 2, "edge", "a")
-    federation = EdgeFederation(
-        LEARNING, LEARNING.build_network(), clients, schedule, FEDAVG, 0, book, folder, ignore_progress
-    )
-    federate_edge(replace(federation, **about), Rules(), outages)
+    group = Group(0.0, {}, "", NAMES, roadside=roadside)
+    conduct = Called(group, samples, watch or GroupWatch(Requests(), {}, [0.0]), LEARNING.task, book, terms)
+    how = (LEARNING, LEARNING.build_network(), clients, schedule, FEDAVG, 0, book, folder, ignore_progress)
+    federate_edge(edge_federation(*how, conduct=conduct), Rules(), outages)
     return (folder / WEIGHTS).read_bytes(), book
 
 
@@ -58,7 +63,7 @@ def test_a_lead_that_leaves_in_mid_round_leaves_the_weights_of_the_next_from_the
 
 def test_roadside_units_train_without_a_message_on_the_radio(tmp_path: Path) -> None:
     alone, book = federate_group(tmp_path / "radio", {})
-    same, less = federate_group(tmp_path / "unit", {}, roadside=frozenset({"a/cav2"}))
+    same, less = federate_group(tmp_path / "unit", {}, roadside=("a/cav2",))
     assert same == alone
     assert {e.client for e in book} == set(NAMES)
     assert {e.client for e in less} == {"a/cav0", "a/cav1"}
@@ -79,12 +84,14 @@ def test_a_group_dissolves_by_the_loss_on_what_it_holds_back_whatever_validation
         weights, book = federate_group(tmp_path / name, {}, 9, watch=watch)
         assert {(e.round, e.client) for e in book if e.bytes < 100} <= {(n, who) for n in range(1, 10) for who in held}
         left = iter(scores)
-        monkeypatch.setattr(groups, "score_network", lambda *_: next(left))
+        monkeypatch.setattr(forming, "score_network", lambda *_: next(left))
         (tmp_path / f"{name}-start").mkdir()
         monkeypatch.setattr(
-            groups, "load_stage_network", lambda task, at: start if "start" in str(at) else load_stage_network(task, at)
+            forming,
+            "load_stage_network",
+            lambda task, at: start if "start" in str(at) else load_stage_network(task, at),
         )
-        called = Called(Group(0.1, {}, "pole1", NAMES), {}, watch, LEARNING.task)
+        called = Called(Group(0.1, {}, "pole1", NAMES), {}, watch, LEARNING.task, book)
         shown: Any = SimpleNamespace(data=None, vehicles=())  # that nobody looks at: their score is given
         with open_questions(members, None, open_account()) as ask:
             return weights, called.dissolve(tmp_path / name, tmp_path / f"{name}-start", shown, 9, ask)

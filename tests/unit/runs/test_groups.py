@@ -19,9 +19,7 @@ from flcav.network.messages import pack
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
 from flcav.runs.arms import check_federations, resolve_settings
-from flcav.runs.recipe import Requests, RunRecipe
-from flcav.runs.results.groups import Checked, Group, Term
-from flcav.runs.training.groups import (
+from flcav.runs.extras.groups.choosing import (
     FULL,
     NOT_NEEDED,
     GroupWatch,
@@ -31,7 +29,7 @@ from flcav.runs.training.groups import (
     has_levelled,
     weigh_offers,
 )
-from flcav.runs.training.members import (
+from flcav.runs.extras.groups.members import (
     MESSAGE,
     SKETCH,
     Offer,
@@ -40,6 +38,9 @@ from flcav.runs.training.members import (
     hold_back,
     sketch_gradient,
 )
+from flcav.runs.extras.groups.rows import Checked, Group, Term
+from flcav.runs.extras.groups.settings import Requests
+from flcav.runs.recipe import RunRecipe
 
 PLACES = {name: np.array([x, 0.0, 0.0]) for name, x in {"a": 0.0, "b": 250.0, "c": 320.0, "d": 900.0}.items()}
 

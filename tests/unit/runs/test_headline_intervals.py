@@ -21,8 +21,8 @@ from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results import tests as results
 from flcav.runs.results.saved import OUTCOMES
 from flcav.runs.results.training import StageResult, Watched
-from flcav.runs.steps import testing
-from flcav.runs.steps.testing import RoundsSettings, rounds_step
+from flcav.runs.stages import testing
+from flcav.runs.stages.testing import RoundsSettings, rounds_step
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.streams import stream
 

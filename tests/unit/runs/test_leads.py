@@ -16,8 +16,8 @@ from flcav.federation.strategies import strategy_named
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.runs.results.groups import Term
-from flcav.runs.training.leads import federate_led, follow_leads
+from flcav.runs.extras.groups.leads import federate_led, follow_leads
+from flcav.runs.extras.groups.rows import Term
 
 SCHEDULE = Schedule(rounds=4, steps=2, learning_rate=0.1, final_learning_rate=0.05, seed=3)
 START = {"w": np.arange(6, dtype=np.float64)}

@@ -7,17 +7,22 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
-from flcav.runs import forecast
-from flcav.runs.analysis.lifelong import find_mended
 from flcav.runs.arms import check_federations
+from flcav.runs.extras.groups.rows import Checked, Group
+from flcav.runs.extras.lifelong.memory import Joined, divide_memory, spread_evenly
+from flcav.runs.extras.lifelong.replay import NO_LIMIT
+from flcav.runs.extras.lifelong.results import find_mended
+from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
+from flcav.runs.extras.lifelong.steps import (
+    ReplaySettings,
+    compare_copies,
+    forecast_lifelong_s,
+    name_driving,
+    name_learning,
+)
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.results.groups import Checked, Group
-from flcav.runs.results.lifelong import LifelongArm, Passed
-from flcav.runs.steps.edge import EdgeSettings
-from flcav.runs.steps.graph import Graph
-from flcav.runs.steps.lifelong import compare_copies, name_driving, name_learning
-from flcav.runs.steps.memory import NO_LIMIT
-from flcav.runs.training.memory import Joined, divide_memory, spread_evenly
+from flcav.runs.stages.federating import EdgeSettings
+from flcav.runs.stages.graph import Graph
 
 VALUES: dict[str, Any] = {
     "size": "toy",
@@ -98,7 +103,7 @@ def test_each_condition_goes_on_from_the_network_that_drives() -> None:
     for arm in ("replay", "no replay"):
         drives = "pretrain-objects"
         for number, condition in enumerate(("sun", "fog", "rain")):
-            learned: EdgeSettings = steps[name_learning(condition, "objects", arm)].arguments["settings"]
+            learned: ReplaySettings = steps[name_learning(condition, "objects", arm)].arguments["settings"]
             assert learned.inputs.pretrain == drives
             assert learned.federation.requests is not None
             assert learned.federation.requests.excess == 2.0
@@ -108,7 +113,7 @@ def test_each_condition_goes_on_from_the_network_that_drives() -> None:
             drives = name_driving(condition, "objects", arm)
             assert {f"test-{drives}-{each}" for each in ("sun", "fog", "rain")} <= {*steps}
     own: EdgeSettings = steps["fog-edge-fl-objects"].arguments["settings"]  # what the condition can reach
-    assert (own.inputs.pretrain, own.federation.requests, own.memory) == ("pretrain-objects", None, None)
+    assert (own.inputs.pretrain, own.federation.requests) == ("pretrain-objects", None)
 
 
 def test_labels_by_tracks_are_those_of_the_network_that_drives() -> None:
@@ -155,6 +160,5 @@ def test_a_forecast_counts_the_rounds_and_scores_of_both_arms() -> None:
     assert asked.lifelong is not None
     graph, splits = Graph(asked, Path()), asked.sized_splits
     tests, validations = (each.scenes * each.spins * each.cavs for each in (splits.test, splits.validation))
-    measured = forecast._Measured(sample_mb=1.0, exchange_mb=None, pool=4, frame_s=9.0, step_s=100.0, test_s=1.0)
-    found = forecast._count_lifelong_s(graph, asked.lifelong, "objects", 2, measured)
+    found = forecast_lifelong_s(graph, "objects", 2, 100.0, 1.0)
     assert found == 2 * (100.0 * 2 * 3 * 2 + 9 * tests + (1 + 2 + 3) * 3 * validations)

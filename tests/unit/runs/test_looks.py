@@ -9,8 +9,8 @@ import pytest
 
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
-from flcav.runs.steps import testing
-from flcav.runs.steps.testing import detect_before_after
+from flcav.runs.stages import testing
+from flcav.runs.stages.testing import detect_before_after
 
 
 def cars(*places: float) -> Boxes:

@@ -14,9 +14,9 @@ from flcav.federation.trainable import Weights
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.network.messages import pack
 from flcav.perception.task import Task
-from flcav.runs.steps.groups import UNREADABLE, Uplink
-from flcav.runs.training.fl_requests import answer_requests, take_requests
-from flcav.runs.training.members import (
+from flcav.runs.extras.groups.fl_requests import answer_requests, take_requests
+from flcav.runs.extras.groups.forming import UNREADABLE, Uplink
+from flcav.runs.extras.groups.members import (
     ASKS,
     CHECK,
     HELD,

@@ -6,7 +6,7 @@ import pytest
 
 from flcav.config import InputError
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.steps.outline import Outline
+from flcav.runs.stages.outline import Outline
 
 
 def outline_of(network: str) -> Outline:

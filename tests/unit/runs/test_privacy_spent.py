@@ -14,7 +14,7 @@ from flcav.runs.analysis.collect import list_trainings
 from flcav.runs.arms import name_repeat
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe
 from flcav.runs.results.training import PrivacySpent, StageResult
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.runs.training.private_rounds import PrivateTraining, compose_trainings, plan_private_rounds
 
 PRIVACY = {"clip": 1.0, "noise": 1.0}

@@ -15,7 +15,7 @@ from flcav.runs.engine import Notify
 from flcav.runs.recipe import RunRecipe
 from flcav.runs.rigs import RIG, compare_rigs, tell_rigs
 from flcav.runs.running import run, run_several
-from flcav.runs.steps.outline import Outline
+from flcav.runs.stages.outline import Outline
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 

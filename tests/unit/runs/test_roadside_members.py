@@ -10,11 +10,11 @@ from flcav.config import InputError
 from flcav.geometry import Boxes, points_in_boxes, pose
 from flcav.perception.objects.model import pillars_config
 from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.extras.groups import roadside
+from flcav.runs.extras.groups.forming import find_units
+from flcav.runs.extras.groups.roadside import label_roadside, lower_sweep
 from flcav.runs.frames import Frames
-from flcav.runs.labels import roadside
-from flcav.runs.labels.roadside import label_roadside, lower_sweep
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.steps.groups import find_units
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = pillars_config()
@@ -70,7 +70,7 @@ def test_units_learn_what_their_own_detector_finds(monkeypatch: pytest.MonkeyPat
 
 def test_units_out_of_range_of_whoever_asked_stay(monkeypatch: pytest.MonkeyPatch) -> None:
     sites = SimpleNamespace(number=np.array([3, 7]), position=np.array([[0.0, 0, 6], [500.0, 0, 6]]))
-    monkeypatch.setattr("flcav.runs.steps.groups.find_sites", lambda *_: sites)
+    monkeypatch.setattr("flcav.runs.extras.groups.forming.find_sites", lambda *_: sites)
     inputs, there = cast(Any, SimpleNamespace(recorded=False)), {"grid/cav0": np.array([40.0, 0, 0])}
     assert find_units(cast(Any, None), inputs, (3, 7), there, ["grid/cav0"], 100.0) == [3]
     assert find_units(cast(Any, None), inputs, (7,), there, ["grid/cav0"], 100.0) == []

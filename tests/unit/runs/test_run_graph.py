@@ -8,8 +8,8 @@ import pytest
 from flcav.config import InputError
 from flcav.runs.engine import Step
 from flcav.runs.recipe import MAIN, RunRecipe, load_run_recipe
-from flcav.runs.steps.graph import Graph
-from flcav.runs.steps.planning import UploadSettings
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.planning import UploadSettings
 from flcav.sources.recipe import recipe_path
 
 OBJECTS = {"objects": {"history": "objects"}}

@@ -29,9 +29,9 @@ from flcav.perception.training import train
 from flcav.perception.weights import to_arrays
 from flcav.runs.recipe import Training
 from flcav.runs.results.saved import WEIGHTS
-from flcav.runs.steps import centralised
-from flcav.runs.steps.centralised import pretrain, train_centrally
-from flcav.runs.steps.settings import region_budget, share_budget
+from flcav.runs.stages import centralised
+from flcav.runs.stages.centralised import pretrain, train_centrally
+from flcav.runs.stages.settings import region_budget, share_budget
 from flcav.runs.training.checkpoints import FederationCheckpoints, find_checkpoint, round_path
 from flcav.runs.training.learning import Learning
 from flcav.runs.training.messages import choose_planned_uploads, choose_uploads

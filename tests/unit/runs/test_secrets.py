@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from federations import cloud_federation, edge_federation, federate_cloud, federate_edge
 from line_task import LineTask, Slope
 from safetensors.numpy import load_file
 
@@ -24,8 +25,7 @@ from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.runs.recipe import Training
 from flcav.runs.results.saved import LEDGER, WEIGHTS
-from flcav.runs.steps.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.runs.training.edge_rounds import EdgeFederation, federate_edge
+from flcav.runs.stages.rounds import RegionStart
 from flcav.runs.training.learning import Learning, Strategies, make_clients
 from flcav.runs.training.secrets import (
     PART,
@@ -69,7 +69,7 @@ def edge(folder: Path, rules: Rules, dies_at: int = 0, report: Any = ignore_prog
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
     schedule, book = learning.schedule(ROUNDS, 1, "edge", "a"), Ledger(LinkMegabytes(wireless_mb, 1.0))
     how = (learning.build_network(), vehicles(learning, "a", dies_at), schedule, FEDAVG, 0, book, folder, report)
-    federate_edge(EdgeFederation(learning, *how), rules)
+    federate_edge(edge_federation(learning, *how), rules)
 
 
 def cloud(folder: Path, rules: Rules, dies_at: int = 0, wireless_mb: float = 1.0) -> None:
@@ -83,7 +83,7 @@ def cloud(folder: Path, rules: Rules, dies_at: int = 0, wireless_mb: float = 1.0
         folder,
         ignore_progress,
     )
-    federate_cloud(CloudFederation(learning, network, regions, *how), 2, rules)
+    federate_cloud(cloud_federation(learning, network, regions, *how), 2, rules)
 
 
 def rules(where: str, **how: Any) -> Rules:

@@ -14,7 +14,7 @@ from flcav.experiments.splits import record_split
 from flcav.experiments.studies import STUDIES, study_named
 from flcav.runs.engine.source_hash import PACKAGES, Sources, find_definitions
 from flcav.runs.recipe import Federation
-from flcav.runs.steps import centralised, cloud, edge, recording, testing
+from flcav.runs.stages import centralised, federating, recording, testing
 
 TOY = {
     "__init__.py": """
@@ -154,8 +154,7 @@ STEPS = {
     "frames": recording.record_step,
     "pretraining": centralised.pretrain_step,
     "evaluation": testing.test_step,
-    "stage II": edge.edge_step,
-    "stage III": cloud.cloud_step,
+    "stage II": federating.federate_step,
 } | {f"{name}, {part}": getattr(study_named(name), part) for name in STUDIES for part in ("learn", "test")}
 
 OF_STUDIES = ("run", "objects", "weather")  # modules with what a study trains, or measures beyond its task

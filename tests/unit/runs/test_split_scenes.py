@@ -12,7 +12,7 @@ from flcav.config import InputError
 from flcav.runs import frames
 from flcav.runs.frames import deal_frames, make_recording_recipe
 from flcav.runs.recipe import SPLITS_OF, Role, RunRecipe, SplitName
-from flcav.runs.steps.recording import RecordSettings
+from flcav.runs.stages.recording import RecordSettings
 from flcav.sources.recipe import CarlaRecipe
 
 

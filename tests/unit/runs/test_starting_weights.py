@@ -16,8 +16,8 @@ from flcav.runs.recipe import RunRecipe
 from flcav.runs.results.plans import Plan, TaskPlan
 from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.results.training import Pretrained
-from flcav.runs.steps.centralised import pretrain_step
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.centralised import pretrain_step
+from flcav.runs.stages.graph import Graph
 from flcav.runs.training.starting_weights import find_start, load_start
 
 WEATHER = task_named("weather")

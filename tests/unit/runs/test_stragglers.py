@@ -7,7 +7,7 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.runs.recipe import RunRecipe, Stragglers, draw_stragglers
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 
 RECIPE: dict[str, Any] = {
     "tasks": {"objects": {"history": "objects", "train_s": 2.0}},

@@ -24,7 +24,7 @@ from flcav.perception.weights import find_shipped, load_network
 from flcav.runs.frames import Frames, list_window, record_frames
 from flcav.runs.labels.pseudo_labels import label_frames
 from flcav.runs.labels.tracks import label_tracked, load_tracks, save_tracks, track_frame
-from flcav.runs.steps.tracking import check_windows
+from flcav.runs.stages.tracking import check_windows
 from flcav.sources.recipe import Recipe
 
 DRIVE = {"town": "suburb", "seed": 5, "scenes": 2, "spins_per_scene": 1, "cavs": 2, "warmup_s": 40.0, "window_s": 0.6}

@@ -1,7 +1,7 @@
 """Groups on request against a fixed roster: accuracy by megabytes of uplink, at equal megabytes and after the plan.
 
 Ten vehicles drive with a network that knows six of eight weathers. In one setting all of them meet the other two, in
-the other three do. A group is called as in stage II of a run (`flcav.runs.training.groups`): who errs asks, all
+the other three do. A group is called as in stage II of a run (`flcav.runs.extras.groups.choosing`): who errs asks, all
 offer, the lead chooses by their data, and the group dissolves when its loss on held-back pictures has levelled off.
 """
 
@@ -35,9 +35,11 @@ from flcav.network.messages import pack, send
 from flcav.perception.weather.task import WEATHER
 from flcav.report import style
 from flcav.report.charts.federation.groups import draw_by_megabytes
+from flcav.runs.extras.groups.choosing import choose_members, has_levelled, weigh_offers
+from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.provenance import Provenance, provenance
-from flcav.runs.recipe import EDGE, Requests
-from flcav.runs.training.groups import Levelled, choose_members, has_levelled, weigh_offers
+from flcav.runs.recipe import EDGE
+from flcav.runs.stages.rounds import RoundsOver
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.storage.records import Record
 
@@ -172,10 +174,10 @@ def follow(
             for name in members:
                 send(book, told, client=name, round_=number, **UP)
             if has_levelled(losses, REQUESTS):
-                raise Levelled
+                raise RoundsOver
 
     pictures = fleet.train if asked else fleet.whole
-    with suppress(Levelled):
+    with suppress(RoundsOver):
         federate(
             {name: Vehicle(pictures[name]) for name in sorted(members)},
             fleet.start,

@@ -18,7 +18,7 @@ from flcav.experiments.attacks.drives import (
     measure_losses,
 )
 from flcav.federation.trainable import Weights
-from flcav.runs.training.members import Offer, hold_back, sketch_gradient
+from flcav.runs.extras.groups.members import Offer, hold_back, sketch_gradient
 from flcav.statistics.streams import derive_seed, stream
 
 PRETRAIN_SCENES = 3  # the first ones

@@ -12,10 +12,10 @@ import numpy as np
 from flcav.config import Json
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_conditions
-from flcav.runs.lifelong import NOTHING, PLAIN, REPLAY
+from flcav.runs.extras.lifelong.rows import LifelongArm
+from flcav.runs.extras.lifelong.settings import NOTHING, PLAIN, REPLAY
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.results.lifelong import LifelongArm
 from flcav.runs.results.run import Run
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means

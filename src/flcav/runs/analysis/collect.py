@@ -16,18 +16,18 @@ from flcav.runs.analysis.differences import (
 )
 from flcav.runs.analysis.findings import findings
 from flcav.runs.analysis.histories import gaps_closed
-from flcav.runs.analysis.lifelong import collect_lifelong
 from flcav.runs.arms import Setting, name_repeat
 from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.provenance import provenance
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
+from flcav.runs.registry import RESULTS, load_all
 from flcav.runs.results.plans import Placed, Plan
 from flcav.runs.results.run import ArmResult, LinkUse, Run, Spent
 from flcav.runs.results.saved import LEDGER
 from flcav.runs.results.training import Pretrained, StageResult, Watched
 from flcav.runs.rigs import compare_rigs
-from flcav.runs.steps.centralised import COUNTED_MB
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.centralised import COUNTED_MB
+from flcav.runs.stages.graph import Graph
 from flcav.runs.training.private_rounds import PrivateTraining, compose_trainings, count_private_rounds
 
 
@@ -58,7 +58,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
         home=collect_home_costs(graph, work) or None,
-        lifelong=collect_lifelong(graph, work) or None,
+        **{name: row for collect in load_all(RESULTS) for name, row in collect(graph, work).items()},
         caveats=(
             *list_caveats(recipe, main.labels.values(), settings.values()),
             *list_unreached(arms, settings, recipe.placement.group_range_m),

@@ -21,7 +21,7 @@ from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.runs.results.run import ArmCost, ArmResult, Run
 from flcav.runs.results.saved import OUTCOMES
 from flcav.runs.results.tests import HomeCost, Test
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.seeds import mean_over_seeds
 

@@ -14,7 +14,7 @@ from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRA
 from flcav.runs.results.saved import OUTCOMES
 from flcav.runs.results.tests import Difference, RegionalTest, Test, Tested
 from flcav.runs.spread import difference_key, test_key
-from flcav.runs.steps.graph import Graph
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, Spread, average_estimates, measure_spread, widen, widen_share
 from flcav.statistics.seeds import MeanOverSeeds, average_shared, mean_over_seeds
 

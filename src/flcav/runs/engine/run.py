@@ -32,6 +32,7 @@ from flcav.runs.engine.step import (
     Notify,
     Step,
     StepRecord,
+    asks_the_same,
     find_damage,
     make_edited_error,
     make_stale_error,
@@ -223,7 +224,7 @@ def _settle_records(
         code = sources.hashes(find_definitions((step.run, step.arguments)))
         record = StepRecord.of(asked, code, [records[name] for name in step.needs], step.asked)
         held = read_record(folder / step.name)
-        moved = held is not None and held.asked == step.asked and sources.lack(held.code)
+        moved = held is not None and asks_the_same(held, step.asked) and sources.lack(held.code)
         moved = moved and not edited.keys() & {*step.needs}
         if held is not None and held.fingerprint != asked and not moved:
             edited[step.name] = held, record

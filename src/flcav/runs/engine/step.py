@@ -231,6 +231,12 @@ def make_edited_error(
     )
 
 
+def asks_the_same(held: StepRecord, wanted: Mapping[str, Json]) -> bool:
+    """Return whether a step was given the same arguments; one that is not there is like one that is None."""
+    told = [{name: each for name, each in (own or {}).items() if each is not None} for own in (held.asked, wanted)]
+    return held.asked is not None and told[0] == told[1]
+
+
 def describe_differences(held: StepRecord, wanted: StepRecord) -> list[str]:
     """Return the arguments of a step that are not as they were, in words; none where they were not recorded."""
     if held.asked is None or wanted.asked is None:

@@ -134,34 +134,33 @@ def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: 
 
 
 @dataclass(frozen=True)
-class DrivenCloud:
-    """The rounds of stage III on the network: rules of all regions, who is lost and why, and how long each takes."""
+class DrivenStage:
+    """The rounds of a stage on the network: rules of all regions, who is lost and why, and how long each takes."""
 
     rules: Rules
-    outages: Mapping[tuple[int, str], Outage]  # by edge round, from 1, and client
-    seconds: Mapping[str, Sequence[float]]  # of each round, by server
+    outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by edge round, from 1, and client
+    seconds: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of each round [s], by server
     buffers: Mapping[str, Buffers] = field(default_factory=dict)  # of asynchronous rounds, by region
+    records: Mapping[str, tuple[RoundTiming, ...]] = field(default_factory=dict)  # of the edge rounds, by region
 
 
-def join_regions(
-    driven: Mapping[str, DrivenRounds], k: int, settings: NetworkSettings | None, model_bytes: int
-) -> DrivenCloud:
-    """Return the rounds of all regions in stage III together.
+def join_regions(driven: Mapping[str, DrivenRounds], k: int = 1, ways_s: float | None = None) -> DrivenStage:
+    """Return the rounds of all regions in a stage together.
 
-    A cloud round is `k` edge rounds of the slowest region, and a model of `model_bytes` down and up by wireline.
+    A cloud round is `k` edge rounds of the slowest region, and a model's ways down and up by wireline, which take
+    `ways_s` [s]; None: there is no cloud, or no network.
     """
     rules = next(iter(driven.values())).rules
-    if settings is None:
-        return DrivenCloud(rules, {}, {})
-    if all(each.rules.selection.rule == "planned" for each in driven.values()):
+    if len(driven) > 1 and all(each.rules.selection.rule == "planned" for each in driven.values()):
         joins = {name: rounds for each in driven.values() for name, rounds in each.rules.selection.joins.items()}
         rules = rules.model_copy(update={"selection": Selection(rule="planned", joins=joins)})
     seconds = {region: each.seconds for region, each in driven.items()}
-    ways = 2 * settings.wireline.seconds(model_bytes)
-    rounds = range(0, len(next(iter(seconds.values()))), k)
-    cloud = [ways + max(sum(own[first : first + k]) for own in seconds.values()) for first in rounds]
+    if ways_s is not None:
+        rounds = range(0, len(next(iter(seconds.values()))), k)
+        seconds[CLOUD] = [ways_s + max(sum(own[first : first + k]) for own in seconds.values()) for first in rounds]
     outages = {key: outage for each in driven.values() for key, outage in each.outages.items()}
-    return DrivenCloud(rules, outages, {**seconds, CLOUD: cloud})
+    buffers = {region: each.buffers for region, each in driven.items() if each.buffers is not None}
+    return DrivenStage(rules, outages, seconds, buffers, {region: each.records for region, each in driven.items()})
 
 
 def link_drive(

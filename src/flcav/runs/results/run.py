@@ -1,13 +1,13 @@
 """Records of a finished run, of its arms, and of the means over several seeds."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated, ClassVar
 
 from flcav.runs.arms import Names, name_steps
 from flcav.runs.provenance import Provenance
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.results.lifelong import LifelongArm
+from flcav.runs.registry import SECTIONS, RunRows, Section, load_all
 from flcav.runs.results.plans import Placed, Plan
 from flcav.runs.results.saved import Saved
 from flcav.runs.results.tests import Difference, HomeCost, RegionalTest, RunFinding, Test, Tested
@@ -84,10 +84,9 @@ class ArmCost(Record):
 
 
 @dataclass(frozen=True)
-class Run(Saved):
-    """Results of a finished run; `Run.load(folder)` reads them back."""
+class _RunFigures(Saved):
+    """The figures of a run."""
 
-    file: ClassVar[str] = "results.json"
     recipe: RunRecipe
     arms: Mapping[str, ArmResult]
     pretrained: tuple[Pretrained, ...]  # of the run itself
@@ -101,12 +100,28 @@ class Run(Saved):
     elapsed_s: float = 0.0  # wall time of all starts together
     costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # of each arm and task
     home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # of further measures than the tasks' own
-    lifelong: Annotated[tuple[LifelongArm, ...] | None, LEFT_OUT] = None  # of each task and arm; None: not asked for
+
+
+@dataclass(frozen=True)
+class Run(RunRows, _RunFigures):
+    """Results of a finished run; `Run.load(folder)` reads them back."""
+
+    file: ClassVar[str] = "results.json"
 
     @property
     def steps(self) -> Names:
         """Return the names of the run's steps, whose folders, in its folder `work`, hold all artefacts."""
         return name_steps(self.recipe)
+
+    def list_sections(self) -> list[Section]:
+        """Return the sections of extras on the run's page."""
+        found = [describe(self) for describe in load_all(SECTIONS)]
+        return [section for section in found if section is not None]
+
+    def describe_rows(self) -> list[str]:
+        """Return the rows of extras in words, each with its name and task."""
+        rows = [(each.name, row) for each in fields(RunRows) for row in getattr(self, each.name) or ()]
+        return [f"{name}, {row.task}, {row.describe()}" for name, row in rows]
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
         """Return the result of a test; raises `KeyError` for one that was not made."""

@@ -1,14 +1,14 @@
 """Records of training: pretraining, federated stages with their rounds, privacy spent, and validation scores."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Annotated
 
 import numpy as np
 
 from flcav.federation.divergence import RoundDivergence
 from flcav.federation.privacy import SEEDED
-from flcav.runs.results.groups import Group
+from flcav.runs.registry import StageRows
 from flcav.runs.results.saved import Saved
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE, Record
 
@@ -117,8 +117,8 @@ class LabelHistory(Saved):
 
 
 @dataclass(frozen=True)
-class StageResult(Saved):
-    """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
+class _StageFigures(Saved):
+    """The figures of a stage."""
 
     stage: str
     task: str
@@ -132,7 +132,16 @@ class StageResult(Saved):
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
     noise: Annotated[float | None, LEFT_OUT] = None  # that the privacy budget gave for the planned rounds; None: none
     statistics: Annotated[tuple[StatisticsScore, ...] | None, LEFT_OUT] = None  # of stage III; None: not asked for
-    group: Annotated[Group | None, LEFT_OUT] = None  # of stage II on request; None: all vehicles federate
+
+
+@dataclass(frozen=True)
+class StageResult(StageRows, _StageFigures):
+    """Result of a federated stage of a task, or of centralised training; the weights are in the same folder."""
+
+    def describe_rows(self) -> dict[str, str]:
+        """Return the rows of extras in words, by name."""
+        rows = {each.name: getattr(self, each.name) for each in fields(StageRows)}
+        return {name: row.describe() for name, row in rows.items() if row is not None}
 
 
 def diverges(losses: Sequence[float | None]) -> bool:

@@ -6,17 +6,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from safetensors.numpy import load_file, save
+
 from flcav.federation.rounds import Schedule
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import Strategy
-from flcav.federation.trainable import Weights
+from flcav.federation.trainable import Weights, statistics_names
 from flcav.perception.client import TaskClient
 from flcav.perception.distillation import OutputClient, SharedSamples
+from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
-from flcav.perception.weights import load_network
+from flcav.perception.weights import from_arrays, load_network, to_arrays
+from flcav.runs.frames import Frames
 from flcav.runs.recipe import Training
 from flcav.runs.results.saved import WEIGHTS
+from flcav.runs.results.training import StatisticsScore
 from flcav.statistics.streams import derive_seed
+from flcav.storage.files import write_bytes
 
 
 @dataclass(frozen=True)
@@ -91,3 +97,31 @@ def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
     """Return strategies and rules, as far as they are not the defaults, in words: what a checkpoint is of."""
     changed = rules.model_dump(mode="json", include=set(Rules.model_fields), exclude_defaults=True)
     return f"{strategy} by {json.dumps(changed)}" if changed else str(strategy)
+
+
+def keep_statistics(weights: Weights, folder: Path, region: str) -> None:
+    """Write the statistics among a region's weights to the folder of stage III, in place of those of before."""
+    write_bytes(_path(folder, region), save({name: weights[name] for name in statistics_names(weights)}))
+
+
+def score_statistics(
+    task: Task, network: Any, folder: Path, validation: Mapping[str, Frames]
+) -> tuple[StatisticsScore, ...]:
+    """Return the scores of `network` on each region's validation frames, by whose statistics it has.
+
+    These are its own, and those of the region that `keep_statistics` wrote to `folder`. Without a cloud round there are
+    none, and the result is empty.
+    """
+    arrays, scores = to_arrays(network), []
+    for region, split in validation.items():
+        if not _path(folder, region).exists():
+            continue
+        own = task.build(network.config)
+        from_arrays(own, {**arrays, **load_file(_path(folder, region))})
+        averaged, kept = (score_network(task, each, split.data, split.vehicles) for each in (network, own.eval()))
+        scores.append(StatisticsScore(region, len(split.vehicles), averaged, kept))
+    return tuple(scores)
+
+
+def _path(folder: Path, region: str) -> Path:
+    return folder / f"statistics-{region}.safetensors"

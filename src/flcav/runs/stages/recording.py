@@ -8,8 +8,8 @@ from flcav.runs.engine import Step, Work
 from flcav.runs.frames import deal_frames, hash_manifest, hash_town, make_recording_recipe, record_frames
 from flcav.runs.recipe import EDGE, SPLITS_OF, Role, SplitName
 from flcav.runs.results.plans import Placed
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.settings import StepSettings, make_step
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.settings import StepSettings, make_step
 from flcav.sources.recipe import CarlaRecipe, Recipe
 
 

@@ -5,11 +5,11 @@ from typing import Any
 
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.runs.engine import Work
+from flcav.runs.extras.groups.members import Picked
+from flcav.runs.extras.lifelong.memory import Joined, divide_memory, spread_evenly
 from flcav.runs.recipe import EDGE
-from flcav.runs.steps.regions import label_samples
-from flcav.runs.steps.settings import FederationSettings, RegionInputs, StepSettings
-from flcav.runs.training.members import Picked
-from flcav.runs.training.memory import Joined, divide_memory, spread_evenly
+from flcav.runs.stages.regions import label_samples
+from flcav.runs.stages.settings import FederationSettings, RegionInputs, StepSettings
 
 NO_LIMIT = LinkMegabytes(1e9, 1e9)  # of messages that were sent, and counted, when their condition was there
 

@@ -99,3 +99,10 @@ def _describe_end(term: Term) -> str:
     if term.received is None:
         return f"{term.lead} was gone before round {term.left}"
     return f"{term.lead} left in round {term.left} with {plural(term.received, 'update')}, and the round began again"
+
+
+@dataclass(frozen=True)
+class GroupRow:
+    """What groups add to the result of a stage."""
+
+    group: Annotated[Group | None, LEFT_OUT] = None  # of stage II on request; None: all vehicles federate

@@ -31,3 +31,9 @@ class Lifelong(Config):
         if len(set(conditions)) < len(conditions):
             raise ValueError("one of them comes twice; name another region of the same town, with traffic of its own")
         return conditions
+
+
+class LifelongFields(Config):
+    """What lifelong learning adds to a recipe."""
+
+    lifelong: Lifelong | None = None  # conditions that come one after another; None: no lifelong learning

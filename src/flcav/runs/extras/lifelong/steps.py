@@ -6,7 +6,9 @@ one, and their group forms on request.
 
 import shutil
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -15,23 +17,42 @@ from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.runs.arms import Setting
 from flcav.runs.engine import Step, Work
+from flcav.runs.extras.groups.rows import Group
+from flcav.runs.extras.groups.settings import Requests
+from flcav.runs.extras.lifelong.checks import find_requests
+from flcav.runs.extras.lifelong.replay import NO_LIMIT, Memory, remember
+from flcav.runs.extras.lifelong.settings import LEARNING, LIFELONG, REPLAY, Lifelong
 from flcav.runs.frames import Frames
-from flcav.runs.lifelong import LEARNING, LIFELONG, REPLAY, Lifelong
-from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, Requests
-from flcav.runs.results.groups import Group
-from flcav.runs.results.lifelong import Driving
-from flcav.runs.results.saved import LEDGER, WEIGHTS
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
+from flcav.runs.results.saved import LEDGER, WEIGHTS, Saved
 from flcav.runs.results.training import Pretrained, StageResult
-from flcav.runs.steps.edge import EdgeSettings, edge_step
-from flcav.runs.steps.memory import NO_LIMIT, Memory
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.settings import RegionInputs, StepSettings, make_step
-from flcav.runs.steps.testing import RoundsSettings, TestSettings, rounds_step, test_step
-from flcav.runs.steps.tracking import TrackSettings, track_step
+from flcav.runs.stages.federating import EdgeSettings, federate_step
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.settings import RegionInputs, StepSettings, make_step
+from flcav.runs.stages.testing import RoundsSettings, TestSettings, rounds_step, test_step
+from flcav.runs.stages.tracking import TrackSettings, track_step
 from flcav.runs.training.learning import load_stage_network
 from flcav.runs.training.messages import send_region_network
 
 DELIVERED = "delivered.parquet"  # ledger of the new network on its way to the vehicles
+
+
+class ReplaySettings(EdgeSettings):
+    """Settings of a group's rounds in a condition, whose vehicles replay what they remember."""
+
+    memory: Memory | None = None  # of conditions that they were in before
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Return the names of the steps whose results it takes."""
+        return (*super().needs, *(() if self.memory is None else self.memory.needs))
+
+
+def learn_step(work: Work, settings: ReplaySettings, **means: Any) -> None:
+    """Run the rounds of a condition as those of stage II, with what vehicles remember joined to their samples."""
+    memory = settings.memory
+    recall = None if memory is None else partial(remember, work, settings, memory, settings.inputs.region)
+    federate_step(work, settings, recall=recall, **means)
 
 
 class DriveSettings(StepSettings):
@@ -46,6 +67,17 @@ class DriveSettings(StepSettings):
     def needs(self) -> tuple[str, ...]:
         """Return the names of the steps whose results it takes."""
         return (self.before, self.learned, self.frames)
+
+
+@dataclass(frozen=True)
+class Driving(Saved):
+    """The network that drives after a condition: the group's copy, or the one that drove before."""
+
+    file: ClassVar[str] = "driving.json"
+    replaced: bool  # whether the copy took its place: it errs less on what its members held back
+    before: float | None  # mean loss of the members on these frames with the network that drove; None: no group
+    after: float | None  # and with the copy
+    recorded_s: float  # of driving in which the frames were recorded, by the clock of the traffic [s]
 
 
 def drive_step(work: Work, settings: DriveSettings) -> None:
@@ -119,7 +151,7 @@ def list_lifelong_steps(outline: Outline) -> Iterator[Step]:
 
 def _list_conditions(outline: Outline, own: Lifelong, main: Setting, task: str, arm: str) -> Iterator[Step]:
     names, training = outline.names, main.training[task]
-    asked = outline.recipe.lifelong_requests()
+    asked = find_requests(outline.recipe)
     drives, passed = names.pretrain(MAIN, task), list[RegionInputs]()
     for number, condition in enumerate(own.conditions):
         inputs = outline.inputs(main, condition, task, EDGE).model_copy(update={"pretrain": drives, "errors": None})
@@ -129,7 +161,7 @@ def _list_conditions(outline: Outline, own: Lifelong, main: Setting, task: str, 
         learned, frames = name_learning(condition, task, arm), names.recording(condition, EDGE, task)
         memory = Memory(conditions=tuple(passed), frames=own.memory) if arm == REPLAY and passed else None
         settings = _federate(outline, main, task, asked, inputs, memory)
-        yield make_step(learned, edge_step, settings, outline.vehicles[condition])
+        yield make_step(learned, learn_step, settings, outline.vehicles[condition])
         about: dict[str, Any] = {"task": task, "start": drives, "averaged": training.average_rounds}
         for seen in own.conditions[: number + 1]:
             about |= {"region": seen, "frames": names.recording(seen, "validation", task)}
@@ -150,11 +182,11 @@ def _list_conditions(outline: Outline, own: Lifelong, main: Setting, task: str, 
 
 def _federate(
     outline: Outline, main: Setting, task: str, asked: Requests, inputs: RegionInputs, memory: Memory | None
-) -> EdgeSettings:
+) -> ReplaySettings:
     """Return the settings of a condition's rounds: those of stage II, with groups on request."""
     about = outline.federation(main, task, EDGE)
     about["federation"] = main.edge_federation.model_copy(update={"requests": asked})
-    return EdgeSettings(**about, inputs=inputs, last=True, memory=memory)
+    return ReplaySettings(**about, inputs=inputs, last=True, memory=memory)
 
 
 def _track(outline: Outline, main: Setting, task: str, inputs: RegionInputs) -> Step:
@@ -163,3 +195,20 @@ def _track(outline: Outline, main: Setting, task: str, inputs: RegionInputs) -> 
     before = inputs.model_copy(update={"tracks": None})
     settings = TrackSettings(task=task, inputs=before, labels=main.labels[task], navigation=outline.recipe.navigation)
     return make_step(inputs.tracks, track_step, settings)
+
+
+def forecast_lifelong_s(outline: Outline, task: str, rounds: int, step_s: float, test_s: float) -> float:
+    """Return the time of lifelong learning [s], if a group of all vehicles forms in every condition of both arms.
+
+    rounds: of stage II. step_s, test_s: time of a training step, and to test a frame [s].
+    """
+    lifelong = outline.recipe.lifelong
+    if lifelong is None:
+        return 0.0
+    size, steps = outline.recipe.sized_splits, outline.settings[MAIN].training[task].local_steps
+    count = len(lifelong.conditions)
+    trained = rounds * steps * sum(outline.vehicles[each] for each in lifelong.conditions)
+    tested = count**2 * size.test.scenes * size.test.spins * size.test.cavs
+    watched = size.validation.scenes * size.validation.spins * size.validation.cavs
+    watched *= (1 + rounds) * count * (count + 1) // 2
+    return len(LEARNING) * (trained * step_s + (tested + watched) * test_s)

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from flcav.federation.buffered_rounds import count_participations
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.strategies import exchanges_more
@@ -31,14 +30,11 @@ from flcav.runs.labels.quality import measure_labels, read_history
 from flcav.runs.labels.road_average import RoadAverageLabels
 from flcav.runs.labels.tracks import label_tracked, load_tracks
 from flcav.runs.poles import find_sites
-from flcav.runs.radio.buffered import BufferedFleet
 from flcav.runs.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.runs.results.plans import Placed
-from flcav.runs.results.training import LabelQuality, Pretrained, StageResult
-from flcav.runs.steps.settings import FederationSettings, RegionInputs
+from flcav.runs.results.training import LabelQuality, Pretrained
+from flcav.runs.stages.settings import FederationSettings, RegionInputs
 from flcav.runs.training.learning import Learning, load_stage_network
-
-ALL_SCENES = 10**6  # more than there are
 
 
 @dataclass(frozen=True)
@@ -166,7 +162,7 @@ def drive_region(
     if network is None:
         return DrivenRounds(rules, {}, ())
     fleet = open_fleet(settings, learning, inputs.region, clients)
-    scenes = _link_scenes(work, inputs, network, earlier + len(seeds), learning.seed)
+    scenes = link_stage_scenes(work, inputs, network, earlier + len(seeds), learning.seed)
     driven = drive_rounds(fleet, scenes, network, rules, seeds, earlier)
     save_clock(driven, work, inputs.region)
     return driven
@@ -181,20 +177,10 @@ def open_fleet(settings: FederationSettings, learning: Learning, region: str, cl
     return Fleet(region, tuple(clients), down, up, settings.train_s, settings.speeds)
 
 
-def open_buffered_fleet(
-    work: Work, settings: FederationSettings, learning: Learning, inputs: RegionInputs, clients: Sequence[str]
-) -> BufferedFleet:
-    """Return the vehicles of a region that fill buffers, in all scenes of its training data."""
-    network, before = settings.federation.network, ()
-    assert network is not None  # of recipes that are checked
-    if inputs.edge is not None:
-        before = StageResult.load(work.inputs[inputs.edge]).records or ()
-    scenes = _link_scenes(work, inputs, network, ALL_SCENES, learning.seed)
-    took_part = count_participations([(each.clients, [*each.failed]) for each in before])
-    return BufferedFleet(open_fleet(settings, learning, inputs.region, clients), scenes, took_part)
-
-
-def _link_scenes(work: Work, inputs: RegionInputs, network: NetworkSettings, most: int, seed: int) -> list[RadioLinks]:
+def link_stage_scenes(
+    work: Work, inputs: RegionInputs, network: NetworkSettings, most: int, seed: int
+) -> list[RadioLinks]:
+    """Return the links of the vehicles in the first `most` scenes of a region's training data."""
     split, placed = Frames.open(work.inputs[inputs.frames]), Placed.load(work.inputs[inputs.place])
     return link_scenes(split, placed, network, most, seed)
 

@@ -6,7 +6,7 @@ again: it asks for the received updates once more, and the weights are those of 
 a strategy keeps at the server between rounds, such as moments, is lost with the lead.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from flcav.federation.rounds import OnRound
@@ -16,9 +16,9 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import RoundTiming
 from flcav.network.clock.rounds import LEFT_TOWN, NO_COVERAGE
 from flcav.network.ledger import Ledger, LedgerEntry
-from flcav.runs.results.groups import Term
+from flcav.runs.extras.groups.rows import Term
+from flcav.runs.stages.rounds import RunRounds
 
-RunRounds = Callable[[Weights, Account, int, OnRound], LocalUpdate]  # `federate` after so many rounds, with the rest
 LEAVES = (LEFT_TOWN, NO_COVERAGE)  # why a vehicle is lost that cannot lead any longer
 
 

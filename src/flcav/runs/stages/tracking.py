@@ -13,9 +13,9 @@ from flcav.runs.labels.pseudo_labels import road_views
 from flcav.runs.labels.tracks import WINDOW_S, save_tracks, track_frame
 from flcav.runs.recipe import TRACKING
 from flcav.runs.results.training import TrackedFrames
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.regions import choose_poles, select_group
-from flcav.runs.steps.settings import RegionInputs, StepSettings, make_step
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.regions import choose_poles, select_group
+from flcav.runs.stages.settings import RegionInputs, StepSettings, make_step
 from flcav.runs.training.learning import load_stage_network
 
 

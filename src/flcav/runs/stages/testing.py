@@ -20,8 +20,8 @@ from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.runs.results.saved import OUTCOMES
 from flcav.runs.results.tests import SweepComparison, SweepDetections, Tested
 from flcav.runs.results.training import ScoredRound, StageResult, Watched
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.settings import StepSettings, make_step
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.settings import StepSettings, make_step
 from flcav.runs.training.checkpoints import load_round_network
 from flcav.runs.training.learning import load_stage_network
 from flcav.statistics.estimates import Estimate

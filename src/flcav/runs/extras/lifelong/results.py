@@ -6,32 +6,32 @@ from pathlib import Path
 import numpy as np
 
 from flcav.network.ledger import Ledger
+from flcav.runs.extras.lifelong.replay import NO_LIMIT
+from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
+from flcav.runs.extras.lifelong.settings import LEARNING, LIFELONG, NOTHING, Lifelong
+from flcav.runs.extras.lifelong.steps import DELIVERED, Driving, count_recorded_s, name_driving, name_learning
 from flcav.runs.frames import Frames
-from flcav.runs.lifelong import LEARNING, LIFELONG, NOTHING, Lifelong
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
-from flcav.runs.results.lifelong import Driving, LifelongArm, Passed
 from flcav.runs.results.saved import LEDGER
 from flcav.runs.results.tests import Tested
 from flcav.runs.results.training import StageResult, Watched
-from flcav.runs.steps.graph import Graph
-from flcav.runs.steps.lifelong import DELIVERED, count_recorded_s, name_driving, name_learning
-from flcav.runs.steps.memory import NO_LIMIT
+from flcav.runs.stages.graph import Graph
 
 
-def collect_lifelong(graph: Graph, work: Path) -> tuple[LifelongArm, ...]:
-    """Return each task's arms of lifelong learning: with replay, without, and nothing; none where the run has none.
+def collect_lifelong(graph: Graph, work: Path) -> dict[str, tuple[LifelongArm, ...]]:
+    """Return each task's arms of lifelong learning: with replay, without, and nothing; no field where the run has none.
 
     Writes the ledger of each arm that learns to `ledgers` beside `work`.
     """
     own = graph.recipe.lifelong
     if own is None:
-        return ()
+        return {}
     arms = [_collect_learning(graph, work, own, task, arm) for task in graph.recipe.tasks for arm in LEARNING]
     for arm in LEARNING:
         steps = [folder / name for folder, name in _list_ledgers(graph, work, own, arm)]
         book = Ledger(NO_LIMIT, (entry for path in steps for entry in Ledger.load(path).entries))
         book.save(work.parent / "ledgers" / f"{LIFELONG}-{arm.replace(' ', '-')}.parquet")
-    return (*arms, *(_collect_nothing(graph, work, own, task) for task in graph.recipe.tasks))
+    return {"lifelong": (*arms, *(_collect_nothing(graph, work, own, task) for task in graph.recipe.tasks))}
 
 
 def find_mended(

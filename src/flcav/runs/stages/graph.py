@@ -1,6 +1,6 @@
 """The steps of a run in their order: plan, pretrain, register errors, place sensors, edge FL, cloud FL, test.
 
-After them come those of lifelong learning.
+After them come those of extras.
 """
 
 from collections.abc import Iterator
@@ -9,16 +9,15 @@ from pathlib import Path
 from flcav.runs.arms import Setting
 from flcav.runs.engine import Step
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
-from flcav.runs.steps.centralised import list_central_steps, list_pretraining
-from flcav.runs.steps.cloud import make_cloud_step
-from flcav.runs.steps.edge import list_edge_steps, list_more_edge_steps
-from flcav.runs.steps.lifelong import list_lifelong_steps
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.placing import list_placements
-from flcav.runs.steps.planning import make_plan_step, make_replan_step
-from flcav.runs.steps.recording import list_recordings, make_recording
-from flcav.runs.steps.testing import list_tests, list_validations
-from flcav.runs.steps.tracking import list_tracks
+from flcav.runs.registry import STEPS, load_all
+from flcav.runs.stages.centralised import list_central_steps, list_pretraining
+from flcav.runs.stages.federating import list_edge_steps, list_more_edge_steps, make_cloud_step
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.placing import list_placements
+from flcav.runs.stages.planning import make_plan_step, make_replan_step
+from flcav.runs.stages.recording import list_recordings, make_recording
+from flcav.runs.stages.testing import list_tests, list_validations
+from flcav.runs.stages.tracking import list_tracks
 
 
 class Graph(Outline):
@@ -59,7 +58,8 @@ class Graph(Outline):
                 elif MORE_EDGE in arm.stages:
                     yield from list_more_edge_steps(self, arm, task)
             yield from list_tests(self, arm)
-        yield from list_lifelong_steps(self)
+        for list_further in load_all(STEPS):
+            yield from list_further(self)
 
     def _start(self, arm: Setting) -> Iterator[Step]:
         """Yield the steps of an arm before it federates."""

@@ -28,10 +28,10 @@ from flcav.runs.recipe import ALL, CENTRAL, EDGE, PRETRAIN, Budgets
 from flcav.runs.results.plans import Plan
 from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.results.training import Pretrained, StageResult, Validated
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.planning import list_frames
-from flcav.runs.steps.regions import load_uploads, select_group
-from flcav.runs.steps.settings import (
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.planning import list_frames
+from flcav.runs.stages.regions import load_uploads, select_group
+from flcav.runs.stages.settings import (
     LearningSettings,
     RegionInputs,
     StepSettings,

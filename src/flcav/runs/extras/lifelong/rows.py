@@ -1,24 +1,12 @@
-"""Records of lifelong learning: the deployed network after each condition; scores, transfer, bytes and times by arm."""
+"""Records of lifelong learning: scores, transfer, bytes and times of each arm."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar
+from typing import Annotated
 
 from flcav.interface.wording import plural
-from flcav.runs.results.saved import Saved
 from flcav.statistics.transfer import compute_backward_transfer, compute_final_mean, compute_forward_transfer
 from flcav.storage.records import LEFT_OUT, Record
-
-
-@dataclass(frozen=True)
-class Driving(Saved):
-    """The network that drives after a condition: the group's copy, or the one that drove before."""
-
-    file: ClassVar[str] = "driving.json"
-    replaced: bool  # whether the copy took its place: it errs less on what its members held back
-    before: float | None  # mean loss of the members on these frames with the network that drove; None: no group
-    after: float | None  # and with the copy
-    recorded_s: float  # of driving in which the frames were recorded, by the clock of the traffic [s]
 
 
 @dataclass(frozen=True)
@@ -100,3 +88,10 @@ class LifelongArm(Record):
         if self.mended:
             mended += f", after {' and '.join(f'{each:.0f} s' for each in self.mended)}"
         return "; ".join([*told, mended])
+
+
+@dataclass(frozen=True)
+class LifelongRow:
+    """What lifelong learning adds to the results of a run."""
+
+    lifelong: Annotated[tuple[LifelongArm, ...] | None, LEFT_OUT] = None  # of each task and arm; None: not asked for

@@ -18,8 +18,9 @@ from flcav.federation.trainable import Trainable, Weights
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
-from flcav.runs.recipe import EDGE, Requests
-from flcav.runs.training.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss
+from flcav.runs.extras.groups.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss
+from flcav.runs.extras.groups.settings import Requests
+from flcav.runs.recipe import EDGE
 
 Array = NDArray[np.float64]
 
@@ -106,10 +107,6 @@ def has_levelled(losses: Sequence[float], how: Requests) -> bool:
         return False
     best = min(losses[: -how.patience])
     return min(losses[-how.patience :]) > best - how.least_gain * abs(best)
-
-
-class Levelled(Exception):
-    """The loss of a group has levelled off: it dissolves."""
 
 
 @dataclass

@@ -13,9 +13,9 @@ from flcav.runs.recipe import EDGE, Budgets, PlacementSettings
 from flcav.runs.results.plans import ErrorRegistry, Plan
 from flcav.runs.results.saved import ERRORS, LEDGER
 from flcav.runs.results.training import Pretrained
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.recording import make_recording
-from flcav.runs.steps.settings import StepSettings, make_step, open_region_book, share_plan_budget
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.recording import make_recording
+from flcav.runs.stages.settings import StepSettings, make_step, open_region_book, share_plan_budget
 from flcav.runs.training.learning import load_stage_network
 from flcav.runs.training.messages import release_network, report_errors
 

@@ -29,7 +29,7 @@ from flcav.runs.recipe import (
     find_path,
 )
 from flcav.runs.spread import read_spreads
-from flcav.runs.steps.settings import LearningSettings, RegionInputs
+from flcav.runs.stages.settings import LearningSettings, RegionInputs
 from flcav.runs.training.starting_weights import find_start
 from flcav.statistics.streams import derive_seed
 

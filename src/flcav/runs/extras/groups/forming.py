@@ -7,12 +7,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from safetensors.numpy import load_file
 
 from flcav.config import InputError
+from flcav.federation.rounds import OnRound
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.runtimes.link import NOTHING, UNREADABLE, Ask, open_questions
 from flcav.federation.runtimes.metered import Account
-from flcav.federation.trainable import Weights
+from flcav.federation.state import FederationState
+from flcav.federation.trainable import Trainable, Weights
+from flcav.network.clock.records import RoundTiming
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
 from flcav.perception.objects.samples import Sample
@@ -20,17 +24,7 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
 from flcav.runs.engine import Work
-from flcav.runs.frames import Frames
-from flcav.runs.labels.roadside import label_roadside
-from flcav.runs.poles import find_sites
-from flcav.runs.radio.driving import link_scenes
-from flcav.runs.recipe import EDGE, Requests
-from flcav.runs.results.groups import Checked, Group, Term
-from flcav.runs.results.plans import Placed
-from flcav.runs.results.training import Pretrained
-from flcav.runs.steps.settings import FederationSettings, RegionInputs
-from flcav.runs.training.fl_requests import answer_requests, take_requests
-from flcav.runs.training.groups import (
+from flcav.runs.extras.groups.choosing import (
     ABSENT,
     NO_LINK,
     SERVER_RANGE,
@@ -41,8 +35,9 @@ from flcav.runs.training.groups import (
     read_losses,
     weigh_offers,
 )
-from flcav.runs.training.learning import Learning, load_stage_network
-from flcav.runs.training.members import (
+from flcav.runs.extras.groups.fl_requests import answer_requests, take_requests
+from flcav.runs.extras.groups.leads import federate_led, follow_leads
+from flcav.runs.extras.groups.members import (
     ASKS,
     CHECK,
     HELD,
@@ -58,6 +53,21 @@ from flcav.runs.training.members import (
     hold_back,
     read_position,
 )
+from flcav.runs.extras.groups.roadside import label_roadside
+from flcav.runs.extras.groups.rows import Checked, Group, Term
+from flcav.runs.extras.groups.settings import Requests
+from flcav.runs.frames import Frames
+from flcav.runs.poles import find_sites
+from flcav.runs.radio.driving import link_scenes
+from flcav.runs.recipe import EDGE
+from flcav.runs.results.plans import Placed, Plan
+from flcav.runs.results.training import Pretrained
+from flcav.runs.stages.federating import EdgeSettings
+from flcav.runs.stages.regions import LabelledSamples
+from flcav.runs.stages.rounds import Conduct, RunRounds
+from flcav.runs.stages.settings import FederationSettings, RegionInputs
+from flcav.runs.training.checkpoints import round_path
+from flcav.runs.training.learning import Learning, load_stage_network
 from flcav.statistics.streams import derive_seed
 
 if TYPE_CHECKING:
@@ -69,19 +79,68 @@ Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `fi
 
 
 @dataclass(frozen=True)
-class Called:
-    """A group that was called, or not, in a region."""
+class Called(Conduct):
+    """A group that was called, or not, in a region: the conduct of its rounds."""
 
     group: Group
     samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
     watch: GroupWatch
     task: Task
-    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group
+    book: Ledger
+    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server leads
 
     @property
-    def vehicles(self) -> list[str]:
-        """Return the members that are vehicles."""
-        return [*self.group.members]
+    def within(self) -> frozenset[str]:
+        """Return the roadside units, which are at the edge server itself."""
+        return frozenset(self.group.roadside)
+
+    @property
+    def vacant(self) -> bool:
+        """Return whether nobody trains."""
+        return not self.samples
+
+    @property
+    def over(self) -> bool:
+        """Return whether the group is to dissolve."""
+        return self.watch.over
+
+    def enlist(self, clients: Mapping[str, Trainable]) -> Mapping[str, Trainable]:
+        """Return the clients, of which members answer questions, too."""
+        return self.watch.enlist(clients)
+
+    def resume(
+        self, folder: Path, clients: Mapping[str, Trainable], deployed: Any, account: Account, done: int
+    ) -> None:
+        """Note the losses after the rounds that are over, whose weights are in `folder`."""
+        with open_questions(clients, deployed if done else None, account) as ask:
+            for number in range(1, done + 1):
+                self.watch.note(self.watch.hear(ask, load_file(round_path(folder, number)), counted=False))
+
+    def follow(self, number: int, weights: Weights, ask: Ask) -> None:
+        """Note the loss after a round; the members' messages enter the ledger. Raises `BudgetExceeded`."""
+        self.watch.follow(self.book, number, weights, ask)
+
+    def foresee(self, records: tuple[RoundTiming, ...], region: str) -> "Called":
+        """Return the group with the terms of its leads, where a vehicle leads it."""
+        vehicles = [*self.group.members]
+        if self.group.lead not in vehicles:
+            return self
+        return replace(self, terms=follow_leads(vehicles, self.group.lead, records, region))
+
+    def run(
+        self, run: RunRounds, start: Weights, account: Account, on_round: OnRound, state: FederationState, done: int
+    ) -> None:
+        """Run the rounds after `done`, under one lead after another where vehicles lead."""
+        if self.terms:
+            federate_led(run, start, account, self.terms, on_round, state=state, done=done)
+        else:
+            run(start, account, done, on_round)
+
+    def report(self, work: Work, settings: EdgeSettings, rounds: int, deployed: Any) -> dict[str, Any]:
+        """Return the row of the group after its rounds, of which so many were planned."""
+        shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
+        with open_questions(self.watch.members, deployed, Account(self.book, EDGE, self.task.name, "wireless")) as ask:
+            return {"group": self.dissolve(work.folder, work.inputs[settings.inputs.pretrain], shown, rounds, ask)}
 
     def dissolve(self, folder: Path, before: Path, shown: Frames | None, most_rounds: int, ask: Ask) -> Group:
         """Return the group after its rounds; members tell what the network in `folder` does on what they held back.
@@ -101,6 +160,23 @@ class Called:
         led = tuple(term for term in self.terms if term.first < len(losses) or term.first == 1)
         about: Any = {"losses": losses, "most_rounds": most_rounds, "dissolved": over, "terms": led, "scores": scores}
         return replace(self.group, vehicles=vehicles, **about)
+
+
+def conduct_group(
+    work: Work,
+    settings: EdgeSettings,
+    labelled: LabelledSamples,
+    book: Ledger,
+    plan: Plan,
+    deployed: "RegionalDeployment | None",
+) -> tuple[Called, Mapping[str, Sequence[Any]]] | None:
+    """Return the conduct of a group's rounds, and its members' samples; None where all vehicles federate."""
+    how = settings.federation.requests
+    if how is None:
+        return None
+    most = plan.tasks[settings.learning.task].called
+    called = call_group(work, settings, settings.inputs, how, labelled.samples, book, most, labelled.poles, deployed)
+    return called, called.samples
 
 
 def call_group(
@@ -138,7 +214,7 @@ def call_group(
         vehicles |= {name: replace(vehicles[name], asks=True, told=own.loss) for name, own in before.items()}
         asked = sorted((name for name, own in vehicles.items() if own.asks), key=lambda name: -vehicles[name].error)
         if not asked:
-            return Called(Group(limit, vehicles, "", stayed=uplink.silent), {}, GroupWatch(how, {}), task)
+            return Called(Group(limit, vehicles, "", stayed=uplink.silent), {}, GroupWatch(how, {}), task, book)
         scene = int(np.flatnonzero(np.isfinite(places[asked[0]]).all(axis=1))[0])
         positions = {name: places[name][scene] for name in vehicles if np.isfinite(places[name][scene]).all()}
         for name, own in before.items():
@@ -148,7 +224,7 @@ def call_group(
         positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
         present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
         if not present:
-            return Called(Group(limit, vehicles, "nobody", stayed=uplink.silent), {}, GroupWatch(how, {}), task)
+            return Called(Group(limit, vehicles, "nobody", stayed=uplink.silent), {}, GroupWatch(how, {}), task, book)
         placed = Placed.load(work.inputs[inputs.place])
         lead = find_lead(positions, present, find_servers(split, placed, inputs), how.range_m)
         near = find_in_range(positions, present, how.range_m)
@@ -159,7 +235,7 @@ def call_group(
     stayed |= {name: NO_LINK for name in near if name not in linked}
     stayed |= uplink.silent
     if not offers:
-        return Called(Group(limit, vehicles, lead, stayed=stayed), {}, GroupWatch(how, {}), task)
+        return Called(Group(limit, vehicles, lead, stayed=stayed), {}, GroupWatch(how, {}), task, book)
     chosen = choose_members(how, [name for name in asked if name in offers], weigh_offers(offers), stayed, most)
     answer_requests(deployed, taken, chosen.members)
     held = {name: members[name] for name in chosen.members if len(members[name].held)}
@@ -171,7 +247,7 @@ def call_group(
         spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in split.vehicles}
         units = label_roadside(split, there, spins, frozen.config, inputs.region)
     group = Group(limit, vehicles, lead, chosen.members, chosen.quality, chosen.stayed, sent, roadside=tuple(units))
-    return Called(group, {name: members[name].data for name in chosen.members} | units, watch, task)
+    return Called(group, {name: members[name].data for name in chosen.members} | units, watch, task, book)
 
 
 def make_members(

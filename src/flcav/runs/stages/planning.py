@@ -30,9 +30,9 @@ from flcav.runs.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, PlanLimits
 from flcav.runs.results.plans import Plan
 from flcav.runs.results.saved import PROBLEM
 from flcav.runs.results.training import Watched, average_last
-from flcav.runs.steps.outline import Outline
-from flcav.runs.steps.settings import StepSettings, make_step, read_entries
-from flcav.runs.steps.testing import list_validations
+from flcav.runs.stages.outline import Outline
+from flcav.runs.stages.settings import StepSettings, make_step, read_entries
+from flcav.runs.stages.testing import list_validations
 from flcav.runs.tables import parse_history, read_history
 from flcav.storage.files import write_json
 

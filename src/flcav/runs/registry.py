@@ -1,0 +1,89 @@
+"""The extras of a run, registered here alone: to take one out, delete its folder in `extras` and its lines below.
+
+An extra adds fields to the recipe and to the results (the bases of the four classes), and functions where a run calls
+them: `load_all` returns those of a table. They are named as `module:NAME`, since their modules import the stages that
+call them; so the hash of a step's code follows the names, too.
+"""
+
+import functools
+import importlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+from flcav.config import Config
+from flcav.runs.extras.groups.rows import GroupRow
+from flcav.runs.extras.groups.settings import RequestFields
+from flcav.runs.extras.lifelong.rows import LifelongRow
+from flcav.runs.extras.lifelong.settings import LifelongFields
+
+
+class RecipeFields(
+    LifelongFields,
+    Config,
+):
+    """Fields of a run recipe."""
+
+
+class FederationFields(
+    RequestFields,
+    Config,
+):
+    """Fields of a recipe's `federation`."""
+
+
+@dataclass(frozen=True)
+class StageRows(
+    GroupRow,
+):
+    """Rows of a stage's result."""
+
+
+@dataclass(frozen=True)
+class RunRows(
+    LifelongRow,
+):
+    """Rows of a run's results."""
+
+
+# called with a recipe: raise ValueError where it is not consistent
+RECIPE_CHECKS = ("flcav.runs.extras.lifelong.checks:check_lifelong",)
+# called with recipe, settings of an arm, and strategy of its edge servers: raise `InputError` where they do not go
+# together
+ARM_CHECKS = (
+    "flcav.runs.extras.buffered.checks:check_buffers",
+    "flcav.runs.extras.groups.checks:check_groups",
+    "flcav.runs.extras.lifelong.checks:check_conditions",
+)
+# called with recipe and `Federation`: return how many vehicles a plan may call, or None
+CALLS = ("flcav.runs.extras.groups.checks:find_calls",)
+# called with an `Outline`: yield further steps
+STEPS = ("flcav.runs.extras.lifelong.steps:list_lifelong_steps",)
+# called in stage II with its step's work, settings, `LabelledSamples`, ledger, plan and deployed vehicles: return a
+# `Conduct` and the samples of those who take part, or None
+CONDUCTS = ("flcav.runs.extras.groups.forming:conduct_group",)
+# called with strategy, planned rounds, `RegionStart` by region and whether the cloud takes part: return both counted
+COUNTS = ("flcav.runs.extras.buffered.driving:count_buffers",)
+# called with a step's work, settings, `StageFederation` and ways by wireline [s]: return a `DrivenStage`, or None
+DRIVES = ("flcav.runs.extras.buffered.driving:drive_stage",)
+# called with `Graph` and folder of the steps: return fields of `Run`
+RESULTS = ("flcav.runs.extras.lifelong.results:collect_lifelong",)
+# called with `Graph`, task, rounds of stage II and times of a step and of a tested frame [s]: return further seconds
+FORECASTS = ("flcav.runs.extras.lifelong.steps:forecast_lifelong_s",)
+# called with a `Run`: return a `Section` of its page, or None
+SECTIONS = ("flcav.runs.extras.lifelong.section:describe_lifelong",)
+
+
+@dataclass(frozen=True)
+class Section:
+    """A section of a run's page; its fields are the values of its template, as `section`."""
+
+    template: ClassVar[str]  # below `extras`
+    chart: ClassVar[str]  # function that draws its pictures, by name, of a `Run`, as `module:NAME`
+
+
+@functools.cache
+def load_all(places: Sequence[str]) -> tuple[Any, ...]:
+    """Return the functions of a table, in its order."""
+    named = [place.partition(":") for place in places]
+    return tuple(getattr(importlib.import_module(module), name) for module, _, name in named)
