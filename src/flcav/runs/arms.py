@@ -13,7 +13,6 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
-from flcav.fusion.pose_graph import check_gtsam
 from flcav.perception.distillation import Imitates
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
@@ -34,7 +33,7 @@ from flcav.runs.recipe import (
     RunRecipe,
     Training,
 )
-from flcav.runs.registry import ARM_CHECKS, CALLS, load_all
+from flcav.runs.registry import ARM_CHECKS, AVERAGES, CALLS, load_all
 
 PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan", "calls")  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
@@ -146,7 +145,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
         arm.fault,
-        Distillation.model_validate((recipe.distillation or Distillation()).model_dump() | dict(arm.distillation)),
+        next((resolve(recipe, arm) for resolve in load_all(AVERAGES)), Distillation()),
         federation,
         {
             task: Training.model_validate(recipe.training_of(task).model_dump() | dict(arm.training))
@@ -229,11 +228,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
     _check_imitation(setting)
     _check_numbers(recipe, setting, edge)
-    _check_bare_labels(setting)
     if isinstance(edge, FedMD) and setting.central is None:
         _check_outputs(recipe, setting)
-    if setting.distillation.pose_graph and setting.central is None:
-        check_gtsam()
     for region in setting.regions:
         if recipe.regions[region].data is None:
             names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
@@ -255,8 +251,6 @@ def _check_imitation(setting: Setting) -> None:
     for task, training in setting.training.items():
         if training.imitation and task != OBJECTS.name:
             raise InputError(f"training.imitation: it keeps boxes, and '{task}' has none; give it to 'objects' alone")
-        if training.imitation and LABEL_SOURCES[setting.labels[task]].averaged:
-            raise InputError(f"training.imitation: the labels '{setting.labels[task]}' have a loss of their own")
 
 
 def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
@@ -283,18 +277,6 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
         raise InputError(f"{why}, and noise is for one number{instead}")
     if needs_known_number(strategy):
         raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
-
-
-def _check_bare_labels(setting: Setting) -> None:
-    """Raise `InputError` for labels that vehicles make together where noise or masks hide what each of them learns."""
-    how = setting.federation
-    averaged = [task for task, kind in setting.labels.items() if LABEL_SOURCES[kind].averaged]
-    if averaged and setting.central is None and (how.privacy is not None or how.secure is not None):
-        hidden = "secure" if how.privacy is None else "privacy"
-        raise InputError(
-            f"{hidden}: with the labels '{setting.labels[averaged[0]]}' of {averaged[0]} each vehicle sends boxes and "
-            "poses that change what others learn from, and neither noise nor masks cover them; choose other labels"
-        )
 
 
 def plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from flcav.config import InputError
 from flcav.perception.client import as_shared
 from flcav.perception.tasks import task_named
+from flcav.runs.registry import SOURCES
 
 
 @dataclass(frozen=True)
@@ -33,9 +34,6 @@ class LabelSource:
 LABEL_SOURCES: Mapping[str, LabelSource] = {
     "own-detections": LabelSource(from_detections=True),
     "road": LabelSource(from_detections=True, from_poles=True, trained=True, caveat="trained road detector"),
-    "road-average": LabelSource(
-        from_detections=True, from_poles=True, trained=True, averaged=True, caveat="trained road detector"
-    ),
     "tracks": LabelSource(from_detections=True, tracked=True),
     "road+tracks": LabelSource(
         from_detections=True, from_poles=True, trained=True, tracked=True, caveat="trained road detector"
@@ -45,12 +43,13 @@ LABEL_SOURCES: Mapping[str, LabelSource] = {
     "future": LabelSource(
         caveat="every vehicle knows all tracks around it, upper bound"
     ),  # the recorded future of each track
+    **{name: LabelSource(**about) for name, about in SOURCES.items()},
 }
 
 
 def choose_labels(task: str, asked: str | None) -> str:
     """Return the kind of labels of a task (None: its first); raises `InputError` for one the task does not have."""
-    known = as_shared(task_named(task)).labels
+    known = [kind for kind in as_shared(task_named(task)).labels if kind in LABEL_SOURCES]
     if asked is not None and asked not in known:
         raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")
     return asked or known[0]

@@ -13,11 +13,10 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.rules import Rules
 from flcav.federation.runtimes.ros_names import ROS_NAMESPACE
-from flcav.fusion.distillation import Distillation
 from flcav.fusion.navigation import NavigationErrors, PoseSource
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
-from flcav.runs.registry import RECIPE_CHECKS, FederationFields, RecipeFields, load_all
+from flcav.runs.registry import RECIPE_CHECKS, ArmFields, FederationFields, LabelFields, RecipeFields, load_all
 from flcav.sensors.calibration import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
 from flcav.statistics.streams import stream
@@ -292,8 +291,8 @@ def _name_replanning(value: Any) -> Any:
 Replanning = Annotated[Literal["none", "stages"], BeforeValidator(_name_replanning)]
 
 
-class Arm(Config):
-    """An arm of a comparison: how it differs from the run itself, and which stages it runs."""
+class _PlannedArm(Config):
+    """How an arm differs from the run in plan, placement, federation and labels."""
 
     plan: Literal["joint", "equal-stages", "equal-tasks", "max-throughput"] = (
         "joint"  # joint: optimal under both budgets; otherwise a baseline
@@ -302,7 +301,11 @@ class Arm(Config):
     federation: Mapping[str, Any] = {}  # fields of `Federation` that differ from the run
     labels: Mapping[str, str] = {}  # kinds of labels that differ from the run, by task
     fault: Fault | None = None  # learn from ground truth with this one fault of the labels, which come from tracks
-    distillation: Mapping[str, Any] = {}  # fields of `Distillation` that differ from the run
+
+
+class Arm(ArmFields, _PlannedArm):
+    """An arm of a comparison: how it differs from the run itself, and which stages it runs."""
+
     training: Mapping[str, Any] = {}  # fields of `Training` that differ from the run, for every task
     central: Literal["pretrain", "federate", "all"] | None = (
         None  # train centrally on the ground truth of the regions of this role; all: one network on that of both
@@ -358,7 +361,11 @@ class _Scene(Config):
     stragglers: Stragglers | None = None  # vehicles that train slower, in every region that is simulated
     placement: PlacementSettings = PlacementSettings()  # placement of roadside sensors
     federation: Federation = Federation()  # settings of aggregation
-    distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
+
+
+class _Drive(Config):
+    """How vehicles and recordings of a run differ from the defaults, and its arms."""
+
     navigation: PoseSource = (
         NavigationErrors()
     )  # errors of vehicles' poses and clocks, in labels of tracks and road sensors; or "estimated"
@@ -366,7 +373,7 @@ class _Scene(Config):
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
 
-class RunRecipe(RecipeFields, _Scene):
+class RunRecipe(RecipeFields, _Drive, LabelFields, _Scene):
     """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
     The seed determines traffic, sensor noise and initial weights. docs/runs.md describes every field. Raises pydantic's
@@ -454,7 +461,6 @@ class RunRecipe(RecipeFields, _Scene):
         parts: list[tuple[type[Config], Config, str]] = [
             (PlacementSettings, self.placement, "placement"),
             (Federation, self.federation, "federation"),
-            (Distillation, self.distillation or Distillation(), "distillation"),
             *((Training, self.training_of(task), "training") for task in self.tasks),
         ]
         for model, own, part in parts:

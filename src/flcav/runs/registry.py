@@ -7,15 +7,30 @@ call them; so the hash of a step's code follows the names, too.
 
 import functools
 import importlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 from flcav.config import Config
+from flcav.runs.extras.distillation.settings import AVERAGED, ArmDistillation, DistillationFields
 from flcav.runs.extras.groups.rows import GroupRow
 from flcav.runs.extras.groups.settings import RequestFields
 from flcav.runs.extras.lifelong.rows import LifelongRow
 from flcav.runs.extras.lifelong.settings import LifelongFields
+
+
+class LabelFields(
+    DistillationFields,
+    Config,
+):
+    """Fields of a run recipe about labels."""
+
+
+class ArmFields(
+    ArmDistillation,
+    Config,
+):
+    """Fields of an arm."""
 
 
 class RecipeFields(
@@ -47,16 +62,33 @@ class RunRows(
 
 
 # called with a recipe: raise ValueError where it is not consistent
-RECIPE_CHECKS = ("flcav.runs.extras.lifelong.checks:check_lifelong",)
+RECIPE_CHECKS = (
+    "flcav.runs.extras.lifelong.checks:check_lifelong",
+    "flcav.runs.extras.distillation.checks:check_arms",
+)
 # called with recipe, settings of an arm, and strategy of its edge servers: raise `InputError` where they do not go
 # together
 ARM_CHECKS = (
     "flcav.runs.extras.buffered.checks:check_buffers",
     "flcav.runs.extras.groups.checks:check_groups",
     "flcav.runs.extras.lifelong.checks:check_conditions",
+    "flcav.runs.extras.distillation.checks:check_averaged",
 )
 # called with recipe and `Federation`: return how many vehicles a plan may call, or None
 CALLS = ("flcav.runs.extras.groups.checks:find_calls",)
+# called with recipe and `Arm`: return how labels are averaged
+AVERAGES = ("flcav.runs.extras.distillation.checks:resolve_distillation",)
+# sources of labels by name: fields of `LabelSource`
+SOURCES: Mapping[str, Mapping[str, Any]] = {
+    **AVERAGED,
+}
+# called with a step's work, settings and `Labelling`: return samples that are labelled anew, or None
+LABELLERS = ("flcav.runs.extras.distillation.labelling:label_by_average",)
+# called with settings of a federation and `Learning`: return the latter with another loss, or None
+LOSSES = ("flcav.runs.extras.distillation.labelling:choose_distillation",)
+# called with the drives of regions, `Sensors`, settings of averaging and configuration of the network: return the size
+# of a vehicle's messages [MB]
+LABEL_SIZES = ("flcav.runs.extras.distillation.sizes:measure_messages",)
 # called with an `Outline`: yield further steps
 STEPS = ("flcav.runs.extras.lifelong.steps:list_lifelong_steps",)
 # called in stage II with its step's work, settings, `LabelledSamples`, ledger, plan and deployed vehicles: return a

@@ -30,10 +30,11 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import to_arrays
+from flcav.runs.extras.distillation import labelling as road_average
+from flcav.runs.extras.distillation.labelling import RoadAverageLabels
 from flcav.runs.frames import Frames
-from flcav.runs.labels import quality, road_average
+from flcav.runs.labels import quality
 from flcav.runs.labels.quality import measure_labels, read_history
-from flcav.runs.labels.road_average import RoadAverageLabels
 from flcav.runs.results.training import Found
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.world.map.layers import MapLane, MapLayers

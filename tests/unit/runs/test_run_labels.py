@@ -12,12 +12,13 @@ from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
 from flcav.runs.analysis.caveats import PLACED_BARE, list_caveats
 from flcav.runs.arms import resolve_settings
+from flcav.runs.extras.distillation.sizes import measure_messages
 from flcav.runs.frames import Frames
 from flcav.runs.label_sources import LABEL_SOURCES, choose_labels
 from flcav.runs.labels import pseudo_labels
 from flcav.runs.labels.pseudo_labels import fit_label_threshold, select_frames_near
 from flcav.runs.plan import exchanges
-from flcav.runs.plan.exchanges import RegionDrive, Sensors, measure_labels
+from flcav.runs.plan.exchanges import RegionDrive, Sensors
 from flcav.runs.recipe import RunRecipe
 
 
@@ -124,7 +125,7 @@ def test_a_vehicle_s_messages_are_priced_for_all_spins_of_its_windows(monkeypatc
     def priced_mb(recorded: bool, window_s: float) -> float:
         region = RegionDrive(drive, recorded, training_frames=20, vehicles=2)
         sensors = Sensors((), 1, 40.0, 60.0)
-        return measure_labels([region], sensors, Distillation(window_s=window_s), cast(Any, None))
+        return measure_messages([region], sensors, Distillation(window_s=window_s), cast(Any, None))
 
     assert priced_mb(recorded=False, window_s=0.0) == pytest.approx(20 * 1e-3 / 2)
     assert priced_mb(recorded=False, window_s=0.5) == pytest.approx(3 * 20 * 1e-3 / 2)

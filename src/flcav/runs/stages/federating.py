@@ -17,7 +17,6 @@ from flcav.perception.weights import to_arrays
 from flcav.runs.arms import Setting, find_calls, find_strategies
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
-from flcav.runs.labels.road_average import RoadAverageLabels
 from flcav.runs.plan.updates import follow_plan
 from flcav.runs.radio.driving import DrivenStage, join_regions
 from flcav.runs.recipe import CLOUD, EDGE, MORE_EDGE, Federation
@@ -27,6 +26,7 @@ from flcav.runs.results.training import StageResult, StatisticsScore
 from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.regions import (
     LabelledSamples,
+    RenewedSamples,
     choose_loss,
     drive_region,
     label_samples,
@@ -247,7 +247,7 @@ def _open_federation(
         clients = make_clients(learning, network.config, samples[region])
         weights = to_arrays(load_stage_network(learning.task, work.inputs[inputs.edge or inputs.pretrain]))
         earlier, own = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds, samples[region]
-        if inputs.edge is not None and rounds and isinstance(own, RoadAverageLabels):
+        if inputs.edge is not None and rounds and isinstance(own, RenewedSamples):
             own.renew(1, weights)
         starts[region] = RegionStart(clients, weights, earlier, how.edge_rounds_per_cloud_round if cloud else 1)
     for count in load_all(COUNTS):
@@ -272,7 +272,7 @@ def _open_federation(
         validation={}
         if cloud
         else {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()},
-        relabel=relabel.renew if isinstance(relabel, RoadAverageLabels) else None,
+        relabel=relabel.renew if isinstance(relabel, RenewedSamples) else None,
         conduct=conduct,
     )
 

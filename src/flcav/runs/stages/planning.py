@@ -22,11 +22,12 @@ from flcav.runs.arms import PlanRule, Setting
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
 from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.runs.plan.exchanges import RegionDrive, Sensors, measure_exchange, measure_labels
+from flcav.runs.plan.exchanges import RegionDrive, Sensors, measure_exchange
 from flcav.runs.plan.replanning import remake_plan
 from flcav.runs.plan.updates import UpdateForm, model_mb, update_forms
 from flcav.runs.radio.driving import link_drive, measure_uplinks, predict_air_s
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, PlanLimits
+from flcav.runs.registry import LABEL_SIZES, load_all
 from flcav.runs.results.plans import Plan
 from flcav.runs.results.saved import PROBLEM
 from flcav.runs.results.training import Watched, average_last
@@ -186,7 +187,7 @@ def _measure_labels(
         for region, step in how.drives.items()
     ]
     sensors = Sensors(how.poles, how.count, how.traffic_m, how.near_m)
-    return measure_labels(regions, sensors, how.distillation, config)
+    return sum(measure(regions, sensors, how.distillation, config) for measure in load_all(LABEL_SIZES))
 
 
 def _link_drives(work: Work, air: AirSettings, seed: int) -> dict[str, list[RadioLinks]]:

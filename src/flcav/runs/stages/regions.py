@@ -1,5 +1,6 @@
 """A region's vehicles in the steps of stages II and III: their labelled samples, and the radio of their rounds."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -9,12 +10,12 @@ import numpy as np
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.runtimes.embedded import update_bytes
 from flcav.federation.strategies import exchanges_more
+from flcav.federation.trainable import Weights
 from flcav.network.clock.records import save_rounds
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
 from flcav.network.radio.links import RadioLinks
 from flcav.perception.objects.distillation.imitation import ImitatingObjects
-from flcav.perception.objects.distillation.road_average import DistillationTerms, DistilledObjects
 from flcav.perception.weights import to_arrays
 from flcav.runs.engine import Work
 from flcav.runs.frames import Frames
@@ -26,15 +27,41 @@ from flcav.runs.labels.pseudo_labels import (
     pseudo_label_samples,
     select_frames_near,
 )
-from flcav.runs.labels.quality import measure_labels, read_history
-from flcav.runs.labels.road_average import RoadAverageLabels
+from flcav.runs.labels.quality import measure_labels
 from flcav.runs.labels.tracks import label_tracked, load_tracks
 from flcav.runs.poles import find_sites
 from flcav.runs.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
+from flcav.runs.registry import LABELLERS, LOSSES, load_all
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.training import LabelQuality, Pretrained
 from flcav.runs.stages.settings import FederationSettings, RegionInputs
 from flcav.runs.training.learning import Learning, load_stage_network
+
+
+class RenewedSamples(Mapping[str, Sequence[Any]], ABC):
+    """Samples of a region's vehicles, by "region/vehicle", that are labelled anew in the course of the rounds."""
+
+    @abstractmethod
+    def renew(self, round_: int, weights: Weights) -> None:
+        """Label all samples by what `weights` detect, before a round."""
+
+    @abstractmethod
+    def list_quality(self) -> tuple[LabelQuality, ...]:
+        """Return the quality of the labels before each round so far."""
+
+
+@dataclass(frozen=True)
+class Labelling:
+    """What the labels of a region's vehicles come from."""
+
+    split: Frames
+    frames: Sequence[int]  # to be labelled
+    poles: Sequence[int]  # whose sensors contribute
+    config: Any  # of the pretrained network
+    threshold: float  # lowest score of a label
+    inputs: RegionInputs
+    book: Ledger  # of the messages
+    stage: str  # that they are entered under
 
 
 @dataclass(frozen=True)
@@ -73,8 +100,8 @@ def label_samples(
 ) -> LabelledSamples:
     """Return the labelled samples of a region's vehicles; messages enter `book`, under `stage`.
 
-    Labels "road-average" are to be renewed: in stage II before each round; after it, where `inputs` has a stage II to
-    go on from, once, and vehicles still have what road sensors saw.
+    Some are to be renewed: in stage II before each round; after it, where `inputs` has a stage II to go on from, once,
+    and vehicles still have what road sensors saw.
     """
     task = settings.learning.resolve().task
     split, kind = Frames.open(work.inputs[inputs.frames]), LABEL_SOURCES[settings.labels]
@@ -85,15 +112,12 @@ def label_samples(
     pretrained = Pretrained.load(work.inputs[inputs.pretrain])
     threshold = pretrained.track_threshold if kind.tracked else pretrained.threshold
     assert threshold is not None  # fixed wherever labels come from detections
-    if settings.distillation is not None:
-        folder = work.folder if inputs.edge is None else None
-        where: Any = (split, frames, poles, inputs.region, book, stage, folder, work.report)
-        averaged = RoadAverageLabels(settings.distillation, settings.navigation, frozen.config, threshold, *where)
-        if inputs.edge is None:
-            averaged.send_views()
-        return LabelledSamples(averaged, poles)
+    about = Labelling(split, frames, poles, frozen.config, threshold, inputs, book, stage)
+    for label in load_all(LABELLERS):
+        if (renewed := label(work, settings, about)) is not None:
+            return LabelledSamples(renewed, poles)
     first = book if inputs.edge is None else None  # later labels are those of stage II
-    where = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
+    where: Any = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
     if inputs.tracks is not None:
         tracks = load_tracks(work.inputs[inputs.tracks])
         samples = label_frames(label_tracked(tracks, threshold, frozen.config), *where)
@@ -120,14 +144,12 @@ def load_uploads(work: Work, learning: Learning, config: Any, pretrained: str, p
 def choose_loss(work: Work, settings: FederationSettings, pretrained: str) -> Learning:
     """Return the settings of a federation's training, with the loss that they ask for.
 
-    It is the task's own, that of federated distillation, or the task's own with imitation of the network of the step
-    `pretrained`.
+    It is that of an extra, the task's own, or this with imitation of the network of the step `pretrained`.
     """
-    learning, how = settings.learning.resolve(), settings.distillation
-    if how is not None:
-        on = ("regression" in how.terms, "contrastive" in how.terms)
-        terms = DistillationTerms(*on, how.contrastive_weight, how.temperature)
-        return replace(learning, task=DistilledObjects(terms))
+    learning = settings.learning.resolve()
+    for choose in load_all(LOSSES):
+        if (other := choose(settings, learning)) is not None:
+            return other
     if weight := learning.training.imitation:
         teacher = load_stage_network(learning.task, work.inputs[pretrained])
         return replace(learning, task=ImitatingObjects(teacher, weight))
@@ -138,8 +160,8 @@ def score_labels(
     work: Work, inputs: RegionInputs, config: Any, samples: Mapping[str, Sequence[Any]]
 ) -> tuple[LabelQuality, ...]:
     """Return the quality of the labels of a stage II before each round; of labels that stay, before the first."""
-    if isinstance(samples, RoadAverageLabels):
-        return read_history(work.folder).rounds
+    if isinstance(samples, RenewedSamples):
+        return samples.list_quality()
     split = Frames.open(work.inputs[inputs.frames])
     return (measure_labels(1, split, select_group(work, split, inputs), inputs.region, samples, config),)
 

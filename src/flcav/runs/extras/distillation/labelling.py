@@ -8,6 +8,7 @@ all windows that the spin is in. After stage II samples are labelled once, befor
 """
 
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,23 +33,28 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Direction, Ledger
 from flcav.network.messages import send
 from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.distillation.road_average import DistillationTerms, DistilledObjects
 from flcav.perception.objects.model import second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.weights import from_arrays
+from flcav.runs.engine import Work
 from flcav.runs.frames import SLACK_S, Frames, list_window
 from flcav.runs.labels.pseudo_labels import Spin, road_views
 from flcav.runs.labels.quality import LABELS, measure_labels, read_history
 from flcav.runs.labels.sightings import make_sighting
 from flcav.runs.recipe import EDGE
-from flcav.runs.results.training import LabelHistory
+from flcav.runs.results.training import LabelHistory, LabelQuality
+from flcav.runs.stages.regions import Labelling, RenewedSamples
+from flcav.runs.stages.settings import FederationSettings
+from flcav.runs.training.learning import Learning
 from flcav.world.map.lanes import map_layers
 
 SURVEYED = np.eye(4)  # road sensors tell of boxes in the world frame
 
 
-class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
+class RoadAverageLabels(RenewedSamples):
     """The samples of a region's vehicles, by "region/vehicle"; `renew` labels them by the road average."""
 
     def __init__(
@@ -104,6 +110,10 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     def __len__(self) -> int:
         """Return the number of vehicles."""
         return len(self._samples)
+
+    def list_quality(self) -> tuple[LabelQuality, ...]:
+        """Return the quality of the labels before each round so far; none where it is not kept."""
+        return () if self._folder is None else read_history(self._folder).rounds
 
     def _name(self, frame: int) -> str:
         return f"{self._region}/{self._split.data.keys[frame].agent}"
@@ -171,3 +181,40 @@ class RoadAverageLabels(Mapping[str, Sequence[Sample]]):
     def _send(self, direction: Direction, i: int, round_: int, message: bytes) -> bytes:
         about: Any = {"stage": self._stage, "task": OBJECTS.name, "link": "wireless", "client": self._name(i)}
         return send(self._book, message, **about, direction=direction, round_=round_)
+
+
+def label_by_average(work: Work, settings: FederationSettings, about: Labelling) -> RoadAverageLabels | None:
+    """Return a region's samples, to be labelled by the road average, once vehicles have what road sensors see.
+
+    None of other labels. After a stage II they have it.
+    """
+    how, first = settings.distillation, about.inputs.edge is None
+    if how is None:
+        return None
+    found = RoadAverageLabels(
+        how,
+        settings.navigation,
+        about.config,
+        about.threshold,
+        about.split,
+        about.frames,
+        about.poles,
+        about.inputs.region,
+        about.book,
+        about.stage,
+        work.folder if first else None,
+        work.report,
+    )
+    if first:
+        found.send_views()
+    return found
+
+
+def choose_distillation(settings: FederationSettings, learning: Learning) -> Learning | None:
+    """Return the settings of a training with the loss of federated distillation; None for other labels."""
+    how = settings.distillation
+    if how is None:
+        return None
+    on = ("regression" in how.terms, "contrastive" in how.terms)
+    terms = DistillationTerms(*on, how.contrastive_weight, how.temperature)
+    return replace(learning, task=DistilledObjects(terms))
