@@ -5,9 +5,9 @@ weights are equal.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from flcav.geometry.arrays import Array
 
 LEAST = 0.01  # least factor of a quality, relative to the fleet's best: no data are worth nothing
 

@@ -25,8 +25,7 @@ from flcav.perception.weights import to_arrays
 from flcav.runs.arms import Setting, check_federations
 from flcav.runs.frames import Frames, deal_frames, make_recording_recipe, record_frames
 from flcav.runs.plan.allocation import PlanRequest, make_plan
-from flcav.runs.plan.exchanges import measure_exchange
-from flcav.runs.plan.updates import model_mb
+from flcav.runs.plan.updates import measure_exchange, model_mb
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
 from flcav.runs.registry import FORECASTS, load_all
 from flcav.runs.results.training import PrivacySpent

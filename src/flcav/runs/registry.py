@@ -69,7 +69,7 @@ RECIPE_CHECKS = (
 # called with recipe, settings of an arm, and strategy of its edge servers: raise `InputError` where they do not go
 # together
 ARM_CHECKS = (
-    "flcav.runs.extras.buffered.checks:check_buffers",
+    "flcav.runs.extras.buffered.driving:check_buffers",
     "flcav.runs.extras.groups.checks:check_groups",
     "flcav.runs.extras.lifelong.checks:check_conditions",
     "flcav.runs.extras.distillation.checks:check_averaged",
@@ -103,7 +103,7 @@ RESULTS = ("flcav.runs.extras.lifelong.results:collect_lifelong",)
 # called with `Graph`, task, rounds of stage II and times of a step and of a tested frame [s]: return further seconds
 FORECASTS = ("flcav.runs.extras.lifelong.steps:forecast_lifelong_s",)
 # called with a `Run`: return a `Section` of its page, or None
-SECTIONS = ("flcav.runs.extras.lifelong.section:describe_lifelong",)
+SECTIONS = ("flcav.runs.extras.lifelong.results:describe_lifelong",)
 
 
 @dataclass(frozen=True)

@@ -17,8 +17,7 @@ from flcav.optimization.verification.allocation import verify_allocation
 from flcav.runs.arms import Names, resolve_settings
 from flcav.runs.extras.groups.choosing import choose_members
 from flcav.runs.extras.groups.settings import Requests
-from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.runs.plan.replanning import remake_plan
+from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
 from flcav.runs.recipe import PlanLimits, RunRecipe
 from flcav.runs.tables import parse_history, read_history
 

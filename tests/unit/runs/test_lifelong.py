@@ -9,8 +9,7 @@ from flcav.config import InputError, parse_config
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.runs.arms import check_federations
 from flcav.runs.extras.groups.rows import Checked, Group
-from flcav.runs.extras.lifelong.memory import Joined, divide_memory, spread_evenly
-from flcav.runs.extras.lifelong.replay import NO_LIMIT
+from flcav.runs.extras.lifelong.replay import NO_LIMIT, Joined, divide_memory, spread_evenly
 from flcav.runs.extras.lifelong.results import find_mended
 from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
 from flcav.runs.extras.lifelong.steps import (

@@ -14,7 +14,6 @@ from flcav.federation.trainable import Weights
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.network.messages import pack
 from flcav.perception.task import Task
-from flcav.runs.extras.groups.fl_requests import answer_requests, take_requests
 from flcav.runs.extras.groups.forming import UNREADABLE, Uplink
 from flcav.runs.extras.groups.members import (
     ASKS,
@@ -30,8 +29,10 @@ from flcav.runs.extras.groups.members import (
     Member,
     Offer,
     Unreadable,
+    answer_requests,
     read_loss,
     read_position,
+    take_requests,
 )
 
 DRIVES = {"weight": np.array([[1.0]], np.float32), "bias": np.array([0.5], np.float32)}  # y = x + 0.5

@@ -32,8 +32,7 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
 from flcav.runs.arms import PlanRule
 from flcav.runs.plan import allocation
-from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.runs.plan.replanning import remake_plan
+from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
 from flcav.runs.plan.updates import model_mb
 from flcav.runs.recipe import FixedPlan, PlanLimits, load_run_recipe
 from flcav.runs.results.plans import TaskPlan

@@ -12,13 +12,13 @@ from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
 from flcav.runs.analysis.caveats import PLACED_BARE, list_caveats
 from flcav.runs.arms import resolve_settings
+from flcav.runs.extras.distillation import sizes
 from flcav.runs.extras.distillation.sizes import measure_messages
 from flcav.runs.frames import Frames
 from flcav.runs.label_sources import LABEL_SOURCES, choose_labels
 from flcav.runs.labels import pseudo_labels
 from flcav.runs.labels.pseudo_labels import fit_label_threshold, select_frames_near
-from flcav.runs.plan import exchanges
-from flcav.runs.plan.exchanges import RegionDrive, Sensors
+from flcav.runs.plan.updates import RegionDrive, Sensors
 from flcav.runs.recipe import RunRecipe
 
 
@@ -118,9 +118,9 @@ def test_a_vehicle_s_messages_are_priced_for_all_spins_of_its_windows(monkeypatc
     times_s = (0.0, 0.5, 1.0, 4.0)
     keys = [SimpleNamespace(scene="s", agent="cav0", index=i, time_s=time_s) for i, time_s in enumerate(times_s)]
     drive = Frames(cast(Any, SimpleNamespace(keys=keys)), (1, 3), {})
-    monkeypatch.setattr(exchanges, "_expect_sensors", lambda region, sensors: np.zeros((1, 2)))
-    monkeypatch.setattr(exchanges, "select_frames_near", lambda drive, sites, near_m: drive.vehicles)
-    monkeypatch.setattr(exchanges, "_sighting_bytes", lambda *about: 1000)
+    monkeypatch.setattr(sizes, "_expect_sensors", lambda region, sensors: np.zeros((1, 2)))
+    monkeypatch.setattr(sizes, "select_frames_near", lambda drive, sites, near_m: drive.vehicles)
+    monkeypatch.setattr(sizes, "_sighting_bytes", lambda *about: 1000)
 
     def priced_mb(recorded: bool, window_s: float) -> float:
         region = RegionDrive(drive, recorded, training_frames=20, vehicles=2)

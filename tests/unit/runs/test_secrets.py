@@ -26,8 +26,7 @@ from flcav.perception.weights import to_arrays
 from flcav.runs.recipe import Training
 from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.stages.rounds import RegionStart
-from flcav.runs.training.learning import Learning, Strategies, make_clients
-from flcav.runs.training.secrets import (
+from flcav.runs.training.checkpoints import (
     PART,
     SECRETS,
     SECRETS_HASH,
@@ -35,6 +34,7 @@ from flcav.runs.training.secrets import (
     remove_secrets,
     write_secrets,
 )
+from flcav.runs.training.learning import Learning, Strategies, make_clients
 
 ROUNDS, VEHICLES = 6, 3
 Federate = Callable[..., None]

@@ -18,7 +18,7 @@ from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.results.training import Pretrained
 from flcav.runs.stages.centralised import pretrain_step
 from flcav.runs.stages.graph import Graph
-from flcav.runs.training.starting_weights import find_start, load_start
+from flcav.runs.training.learning import find_start, load_start
 
 WEATHER = task_named("weather")
 SHIPPED = find_shipped(WEATHER)

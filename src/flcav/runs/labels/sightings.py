@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.dataset.layout import navigation_path
@@ -15,14 +14,13 @@ from flcav.fusion.navigation import ESTIMATED, PoseSource, state_accuracy
 from flcav.fusion.posts import find_posts
 from flcav.fusion.sightings import Navigation, Sighting
 from flcav.geometry import Boxes, transform_points
+from flcav.geometry.arrays import Array
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar
 from flcav.sensors.frame import Frame
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
-
-Array = NDArray[np.float64]
 
 KEPT_DRIVES = 64  # whose estimated poses are kept
 

@@ -40,9 +40,8 @@ from flcav.runs.stages.settings import (
     share_plan_budget,
 )
 from flcav.runs.training.checkpoints import LAST
-from flcav.runs.training.learning import Learning, load_stage_network
+from flcav.runs.training.learning import Learning, StartingWeights, load_stage_network, load_start
 from flcav.runs.training.messages import choose_planned_uploads, choose_uploads, upload_samples
-from flcav.runs.training.starting_weights import StartingWeights, load_start
 from flcav.statistics.streams import derive_seed
 
 CHECKPOINT, ROUND = "checkpoint.pt", LAST

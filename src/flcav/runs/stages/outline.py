@@ -30,7 +30,7 @@ from flcav.runs.recipe import (
 )
 from flcav.runs.spread import read_spreads
 from flcav.runs.stages.settings import LearningSettings, RegionInputs
-from flcav.runs.training.starting_weights import find_start
+from flcav.runs.training.learning import find_start
 from flcav.statistics.streams import derive_seed
 
 NAVIGATION_S = 20.0  # of navigation logs before the first frame

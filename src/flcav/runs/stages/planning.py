@@ -21,10 +21,8 @@ from flcav.perception.tasks import task_named
 from flcav.runs.arms import PlanRule, Setting
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
-from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan
-from flcav.runs.plan.exchanges import RegionDrive, Sensors, measure_exchange
-from flcav.runs.plan.replanning import remake_plan
-from flcav.runs.plan.updates import UpdateForm, model_mb, update_forms
+from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
+from flcav.runs.plan.updates import RegionDrive, Sensors, UpdateForm, measure_exchange, model_mb, update_forms
 from flcav.runs.radio.driving import link_drive, measure_uplinks, predict_air_s
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, PlanLimits
 from flcav.runs.registry import LABEL_SIZES, load_all

@@ -8,6 +8,7 @@ from typing import Any
 
 from safetensors.numpy import load_file, save
 
+from flcav.config import Config, InputError, shorten
 from flcav.federation.rounds import Schedule
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import Strategy
@@ -16,13 +17,13 @@ from flcav.perception.client import TaskClient
 from flcav.perception.distillation import OutputClient, SharedSamples
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
-from flcav.perception.weights import from_arrays, load_network, to_arrays
+from flcav.perception.weights import find_shipped, from_arrays, load_network, to_arrays
 from flcav.runs.frames import Frames
-from flcav.runs.recipe import Training
+from flcav.runs.recipe import TaskRecipe, Training, find_path
 from flcav.runs.results.saved import WEIGHTS
 from flcav.runs.results.training import StatisticsScore
 from flcav.statistics.streams import derive_seed
-from flcav.storage.files import write_bytes
+from flcav.storage.files import sha256, write_bytes
 
 
 @dataclass(frozen=True)
@@ -125,3 +126,42 @@ def score_statistics(
 
 def _path(folder: Path, region: str) -> Path:
     return folder / f"statistics-{region}.safetensors"
+
+
+SHIPPED = "shipped"  # name of the weights that come with the package
+
+
+class StartingWeights(Config):
+    """A file of weights from which stage I goes on."""
+
+    path: str
+    version: str  # SHA-256 of the file
+
+
+def find_start(task: Task, own: TaskRecipe, beside: Path) -> StartingWeights | None:
+    """Return the weights that a task begins with, None for random ones.
+
+    Raises `InputError` where the file is not in `beside`, or its network has other arrays than the recipe's.
+    """
+    if own.weights is None:
+        return None
+    path = find_shipped(task) if own.weights == SHIPPED else find_path(own.weights, beside)
+    if path is None:
+        raise InputError(f"tasks.{task.name}.weights: there is no file {shorten(own.weights)} in {beside}")
+    held, wanted = load_network(task, path), build_network(task, find_configuration(task, own.network), 0)
+    if _shapes(held) != _shapes(wanted):
+        network = own.network or next(iter(task.configurations))
+        raise InputError(f"{path}: weights of another network than '{network}', which the recipe has for '{task.name}'")
+    return StartingWeights(path=str(path.absolute()), version=sha256(path))
+
+
+def load_start(task: Task, start: StartingWeights) -> Any:
+    """Return the network to go on from; raises `InputError` where its file has changed since `find_start`."""
+    path = Path(start.path)
+    if sha256(path) != start.version:
+        raise InputError(f"{path}: the weights were changed while the run was under way")
+    return load_network(task, path)
+
+
+def _shapes(network: Any) -> dict[str, tuple[int, ...]]:
+    return {name: array.shape for name, array in to_arrays(network).items()}

@@ -8,6 +8,7 @@ full and the models have gone up and down by wireline. Meanwhile vehicles go on,
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
+from flcav.config import InputError
 from flcav.federation.buffered_rounds import BrokenUpdate, BufferedRound, Buffers, count_participations
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import Strategy
@@ -16,9 +17,11 @@ from flcav.network.clock.buffers import BufferClock, BufferTiming
 from flcav.network.clock.records import ClientTiming
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.radio.links import RadioLinks
+from flcav.runs.arms import Setting, plans_joiners
 from flcav.runs.engine import Work
+from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.radio.driving import DrivenRounds, DrivenStage, Fleet, join_regions
-from flcav.runs.recipe import CLOUD
+from flcav.runs.recipe import CLOUD, RunRecipe
 from flcav.runs.results.training import StageResult
 from flcav.runs.stages.federating import StageSettings
 from flcav.runs.stages.regions import link_stage_scenes, open_fleet, save_clock
@@ -150,3 +153,15 @@ def open_buffered_fleet(
     scenes = link_stage_scenes(work, inputs, network, ALL_SCENES, learning.seed)
     took_part = count_participations([(each.clients, [*each.failed]) for each in before])
     return BufferedFleet(open_fleet(settings, learning, inputs.region, clients), scenes, took_part)
+
+
+def check_buffers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where an arm's rounds are buffers, and no clock is theirs, or something goes by rounds."""
+    if not isinstance(strategy, FedBuff):
+        return
+    if setting.federation.network is None:
+        raise InputError("strategy fedbuff: vehicles go on at their own pace, by the clock of 'federation.network'")
+    if plans_joiners(recipe, setting):
+        raise InputError("strategy fedbuff: nobody joins rounds by a plan; leave out horizon_s")
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("strategy fedbuff: labels 'road-average' are made anew before a round that all begin together")

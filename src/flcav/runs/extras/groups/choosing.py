@@ -11,18 +11,16 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.federation.runtimes.link import Ask
 from flcav.federation.trainable import Trainable, Weights
+from flcav.geometry.arrays import Array
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
 from flcav.runs.extras.groups.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss
 from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.recipe import EDGE
-
-Array = NDArray[np.float64]
 
 SERVER_RANGE = "out of V2X range of whoever asked"
 ABSENT = "not in the town"

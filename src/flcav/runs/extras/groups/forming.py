@@ -35,7 +35,6 @@ from flcav.runs.extras.groups.choosing import (
     read_losses,
     weigh_offers,
 )
-from flcav.runs.extras.groups.fl_requests import answer_requests, take_requests
 from flcav.runs.extras.groups.leads import federate_led, follow_leads
 from flcav.runs.extras.groups.members import (
     ASKS,
@@ -50,8 +49,10 @@ from flcav.runs.extras.groups.members import (
     Offer,
     Picked,
     Unreadable,
+    answer_requests,
     hold_back,
     read_position,
+    take_requests,
 )
 from flcav.runs.extras.groups.roadside import label_roadside
 from flcav.runs.extras.groups.rows import Checked, Group, Term

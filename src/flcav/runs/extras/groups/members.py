@@ -7,22 +7,27 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from safetensors import SafetensorError
 
+from flcav.federation.messages.fl_request import FLRequest, parse_request
 from flcav.federation.trainable import Trainable, Update, Weights, count_samples
+from flcav.geometry.arrays import Array
 from flcav.machine.threads import use_threads
 from flcav.network.messages import from_names, pack, to_names, unpack
 from flcav.perception.client import TaskClient
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays
+from flcav.runs.results.saved import Saved
 from flcav.statistics.streams import stream
 
-Array = NDArray[np.float64]
+if TYPE_CHECKING:
+    from flcav.federation.runtimes.deployed import RegionalDeployment
 
 SKETCH = 64  # numbers
 CHECK, REQUEST, OFFER, SCORE = "check", "request", "offer", "score"  # questions
@@ -213,3 +218,37 @@ class Picked(Sequence[Any]):
         if isinstance(index, slice):
             return [self._samples[place] for place in self._places[index]]
         return self._samples[self._places[index]]
+
+
+@dataclass(frozen=True)
+class TakenRequests(Saved):
+    """FL requests for a task that were waiting when a group formed."""
+
+    file: ClassVar[str] = "fl-requests.json"
+
+    messages: Mapping[str, tuple[str, ...]]  # by client, as they were sent, the latest last
+
+    def read(self) -> dict[str, FLRequest]:
+        """Return the latest request of each client."""
+        return {name: parse_request(own[-1].encode()) for name, own in self.messages.items()}
+
+
+def take_requests(
+    deployed: "RegionalDeployment | None", folder: Path, clients: Sequence[str], task: str
+) -> TakenRequests:
+    """Return the FL requests of a region's `clients` for a task: those that `folder` has, or that wait in the fleet."""
+    if (folder / TakenRequests.file).exists():
+        return TakenRequests.load(folder)
+    if deployed is None or not clients:
+        return TakenRequests({})
+    waiting = deployed.fleet_of(clients[0]).list_requests(clients, task)
+    taken = TakenRequests({name: tuple(content.decode() for content in own) for name, own in waiting.items()})
+    taken.save(folder)
+    return taken
+
+
+def answer_requests(deployed: "RegionalDeployment | None", taken: TakenRequests, members: Sequence[str]) -> None:
+    """Mark the requests of a group's members as answered."""
+    answered = [each.encode() for name, own in taken.messages.items() if name in members for each in own]
+    if deployed is not None and answered:
+        deployed.fleet_of(members[0]).answer_requests(answered)

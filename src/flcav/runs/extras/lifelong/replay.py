@@ -6,7 +6,6 @@ from typing import Any
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.runs.engine import Work
 from flcav.runs.extras.groups.members import Picked
-from flcav.runs.extras.lifelong.memory import Joined, divide_memory, spread_evenly
 from flcav.runs.recipe import EDGE
 from flcav.runs.stages.regions import label_samples
 from flcav.runs.stages.settings import FederationSettings, RegionInputs, StepSettings
@@ -38,3 +37,31 @@ def remember(
             held = known.get(f"{inputs.region}/{name.removeprefix(f'{region}/')}", ())
             own.append(Picked(held, spread_evenly(len(held), frames)))
     return {name: Joined(own) for name, own in parts.items()}
+
+
+def divide_memory(frames: int, conditions: int) -> list[int]:
+    """Return how many of `frames` are of each condition: as equal as they go, the latest have more."""
+    return [frames * (number + 1) // conditions - frames * number // conditions for number in range(conditions)]
+
+
+def spread_evenly(count: int, kept: int) -> list[int]:
+    """Return the places of `kept` of `count` samples, evenly spread; all places where there are no more."""
+    if kept >= count:
+        return [*range(count)]
+    return [int((number + 0.5) * count / kept) for number in range(kept)]
+
+
+class Joined(Sequence[Any]):
+    """The samples of several sequences, one after another, each read when it is asked for."""
+
+    def __init__(self, parts: Sequence[Sequence[Any]]) -> None:
+        self._places = [(part, place) for part in parts for place in range(len(part))]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [part[place] for part, place in self._places[index]]
+        part, place = self._places[index]
+        return part[place]

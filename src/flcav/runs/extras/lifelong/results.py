@@ -1,7 +1,9 @@
 """Results of lifelong learning, of the finished steps of a run: scores, transfer, bytes, and seconds until mended."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 
@@ -12,6 +14,8 @@ from flcav.runs.extras.lifelong.settings import LEARNING, LIFELONG, NOTHING, Lif
 from flcav.runs.extras.lifelong.steps import DELIVERED, Driving, count_recorded_s, name_driving, name_learning
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
+from flcav.runs.registry import Section
+from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER
 from flcav.runs.results.tests import Tested
 from flcav.runs.results.training import StageResult, Watched
@@ -137,3 +141,22 @@ def _reachable(graph: Graph, work: Path, condition: str, task: str) -> float:
     """
     steps = [graph.names.stage(MAIN, stage, condition, task) for stage in (PRETRAIN, EDGE)]
     return max(Watched.load(work / graph.names.rounds(step, condition)).rounds[-1].score for step in steps)
+
+
+@dataclass(frozen=True)
+class LifelongSection(Section):
+    """The values of the section."""
+
+    template: ClassVar[str] = "lifelong/section.html.j2"
+    chart: ClassVar[str] = "flcav.report.charts.lifelong:draw_lifelong"
+
+    arms: tuple[LifelongArm, ...]
+    conditions: tuple[tuple[LifelongArm, Passed], ...]  # in which vehicles asked
+
+
+def describe_lifelong(run: Run) -> LifelongSection | None:
+    """Return the section of a run; None where it has no lifelong learning."""
+    if not run.lifelong:
+        return None
+    passed = tuple((arm, each) for arm in run.lifelong for each in arm.passed if each.asked)
+    return LifelongSection(run.lifelong, passed)
