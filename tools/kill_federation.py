@@ -24,7 +24,7 @@ from pathlib import Path
 
 from flcav.interface.progress import ignore_progress
 from flcav.machine.threads import use_threads
-from flcav.runs.alone import WORK, list_needed
+from flcav.runs.edge_stage import WORK, list_needed
 from flcav.runs.engine import Step, ignore_steps, run_steps
 from flcav.runs.engine.step import StepRecord, read_record
 from flcav.runs.engine.workers import perform

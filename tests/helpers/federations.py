@@ -13,7 +13,7 @@ from flcav.interface.progress import Report
 from flcav.network.ledger import Ledger
 from flcav.perception.client import TaskClient
 from flcav.perception.weights import to_arrays
-from flcav.runs.radio.driving import DrivenStage
+from flcav.runs.driving import DrivenStage
 from flcav.runs.stages.rounds import CloudServer, RegionStart, StageFederation, Whereabouts, federate_stage
 from flcav.runs.training.learning import Learning, Strategies
 

@@ -7,7 +7,7 @@ import pytest
 
 from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import Ledger
-from flcav.runs.alone import federate_regions
+from flcav.runs.edge_stage import federate_regions
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe, Training, load_run_recipe
 from flcav.runs.results.run import Run
 from flcav.runs.running import run

@@ -10,8 +10,8 @@ from flcav.experiments.run_tables import tables
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
 from flcav.report.pages.run_page import draw
-from flcav.runs.alone import TRAIN_TIMES, Federations, name_results
-from flcav.runs.radio.driving import TOO_SLOW
+from flcav.runs.driving import TOO_SLOW
+from flcav.runs.edge_stage import TRAIN_TIMES, Federations, name_results
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, Training, load_run_recipe
 from flcav.runs.results.run import Run
 from flcav.runs.running import SPREAD, run

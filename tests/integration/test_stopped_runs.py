@@ -16,8 +16,8 @@ from waiting import LONGEST_S, wait_for
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
-from flcav.runs.alone import federate_regions
 from flcav.runs.comparing import compare
+from flcav.runs.edge_stage import federate_regions
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, load_run_recipe
 from flcav.runs.results.training import Pretrained
 from flcav.runs.running import run

@@ -48,7 +48,7 @@ def federate(
         refuse_unused(f"--runtime {runtime.value}", "fleet")
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.runs.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
+    from flcav.runs.edge_stage import TRAIN_TIMES, federate_regions, measure_times, name_results
     from flcav.runs.recipe import load_run_recipe
     from flcav.runs.results.training import TOGETHER
     from flcav.sources.recipe import find_recipe
@@ -91,7 +91,7 @@ def _describe(result: "StageResult") -> str:
 
 def _telling(notify: "Notify") -> "Notify":
     """Return a `Notify` that also prints the rounds as they end."""
-    from flcav.runs.alone import tells_of_round
+    from flcav.runs.edge_stage import tells_of_round
 
     def tell(step: str, done: int, total: int, note: str) -> None:
         of_round = tells_of_round(step, note)

@@ -22,10 +22,9 @@ from flcav.perception.client import as_shared
 from flcav.perception.outcomes import score_network
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
+from flcav.runs.allocation import PlanRequest, make_plan
 from flcav.runs.arms import Setting, check_federations
 from flcav.runs.frames import Frames, deal_frames, make_recording_recipe, record_frames
-from flcav.runs.plan.allocation import PlanRequest, make_plan
-from flcav.runs.plan.updates import measure_exchange, model_mb
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
 from flcav.runs.registry import FORECASTS, load_all
 from flcav.runs.results.training import PrivacySpent
@@ -39,6 +38,7 @@ from flcav.runs.training.private_rounds import (
     find_budget_noise,
     plan_private_rounds,
 )
+from flcav.runs.updates import measure_exchange, model_mb
 from flcav.storage.records import LEFT_OUT, Record
 
 STEPS = 3  # that are timed

@@ -75,7 +75,7 @@ ARM_CHECKS = (
     "flcav.runs.extras.distillation.checks:check_averaged",
 )
 # called with recipe and `Federation`: return how many vehicles a plan may call, or None
-CALLS = ("flcav.runs.extras.groups.checks:find_calls",)
+CALLS = ("flcav.runs.extras.groups.checks:count_called",)
 # called with recipe and `Arm`: return how labels are averaged
 AVERAGES = ("flcav.runs.extras.distillation.checks:resolve_distillation",)
 # sources of labels by name: fields of `LabelSource`
@@ -102,12 +102,12 @@ DRIVES = ("flcav.runs.extras.buffered.driving:drive_stage",)
 RESULTS = ("flcav.runs.extras.lifelong.results:collect_lifelong",)
 # called with `Graph`, task, rounds of stage II and times of a step and of a tested frame [s]: return further seconds
 FORECASTS = ("flcav.runs.extras.lifelong.steps:forecast_lifelong_s",)
-# called with a `Run`: return a `Section` of its page, or None
+# called with a `Run`: return a `PageSection` of its page, or None
 SECTIONS = ("flcav.runs.extras.lifelong.results:describe_lifelong",)
 
 
 @dataclass(frozen=True)
-class Section:
+class PageSection:
     """A section of a run's page; its fields are the values of its template, as `section`."""
 
     template: ClassVar[str]  # below `extras`

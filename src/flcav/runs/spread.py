@@ -15,7 +15,7 @@ from pathlib import Path
 from flcav.config import InputError
 from flcav.runs.results.run import Run
 from flcav.runs.results.tests import Difference, Test
-from flcav.runs.tables import read_table
+from flcav.runs.tables import read_named_table
 from flcav.statistics.estimates import Spread, measure_spread, pool_spreads, widen, widen_share
 
 Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before
@@ -88,7 +88,7 @@ def read_spreads(name: str, beside: Path) -> Spreads:
 
     Raises `InputError` where there is no such table, or a row is not a spread.
     """
-    table = io.StringIO(read_table("spread", name, "spread", "spreads", beside))
+    table = io.StringIO(read_named_table("spread", name, "spread", "spreads", beside))
     try:
         rows = list(csv.DictReader(table))
     except csv.Error as error:  # of a cell that is longer than any

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from flcav.optimization.curves.history import History, parse_histories
 
 
-def read_table(field: str, name: str, noun: str, folder: str, beside: Path) -> str:
+def read_named_table(field: str, name: str, noun: str, folder: str, beside: Path) -> str:
     """Return the text of a table: one of the package by its name, in `folder`, or a file below `beside`.
 
     Raises `InputError`, naming the recipe's `field` and the table by its `noun`, where there is none.
@@ -84,7 +84,7 @@ def read_history(task: str, name: str, beside: Path) -> str:
 
     Raises `InputError` where there is no such table, or it has no rows of the task.
     """
-    text = read_table(f"tasks.{task}.history", name, "history", "histories", beside)
+    text = read_named_table(f"tasks.{task}.history", name, "history", "histories", beside)
     parse_history(task, text, name)
     return text
 

@@ -23,9 +23,8 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.wireline import Wireline
-from flcav.runs.poles import Sites
-from flcav.runs.radio import driving as prediction
-from flcav.runs.radio.driving import (
+from flcav.runs import driving as prediction
+from flcav.runs.driving import (
     DrivenRounds,
     Fleet,
     drive_rounds,
@@ -34,6 +33,7 @@ from flcav.runs.radio.driving import (
     measure_uplinks,
     predict_air_s,
 )
+from flcav.runs.poles import Sites
 from flcav.runs.recipe import CLOUD, Stragglers, draw_stragglers
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing

@@ -21,7 +21,7 @@ from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER
 from flcav.runs.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
 from flcav.runs.training.checkpoints import Checkpoint
-from flcav.runs.training.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
+from flcav.runs.training.records import EVENTS, ROUNDS, read_rounds, save_rounds, tabulate_rounds
 
 
 def entry(link: Link, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
@@ -67,7 +67,7 @@ def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
     save_rounds(run, tmp_path)
     save_rounds(run, tmp_path)  # a run that is collected again leaves one set of curves
     rows = pq.read_table(tmp_path / ROUNDS).to_pylist()
-    assert rows == rounds_table(run).to_pylist()
+    assert rows == tabulate_rounds(run).to_pylist()
     assert [(row["arm"], row["stage"], row["task"], row["round"]) for row in rows] == [
         (MAIN, EDGE, "objects", number) for number in (1, 2)
     ]

@@ -14,10 +14,10 @@ from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.curves.history import History
 from flcav.optimization.problem import Problem
 from flcav.optimization.verification.allocation import verify_allocation
+from flcav.runs.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
 from flcav.runs.arms import Names, resolve_settings
 from flcav.runs.extras.groups.choosing import choose_members
 from flcav.runs.extras.groups.settings import Requests
-from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
 from flcav.runs.recipe import PlanLimits, RunRecipe
 from flcav.runs.tables import parse_history, read_history
 

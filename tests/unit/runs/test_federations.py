@@ -28,7 +28,6 @@ from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import to_arrays
 from flcav.runs.arms import check_federations, find_strategies
-from flcav.runs.plan.updates import UpdateForm, model_mb, update_forms
 from flcav.runs.recipe import Federation, Training
 from flcav.runs.results.saved import WEIGHTS
 from flcav.runs.results.training import StatisticsScore
@@ -43,6 +42,7 @@ from flcav.runs.training.learning import (
     score_statistics,
 )
 from flcav.runs.training.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
+from flcav.runs.updates import UpdateForm, model_mb, update_forms
 from flcav.statistics.streams import derive_seed
 
 BUSY_S = 0.05  # CPU time of a training

@@ -20,8 +20,8 @@ from flcav.perception.weights import to_arrays
 from flcav.runs.extras.groups import forming
 from flcav.runs.extras.groups.choosing import GroupWatch
 from flcav.runs.extras.groups.forming import Called
-from flcav.runs.extras.groups.members import Member, measure_loss
-from flcav.runs.extras.groups.rows import Group, Term
+from flcav.runs.extras.groups.members import GroupMember, measure_loss
+from flcav.runs.extras.groups.rows import Group, LeadTerm
 from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.recipe import Training
 from flcav.runs.results.saved import WEIGHTS
@@ -35,7 +35,7 @@ def federate_group(
     folder: Path,
     outages: dict[tuple[int, str], Outage],
     rounds: int = 3,
-    terms: tuple[Term, ...] = (),
+    terms: tuple[LeadTerm, ...] = (),
     roadside: tuple[str, ...] = (),
     watch: GroupWatch | None = None,
 ) -> tuple[bytes, Ledger]:
@@ -51,10 +51,10 @@ def federate_group(
 
 def test_a_lead_that_leaves_in_mid_round_leaves_the_weights_of_the_next_from_the_round_s_start(tmp_path: Path) -> None:
     gone = {(2, "a/cav0"): Outage("left the town", 7), (3, "a/cav0"): Outage("not in the town")}
-    terms = (Term("a/cav0", 1, 2, 1), Term("a/cav1", 2))
+    terms = (LeadTerm("a/cav0", 1, 2, 1), LeadTerm("a/cav1", 2))
     found, book = federate_group(tmp_path / "led", gone, terms=terms)
     away = {key: Outage("gone") for key in gone}
-    expected, other = federate_group(tmp_path / "from", away, terms=(Term("a/cav1", 1),))
+    expected, other = federate_group(tmp_path / "from", away, terms=(LeadTerm("a/cav1", 1),))
     assert found == expected
     assert [e.client for e in book if (e.round, e.direction) == (2, "up")] == ["a/cav1", "a/cav2"]  # lost; asked again
     assert [e.client for e in other if (e.round, e.direction) == (2, "up")] == ["a/cav2"]
@@ -78,7 +78,7 @@ def test_a_group_dissolves_by_the_loss_on_what_it_holds_back_whatever_validation
     def end(name: str, scores: tuple[float, float]) -> tuple[bytes, Group]:
         start = LEARNING.build_network()
         about = (to_arrays(start), 0.1, 0, np.zeros((1, 3)))
-        members = {who: Member(LEARNING.task, Slope(), 2, own, own, *about) for who, own in held.items()}
+        members = {who: GroupMember(LEARNING.task, Slope(), 2, own, own, *about) for who, own in held.items()}
         first = np.mean([measure_loss(LEARNING.task, Slope(), to_arrays(start), own, 2) for own in held.values()])
         watch = GroupWatch(Requests(patience=1, least_gain=0.5), members, [float(first)])
         weights, book = federate_group(tmp_path / name, {}, 9, watch=watch)

@@ -33,12 +33,12 @@ from flcav.runs.extras.groups.members import (
     MESSAGE,
     SKETCH,
     Offer,
-    count_labels,
+    count_sample_labels,
     find_gradient,
     hold_back,
     sketch_gradient,
 )
-from flcav.runs.extras.groups.rows import Checked, Group, Term
+from flcav.runs.extras.groups.rows import CheckedNetwork, Group, LeadTerm
 from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.recipe import RunRecipe
 
@@ -143,10 +143,10 @@ def test_a_loss_that_is_lost_or_cannot_be_read_counts_for_nothing() -> None:
 
 def test_labels_are_counted_by_class_and_sketches_keep_angles() -> None:
     picture = np.zeros((32, 32, 3), np.uint8)
-    assert count_labels([Sample(picture, each) for each in (3, 3, 5)]) == {"3": 2, "5": 1}
+    assert count_sample_labels([Sample(picture, each) for each in (3, 3, 5)]) == {"3": 2, "5": 1}
     boxes = SimpleNamespace(boxes=SimpleNamespace(label=np.array(["car", "car"])))
-    assert count_labels([boxes]) == {"car": 2}
-    assert count_labels([SimpleNamespace(past=1)]) == {}
+    assert count_sample_labels([boxes]) == {"car": 2}
+    assert count_sample_labels([SimpleNamespace(past=1)]) == {}
     gradients = np.random.default_rng(1).normal(size=(3, 500))
     gradients[1] = 0.8 * gradients[0] + 0.6 * gradients[1]
 
@@ -164,7 +164,11 @@ def test_labels_are_counted_by_class_and_sketches_keep_angles() -> None:
 
 
 def test_the_record_says_who_asked_why_who_came_and_what_it_mended() -> None:
-    vehicles = {"grid/a": Checked(3, 1.4, 0.6, asks=True), "grid/b": Checked(3, 0.2, 0.3), "grid/c": Checked(3, 0.1)}
+    vehicles = {
+        "grid/a": CheckedNetwork(3, 1.4, 0.6, asks=True),
+        "grid/b": CheckedNetwork(3, 0.2, 0.3),
+        "grid/c": CheckedNetwork(3, 0.1),
+    }
     group = Group(
         *(0.9, vehicles, "pole3", ("grid/a", "grid/b"), {"grid/a": 1.0}, {"grid/c": "no link to spare"}),
         *(1234, 6, (0.8, 0.5, 0.45), "the loss has levelled off"),
@@ -175,11 +179,13 @@ def test_the_record_says_who_asked_why_who_came_and_what_it_mended() -> None:
         "levelled off"
     )
     assert Group.from_json(group.as_json(), "here") == group
-    lasting = replace(group, vehicles={**vehicles, "grid/a": Checked(3, 1.4, 1.0, asks=True)}, scores=(0.5, 0.25))
+    lasting = replace(
+        group, vehicles={**vehicles, "grid/a": CheckedNetwork(3, 1.4, 1.0, asks=True)}, scores=(0.5, 0.25)
+    )
     assert lasting.mended == ()
     assert "mended: 0 of 1" in lasting.describe()
     assert "on validation frames 0.500 to 0.250, which nobody acts on" in lasting.describe()
-    terms = (Term("grid/a", 1, 2, 1), Term("grid/b", 2, 3), Term("grid/c", 3))
+    terms = (LeadTerm("grid/a", 1, 2, 1), LeadTerm("grid/b", 2, 3), LeadTerm("grid/c", 3))
     adhoc = replace(group, lead="grid/a", terms=terms, roadside=("grid/pole3",))
     assert "grid/a led 2 vehicles and 1 roadside unit (pole3) for 2" in adhoc.describe()
     assert "grid/a left in round 2 with 1 update, and the round began again; grid/b was gone before round 3" in (

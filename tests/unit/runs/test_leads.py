@@ -17,7 +17,7 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import ClientTiming, RoundTiming
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.runs.extras.groups.leads import federate_led, follow_leads
-from flcav.runs.extras.groups.rows import Term
+from flcav.runs.extras.groups.rows import LeadTerm
 
 SCHEDULE = Schedule(rounds=4, steps=2, learning_rate=0.1, final_learning_rate=0.05, seed=3)
 START = {"w": np.arange(6, dtype=np.float64)}
@@ -44,7 +44,9 @@ def account(outages: dict[tuple[int, str], Outage] | None = None, **more: Any) -
     return Account(Ledger(LinkMegabytes(1.0, 0.0)), "edge", "t", "wireless", outages or {}, **more)
 
 
-def lead(clients: Any, weights: Weights, own: Account, terms: list[Term], on_round: OnRound, **about: Any) -> Weights:
+def lead(
+    clients: Any, weights: Weights, own: Account, terms: list[LeadTerm], on_round: OnRound, **about: Any
+) -> Weights:
     """Federate under the leads of these terms."""
     state, done = about.pop("state", None) or FederationState(), about.pop("done", 0)
     schedule = about.pop("schedule", SCHEDULE)
@@ -55,7 +57,7 @@ def lead(clients: Any, weights: Weights, own: Account, terms: list[Term], on_rou
     return federate_led(run, weights, own, terms, on_round, state=state, done=done).weights
 
 
-def led(terms: list[Term], outages: dict[tuple[int, str], Outage], **how: Any) -> tuple[Weights, Account, dict]:
+def led(terms: list[LeadTerm], outages: dict[tuple[int, str], Outage], **how: Any) -> tuple[Weights, Account, dict]:
     own, vehicles, reached = account(outages), clients(), dict[int, Weights]()
     keep = lambda number, weights, _loss: reached.__setitem__(number, weights)  # noqa: E731
     weights = lead(vehicles, START, own, terms, keep, **how)
@@ -70,7 +72,7 @@ LEAVES = {(3, "r/a"): Outage("left the town", 17), (4, "r/a"): Outage("not in th
 def test_a_lead_that_leaves_in_mid_round_is_replaced_and_the_weights_are_those_of_the_next_lead_from_its_start() -> (
     None
 ):
-    weights, own, vehicles = led([Term("r/a", 1, 3, 2), Term("r/b", 3)], LEAVES)
+    weights, own, vehicles = led([LeadTerm("r/a", 1, 3, 2), LeadTerm("r/b", 3)], LEAVES)
     away = {key: Outage("left the town") for key in LEAVES}
     alone = account(away, within=frozenset({"r/b"}))
     expected = federate(clients(), START, SCHEDULE, alone).weights
@@ -89,14 +91,14 @@ def test_a_lead_that_leaves_in_mid_round_is_replaced_and_the_weights_are_those_o
 
 @pytest.mark.parametrize("received", [0, 1, 2])
 def test_however_many_updates_it_had(received: int) -> None:
-    weights, own, _ = led([Term("r/a", 1, 3, received), Term("r/b", 3)], LEAVES)
-    np.testing.assert_array_equal(weights["w"], led([Term("r/a", 1, 3), Term("r/b", 3)], LEAVES)[0]["w"])
+    weights, own, _ = led([LeadTerm("r/a", 1, 3, received), LeadTerm("r/b", 3)], LEAVES)
+    np.testing.assert_array_equal(weights["w"], led([LeadTerm("r/a", 1, 3), LeadTerm("r/b", 3)], LEAVES)[0]["w"])
     assert sum(each.round == 3 and each.direction == "up" for each in own.ledger) == received + 2
 
 
 def test_several_leave_one_after_another() -> None:
     outages = LEAVES | {(3, "r/b"): Outage("left the town", 0), (4, "r/b"): Outage("not in the town")}
-    terms = [Term("r/a", 1, 3, 1), Term("r/b", 3, 3, 1), Term("r/c", 3)]
+    terms = [LeadTerm("r/a", 1, 3, 1), LeadTerm("r/b", 3, 3, 1), LeadTerm("r/c", 3)]
     weights, own, _ = led(terms, outages)
     away = account({key: Outage("gone") for key in outages}, within=frozenset({"r/c"}))
     np.testing.assert_array_equal(weights["w"], federate(clients(), START, SCHEDULE, away).weights["w"])
@@ -104,7 +106,7 @@ def test_several_leave_one_after_another() -> None:
 
 
 def test_a_stopped_group_goes_on_in_the_term_of_its_round() -> None:
-    terms, states, reached = [Term("r/a", 1, 3, 2), Term("r/b", 3)], FederationState(), dict[int, Weights]()
+    terms, states, reached = [LeadTerm("r/a", 1, 3, 2), LeadTerm("r/b", 3)], FederationState(), dict[int, Weights]()
     whole, own, _ = led(terms, LEAVES)
 
     def stop(number: int, weights: Weights, _loss: float | None) -> None:
@@ -124,7 +126,7 @@ def test_a_stopped_group_goes_on_in_the_term_of_its_round() -> None:
 
 def test_what_a_lead_kept_is_lost_with_it() -> None:
     strategy: Any = {"strategy": strategy_named({"fedavgm": {"momentum": 0.9}})}
-    weights, _, _ = led([Term("r/a", 1, 3), Term("r/b", 3)], LEAVES, **strategy)
+    weights, _, _ = led([LeadTerm("r/a", 1, 3), LeadTerm("r/b", 3)], LEAVES, **strategy)
     first = federate(clients(), START, Schedule(4, 2, 0.1, 0.05, 3), account(LEAVES), **strategy).weights
     assert not np.array_equal(weights["w"], first["w"])  # which has the moments of all rounds
 
@@ -137,32 +139,32 @@ def timing(number: int, *clients: tuple[str, float, str]) -> RoundTiming:
 @pytest.mark.parametrize(
     ("rounds", "terms"),
     [
-        ([timing(1, ("a", 1, ""), ("b", 2, "")), timing(2, ("a", 1, ""), ("b", 2, ""))], [Term("r/a", 1)]),
+        ([timing(1, ("a", 1, ""), ("b", 2, "")), timing(2, ("a", 1, ""), ("b", 2, ""))], [LeadTerm("r/a", 1)]),
         (  # b's update is there, c's is not
             [timing(1, ("a", 2, "left the town"), ("b", 1, ""), ("c", 3, "")), timing(2, ("b", 1, ""), ("c", 1, ""))],
-            [Term("r/a", 1, 1, 1), Term("r/b", 1)],
+            [LeadTerm("r/a", 1, 1, 1), LeadTerm("r/b", 1)],
         ),
         (  # it leaves when all updates are there, and is away in the next round
             [timing(1, ("a", 4, "left the town"), ("b", 1, ""), ("c", 3, "")), timing(2, ("b", 1, ""), ("c", 1, ""))],
-            [Term("r/a", 1, 2), Term("r/b", 2)],
+            [LeadTerm("r/a", 1, 2), LeadTerm("r/b", 2)],
         ),
         (  # past a deadline its update is late, but it is there
             [timing(1, ("a", 2, "past the deadline"), ("b", 1, ""), ("c", 3, ""))],
-            [Term("r/a", 1)],
+            [LeadTerm("r/a", 1)],
         ),
         (  # a comes back, and leads no more while another can
             [timing(1, ("b", 1, ""), ("c", 1, "")), timing(2, ("a", 1, ""), ("c", 1, "")), timing(3, ("a", 1, ""))],
-            [Term("r/a", 1, 1), Term("r/b", 1, 2), Term("r/c", 2, 3), Term("r/a", 3)],
+            [LeadTerm("r/a", 1, 1), LeadTerm("r/b", 1, 2), LeadTerm("r/c", 2, 3), LeadTerm("r/a", 3)],
         ),
-        ([timing(1)], [Term("r/a", 1)]),  # nobody is there
+        ([timing(1)], [LeadTerm("r/a", 1)]),  # nobody is there
     ],
 )
-def test_who_leads_by_the_clock(rounds: list[RoundTiming], terms: list[Term]) -> None:
+def test_who_leads_by_the_clock(rounds: list[RoundTiming], terms: list[LeadTerm]) -> None:
     assert [*follow_leads(["r/a", "r/b", "r/c"], "r/a", rounds, "r")] == terms
 
 
 def test_a_round_begins_again_where_clients_train_in_processes() -> None:
-    terms, found = [Term("r/a", 1, 2, 1), Term("r/b", 2)], []
+    terms, found = [LeadTerm("r/a", 1, 2, 1), LeadTerm("r/b", 2)], []
     for count in (1, 2):
         own, vehicles = account(), clients()
         with ClientProcesses(vehicles, 2) if count == 2 else nullcontext() as where:

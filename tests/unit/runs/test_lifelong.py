@@ -8,7 +8,7 @@ import pytest
 from flcav.config import InputError, parse_config
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.runs.arms import check_federations
-from flcav.runs.extras.groups.rows import Checked, Group
+from flcav.runs.extras.groups.rows import CheckedNetwork, Group
 from flcav.runs.extras.lifelong.replay import NO_LIMIT, Joined, divide_memory, spread_evenly
 from flcav.runs.extras.lifelong.results import find_mended
 from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
@@ -58,8 +58,8 @@ def test_joined_samples_are_those_of_the_parts_in_order() -> None:
     assert (len(joined), [*joined], joined[-1], joined[1:3]) == (5, [*"abcde"], "e", ["b", "c"])
 
 
-def checked(before: float, after: float | None, held: int = 2) -> Checked:
-    return Checked(held, before, after)
+def checked(before: float, after: float | None, held: int = 2) -> CheckedNetwork:
+    return CheckedNetwork(held, before, after)
 
 
 def test_a_copy_is_compared_on_what_its_members_held_back() -> None:

@@ -14,7 +14,7 @@ from flcav.federation.trainable import Weights
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes
 from flcav.network.messages import pack
 from flcav.perception.task import Task
-from flcav.runs.extras.groups.forming import UNREADABLE, Uplink
+from flcav.runs.extras.groups.forming import UNREADABLE, GroupUplink
 from flcav.runs.extras.groups.members import (
     ASKS,
     CHECK,
@@ -26,12 +26,12 @@ from flcav.runs.extras.groups.members import (
     SCENE,
     SCORE,
     SKETCH,
-    Member,
+    GroupMember,
     Offer,
     Unreadable,
     answer_requests,
     read_loss,
-    read_position,
+    read_request,
     take_requests,
 )
 
@@ -39,10 +39,10 @@ DRIVES = {"weight": np.array([[1.0]], np.float32), "bias": np.array([0.5], np.fl
 PLACES = np.array([[np.nan] * 3, [10.0, -3.0, 1.0]])
 
 
-def member(limit: float, held: Sequence[float] = (1.0, 3.0)) -> Member:
+def member(limit: float, held: Sequence[float] = (1.0, 3.0)) -> GroupMember:
     """Return a member whose network errs by 0.5 - x: its loss is the mean of (x - 0.5)^2."""
     data, own = ([np.float32(each) for each in some] for some in ((0.0, 2.0), held))
-    return Member(cast(Task, LineTask()), Slope(), 1, data, own, DRIVES, limit, 7, PLACES)
+    return GroupMember(cast(Task, LineTask()), Slope(), 1, data, own, DRIVES, limit, 7, PLACES)
 
 
 @pytest.mark.parametrize(("limit", "asks"), [(3.2, True), (3.3, False)])
@@ -60,7 +60,7 @@ def test_a_check_is_by_the_loss_on_what_is_held_back(limit: float, asks: bool) -
 def test_messages_of_a_member() -> None:
     own = member(1.0)
     request = own.answer(REQUEST, {SCENE: np.array([1])})[MESSAGE].tobytes()
-    assert (read_position(request).tolist(), read_loss(request)) == ([10.0, -3.0, 1.0], 3.25)
+    assert (read_request(request).tolist(), read_loss(request)) == ([10.0, -3.0, 1.0], 3.25)
     better = {"weight": np.array([[2.0]], np.float32), "bias": np.array([1.0], np.float32)}  # errs by 1
     assert read_loss(own.answer(SCORE, better)[MESSAGE].tobytes()) == 1.0
     offer = Offer.read(own.answer(OFFER, {})[MESSAGE].tobytes())
@@ -103,13 +103,13 @@ def test_what_is_no_offer(message: bytes) -> None:
         Offer.read(message)
 
 
-def uplink(answers: dict[str, Weights], missing: dict[str, str], budget_mb: float = 1.0) -> tuple[Uplink, Ledger]:
+def uplink(answers: dict[str, Weights], missing: dict[str, str], budget_mb: float = 1.0) -> tuple[GroupUplink, Ledger]:
     book = Ledger(LinkMegabytes(budget_mb, 0.0))
 
     def ask(question: str, clients: Sequence[str], arrays: Any = None, *, counted: bool = True) -> Replies:
         return Replies(answers, missing)
 
-    return Uplink(ask, book, "line"), book
+    return GroupUplink(ask, book, "line"), book
 
 
 def test_messages_enter_the_ledger_and_who_sends_no_usable_one_is_silent() -> None:

@@ -30,14 +30,14 @@ from flcav.optimization.solvers.instance import Infeasible
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import to_arrays
+from flcav.runs import allocation
+from flcav.runs.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
 from flcav.runs.arms import PlanRule
-from flcav.runs.plan import allocation
-from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
-from flcav.runs.plan.updates import model_mb
 from flcav.runs.recipe import FixedPlan, PlanLimits, load_run_recipe
 from flcav.runs.results.plans import TaskPlan
 from flcav.runs.spread import read_spreads
 from flcav.runs.tables import HistoryPoint, append_records, load_history, parse_history
+from flcav.runs.updates import model_mb
 
 RECIPES = Path(__file__).parents[3] / "recipes/runs"
 FITTED: dict[tuple[bytes, ...], CurveFit] = {}
@@ -293,7 +293,10 @@ def test_doubling_up_to_a_recipe_s_budget_is_worth_more_than_trainings_differ_an
 
 
 def test_plans_of_the_comparison_of_plans_stay_within_what_the_history_covers() -> None:
-    limits, covered = load_run_recipe(RECIPES / "allocation.yaml").limits, load_history("objects").resources.max(axis=0)
+    limits, covered = (
+        load_run_recipe(RECIPES / "allocation.yaml").limits,
+        load_history("objects").resources.max(axis=0),
+    )
     assert (limits.edge_rounds[1], limits.cloud_rounds[1]) == (None, None)  # rounds: the history's
     assert limits.samples[1] == covered[0]
     for factor, rule in product(BUDGETS, get_args(PlanRule)):

@@ -8,10 +8,10 @@ import numpy as np
 from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Infeasible
-from flcav.runs.plan.allocation import continue_joins, remake_plan
-from flcav.runs.plan.updates import follow_plan
+from flcav.runs.allocation import continue_joins, remake_plan
 from flcav.runs.recipe import Federation
 from flcav.runs.results.plans import Plan, TaskPlan
+from flcav.runs.updates import follow_plan
 
 PREDICTED = {"pretrain": 0.4, "edge": 0.6, "cloud": 0.7}
 

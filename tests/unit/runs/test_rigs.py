@@ -9,8 +9,8 @@ import pytest
 from flcav.cli.steps import live_steps
 from flcav.config import parse_config
 from flcav.dataset.recording.recorder import record
-from flcav.runs import alone, running
-from flcav.runs.alone import federate_regions
+from flcav.runs import edge_stage, running
+from flcav.runs.edge_stage import federate_regions
 from flcav.runs.engine import Notify
 from flcav.runs.recipe import RunRecipe
 from flcav.runs.rigs import RIG, compare_rigs, tell_rigs
@@ -78,7 +78,7 @@ def test_runs_and_federations_tell_it_before_their_steps(
     def begun(*_: object, **__: object) -> None:
         raise Begun
 
-    for place, name in ((running, "run_steps"), (running, "run_side_by_side"), (alone, "run_steps")):
+    for place, name in ((running, "run_steps"), (running, "run_side_by_side"), (edge_stage, "run_steps")):
         monkeypatch.setattr(place, name, begun)
     told: list[tuple[str, str]] = []
     with pytest.raises(Begun):

@@ -30,8 +30,8 @@ from flcav.network.radio.recorded import link_scene
 from flcav.perception.weather.task import WEATHER
 from flcav.report import style
 from flcav.report.charts.federation.asynchrony import draw_trajectories
+from flcav.runs.driving import Fleet
 from flcav.runs.provenance import Provenance, provenance
-from flcav.runs.radio.driving import Fleet
 from flcav.runs.recipe import Stragglers, draw_stragglers
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.storage.records import Record

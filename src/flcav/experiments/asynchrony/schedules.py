@@ -14,8 +14,8 @@ from flcav.network.clock.buffers import BufferTiming, chain_links
 from flcav.network.clock.records import RoundTiming
 from flcav.network.clock.rounds import NetworkSettings, simulate_rounds
 from flcav.network.radio.links import RadioLinks
+from flcav.runs.driving import AWAY, Fleet
 from flcav.runs.extras.buffered.driving import BufferedFleet
-from flcav.runs.radio.driving import AWAY, Fleet
 
 PASSES = 20  # through the scenes, at most, of rounds that wait
 

@@ -1,6 +1,6 @@
 """Seconds of the rounds of an arm: its messages on the radio links of the region's recorded training drives.
 
-Round n of a region is driven in the n-th scene of its training data, as in `flcav.runs.radio.driving`. The
+Round n of a region is driven in the n-th scene of its training data, as in `flcav.runs.driving`. The
 ledger says what each vehicle sent and received in the round, so that every arm has seconds, also one whose federation
 knew of no network. Training takes no time here: the arms train alike.
 """
@@ -15,8 +15,8 @@ from flcav.network.clock.work import ClientWork, work_of_messages
 from flcav.network.ledger import LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.runs.arms import name_steps
+from flcav.runs.driving import link_scenes
 from flcav.runs.frames import Frames
-from flcav.runs.radio.driving import link_scenes
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe
 from flcav.runs.results.plans import Placed
 

@@ -25,8 +25,8 @@ from flcav.runs.analysis.caveats import PLACED_BARE
 from flcav.runs.analysis.costs import list_arm_costs, list_home_costs, tell_gain
 from flcav.runs.analysis.findings import WORDS
 from flcav.runs.arms import Names
+from flcav.runs.driving import CLOCK
 from flcav.runs.frames import Frames
-from flcav.runs.radio.driving import CLOCK
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import ArmCost, LinkUse, Run

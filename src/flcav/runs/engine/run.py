@@ -42,11 +42,11 @@ from flcav.runs.engine.step import (
     reserve_sibling,
     take_over,
 )
-from flcav.runs.engine.workers import Workers, open_processes
+from flcav.runs.engine.workers import Workers, open_step_processes
 from flcav.storage.files import write_json
 
 ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Workers]]] = {
-    "processes": open_processes,
+    "processes": open_step_processes,
     "ray": open_actors,
 }
 POLL_S = 0.2

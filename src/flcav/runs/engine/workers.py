@@ -28,7 +28,7 @@ class Workers:
 
 
 @contextlib.contextmanager
-def open_processes(jobs: int) -> Iterator[Workers]:
+def open_step_processes(jobs: int) -> Iterator[Workers]:
     """Yield `jobs` processes, which end with this one, however it ends; raises `OSError` where one was killed."""
     reports = start_server().Queue()
     with process_pool(jobs, _begin, replace(provenance(), threads=1), reports) as pool:

@@ -14,14 +14,14 @@ from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
 from flcav.runs.frames import Frames
-from flcav.runs.results.training import Found, LabelHistory, LabelQuality
+from flcav.runs.results.training import FoundTargets, LabelHistory, LabelQuality
 
 RETURNS = 5, 20, 100  # of targets, from which their recall is counted apart
 TIGHT = 0.7  # IoU in 3D of a box that is as good as an annotated one
 LABELS = "labels.json"  # quality of the labels before each round, in the folder of a stage
 
 
-def read_history(folder: Path) -> LabelHistory:
+def read_label_history(folder: Path) -> LabelHistory:
     """Return the quality of the labels of the rounds so far in a stage's folder."""
     return LabelHistory.load(folder, LABELS) if (folder / LABELS).exists() else LabelHistory()
 
@@ -69,8 +69,8 @@ def measure_labels(
     )
 
 
-def _count_by_returns(returns: NDArray[np.int64], met: NDArray[np.bool_]) -> tuple[Found, ...]:
+def _count_by_returns(returns: NDArray[np.int64], met: NDArray[np.bool_]) -> tuple[FoundTargets, ...]:
     """Return the targets, and those that are `met`, by their number of LiDAR `returns`, (T,) each."""
     kind = np.searchsorted(RETURNS, returns, side="right") - 1
     kinds = range(len(RETURNS))
-    return tuple(Found(RETURNS[k], int((kind == k).sum()), int(met[kind == k].sum())) for k in kinds)
+    return tuple(FoundTargets(RETURNS[k], int((kind == k).sum()), int(met[kind == k].sum())) for k in kinds)

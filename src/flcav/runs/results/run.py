@@ -7,7 +7,7 @@ from typing import Annotated, ClassVar
 from flcav.runs.arms import Names, name_steps
 from flcav.runs.provenance import Provenance
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.registry import SECTIONS, RunRows, Section, load_all
+from flcav.runs.registry import SECTIONS, PageSection, RunRows, load_all
 from flcav.runs.results.plans import Placed, Plan
 from flcav.runs.results.saved import Saved
 from flcav.runs.results.tests import Difference, HomeCost, RegionalTest, RunFinding, Test, Tested
@@ -113,7 +113,7 @@ class Run(RunRows, _RunFigures):
         """Return the names of the run's steps, whose folders, in its folder `work`, hold all artefacts."""
         return name_steps(self.recipe)
 
-    def list_sections(self) -> list[Section]:
+    def list_sections(self) -> list[PageSection]:
         """Return the sections of extras on the run's page."""
         found = [describe(self) for describe in load_all(SECTIONS)]
         return [section for section in found if section is not None]

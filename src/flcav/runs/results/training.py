@@ -83,7 +83,7 @@ class StatisticsScore(Record):
 
 
 @dataclass(frozen=True)
-class Found(Record):
+class FoundTargets(Record):
     """How many targets of some numbers of LiDAR returns have a right label."""
 
     returns: int  # from this number up to, not including, that of the next kind
@@ -106,7 +106,7 @@ class LabelQuality(Record):
     tight: Annotated[float | None, LEFT_OUT] = None  # share of right labels with an IoU of 0.7 or more; None: none
     offset_m: Annotated[float | None, LEFT_OUT] = None  # median distance of their centres from the objects', in 3D [m]
     size_m: Annotated[float | None, LEFT_OUT] = None  # median of their largest error in length, width or height [m]
-    by_returns: Annotated[tuple[Found, ...] | None, LEFT_OUT] = None  # the targets by their returns
+    by_returns: Annotated[tuple[FoundTargets, ...] | None, LEFT_OUT] = None  # the targets by their returns
 
 
 @dataclass(frozen=True)

@@ -71,7 +71,7 @@ def pretrain(
         batch=learning.batch,
         seed=derive_seed(learning.seed, PRETRAIN),
         checkpointing=Checkpointing(folder / CHECKPOINT, every),
-        validation=Validation(lambda now: mean_score(task, now, validation), every),
+        validation=Validation(lambda now: average_splits(task, now, validation), every),
         progress=report,
     )
     save_network(task, network, folder / WEIGHTS)
@@ -83,7 +83,7 @@ def pretrain(
     )
 
 
-def mean_score(task: Task, network: Any, splits: Sequence[Frames]) -> float:
+def average_splits(task: Task, network: Any, splits: Sequence[Frames]) -> float:
     """Return the task's measure on the vehicles' frames, as the mean over `splits`."""
     return float(np.mean([score_network(task, network, split.data, split.vehicles) for split in splits]))
 

@@ -15,10 +15,9 @@ from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
 from flcav.perception.weights import to_arrays
 from flcav.runs.arms import Setting, find_calls, find_strategies
+from flcav.runs.driving import DrivenStage, join_regions
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
-from flcav.runs.plan.updates import follow_plan
-from flcav.runs.radio.driving import DrivenStage, join_regions
 from flcav.runs.recipe import CLOUD, EDGE, MORE_EDGE, Federation
 from flcav.runs.registry import CONDUCTS, COUNTS, DRIVES, load_all
 from flcav.runs.results.plans import Plan, TaskPlan
@@ -53,6 +52,7 @@ from flcav.runs.training.learning import Learning, Strategies, load_stage_networ
 from flcav.runs.training.messages import send_region_network, share_frames
 from flcav.runs.training.private_rounds import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
 from flcav.runs.training.records import read_rounds
+from flcav.runs.updates import follow_plan
 
 Recall = Callable[[Mapping[str, Sequence[Any]]], Mapping[str, Sequence[Any]]]  # adds to the samples of each client
 

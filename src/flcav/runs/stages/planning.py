@@ -18,12 +18,11 @@ from flcav.perception.client import as_shared
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
+from flcav.runs.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
 from flcav.runs.arms import PlanRule, Setting
+from flcav.runs.driving import link_drive, measure_uplinks, predict_air_s
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
-from flcav.runs.plan.allocation import PlanRequest, PlanSettings, make_plan, remake_plan
-from flcav.runs.plan.updates import RegionDrive, Sensors, UpdateForm, measure_exchange, model_mb, update_forms
-from flcav.runs.radio.driving import link_drive, measure_uplinks, predict_air_s
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, Budgets, FixedPlan, PlanLimits
 from flcav.runs.registry import LABEL_SIZES, load_all
 from flcav.runs.results.plans import Plan
@@ -33,6 +32,7 @@ from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.settings import StepSettings, make_step, read_entries
 from flcav.runs.stages.testing import list_validations
 from flcav.runs.tables import parse_history, read_history
+from flcav.runs.updates import RegionDrive, Sensors, UpdateForm, measure_exchange, model_mb, update_forms
 from flcav.storage.files import write_json
 
 

@@ -17,6 +17,7 @@ from flcav.network.ledger import Ledger
 from flcav.network.radio.links import RadioLinks
 from flcav.perception.objects.distillation.imitation import ImitatingObjects
 from flcav.perception.weights import to_arrays
+from flcav.runs.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.runs.engine import Work
 from flcav.runs.frames import Frames
 from flcav.runs.label_sources import LABEL_SOURCES, LabelSource
@@ -30,7 +31,6 @@ from flcav.runs.labels.pseudo_labels import (
 from flcav.runs.labels.quality import measure_labels
 from flcav.runs.labels.tracks import label_tracked, load_tracks
 from flcav.runs.poles import find_sites
-from flcav.runs.radio.driving import CLOCK, DrivenRounds, Fleet, drive_rounds, link_scenes
 from flcav.runs.registry import LABELLERS, LOSSES, load_all
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.training import LabelQuality, Pretrained
@@ -183,14 +183,14 @@ def drive_region(
     network = settings.federation.network
     if network is None:
         return DrivenRounds(rules, {}, ())
-    fleet = open_fleet(settings, learning, inputs.region, clients)
+    fleet = open_region_fleet(settings, learning, inputs.region, clients)
     scenes = link_stage_scenes(work, inputs, network, earlier + len(seeds), learning.seed)
     driven = drive_rounds(fleet, scenes, network, rules, seeds, earlier)
     save_clock(driven, work, inputs.region)
     return driven
 
 
-def open_fleet(settings: FederationSettings, learning: Learning, region: str, clients: Sequence[str]) -> Fleet:
+def open_region_fleet(settings: FederationSettings, learning: Learning, region: str, clients: Sequence[str]) -> Fleet:
     """Return the vehicles of a region with the work of each of their rounds."""
     how, weights = settings.federation, to_arrays(learning.build_network())
     both = isinstance(how.personal, RegionalModels)  # the region's and the global model go down together

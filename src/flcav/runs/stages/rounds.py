@@ -30,9 +30,9 @@ from flcav.perception.client import TaskClient
 from flcav.perception.distillation import SharedSamples
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import from_arrays, save_network, to_arrays
+from flcav.runs.driving import DrivenStage
 from flcav.runs.engine import Work
 from flcav.runs.frames import Frames
-from flcav.runs.radio.driving import DrivenStage
 from flcav.runs.recipe import CLOUD, EDGE
 from flcav.runs.training.checkpoints import FederationCheckpoints, load_round_network
 from flcav.runs.training.learning import (

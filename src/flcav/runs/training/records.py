@@ -72,7 +72,7 @@ def list_rounds(run: Run) -> Iterator[tuple[str, StageResult, FederatedRound]]:
                 yield arm, stage, record
 
 
-def rounds_table(run: Run) -> pa.Table:
+def tabulate_rounds(run: Run) -> pa.Table:
     """Return a table with a row per arm, stage, task, server and round."""
     rows = [
         {
@@ -88,11 +88,11 @@ def rounds_table(run: Run) -> pa.Table:
 
 
 def save_rounds(run: Run, out: Path) -> None:
-    """Write `rounds_table` to `out`/rounds.parquet, and the curves of every federation to `out`/events.
+    """Write `tabulate_rounds` to `out`/rounds.parquet, and the curves of every federation to `out`/events.
 
     There is a folder of TensorBoard's event files for each arm, stage, task and server.
     """
-    write_table(rounds_table(run), out / ROUNDS)
+    write_table(tabulate_rounds(run), out / ROUNDS)
     shutil.rmtree(out / EVENTS, ignore_errors=True)
     curves: dict[str, list[FederatedRound]] = {}
     for arm, stage, record in list_rounds(run):

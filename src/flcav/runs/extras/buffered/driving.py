@@ -18,13 +18,13 @@ from flcav.network.clock.records import ClientTiming
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.radio.links import RadioLinks
 from flcav.runs.arms import Setting, plans_joiners
+from flcav.runs.driving import DrivenRounds, DrivenStage, Fleet, join_regions
 from flcav.runs.engine import Work
 from flcav.runs.label_sources import LABEL_SOURCES
-from flcav.runs.radio.driving import DrivenRounds, DrivenStage, Fleet, join_regions
 from flcav.runs.recipe import CLOUD, RunRecipe
 from flcav.runs.results.training import StageResult
 from flcav.runs.stages.federating import StageSettings
-from flcav.runs.stages.regions import link_stage_scenes, open_fleet, save_clock
+from flcav.runs.stages.regions import link_stage_scenes, open_region_fleet, save_clock
 from flcav.runs.stages.rounds import RegionStart, StageFederation
 from flcav.runs.stages.settings import FederationSettings, RegionInputs
 from flcav.runs.training.learning import Learning
@@ -152,7 +152,7 @@ def open_buffered_fleet(
         before = StageResult.load(work.inputs[inputs.edge]).records or ()
     scenes = link_stage_scenes(work, inputs, network, ALL_SCENES, learning.seed)
     took_part = count_participations([(each.clients, [*each.failed]) for each in before])
-    return BufferedFleet(open_fleet(settings, learning, inputs.region, clients), scenes, took_part)
+    return BufferedFleet(open_region_fleet(settings, learning, inputs.region, clients), scenes, took_part)
 
 
 def check_buffers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:

@@ -42,7 +42,7 @@ from flcav.perception.weights import from_arrays
 from flcav.runs.engine import Work
 from flcav.runs.frames import SLACK_S, Frames, list_window
 from flcav.runs.labels.pseudo_labels import Spin, road_views
-from flcav.runs.labels.quality import LABELS, measure_labels, read_history
+from flcav.runs.labels.quality import LABELS, measure_labels, read_label_history
 from flcav.runs.labels.sightings import make_sighting
 from flcav.runs.recipe import EDGE
 from flcav.runs.results.training import LabelHistory, LabelQuality
@@ -75,7 +75,8 @@ class RoadAverageLabels(RenewedSamples):
         """Hold the vehicles' `frames` of a split, to be labelled with the sensors on `poles`.
 
         poses: of the vehicles' navigation. threshold: lowest score of a label that vehicles alone tell of. book: holds
-        the messages, under `stage`. folder: where the quality of the labels is kept, `read_history`; None: nowhere.
+        the messages, under `stage`. folder: where the quality of the labels is kept, `read_label_history`; None:
+        nowhere.
         """
         self._how, self._config, self._threshold = how, config, threshold
         self._poses: PoseSource = poses
@@ -113,7 +114,7 @@ class RoadAverageLabels(RenewedSamples):
 
     def list_quality(self) -> tuple[LabelQuality, ...]:
         """Return the quality of the labels before each round so far; none where it is not kept."""
-        return () if self._folder is None else read_history(self._folder).rounds
+        return () if self._folder is None else read_label_history(self._folder).rounds
 
     def _name(self, frame: int) -> str:
         return f"{self._region}/{self._split.data.keys[frame].agent}"
@@ -157,7 +158,7 @@ class RoadAverageLabels(RenewedSamples):
             self._samples[name][place[name]] = distil_sample(frame, own[i], given[i], views, self._config, lidar)
             place[name] += 1
         if self._folder is not None:
-            kept = tuple(each for each in read_history(self._folder).rounds if each.round < round_)
+            kept = tuple(each for each in read_label_history(self._folder).rounds if each.round < round_)
             quality = measure_labels(round_, self._split, self._frames, self._region, self, self._config)
             LabelHistory((*kept, quality)).save(self._folder, LABELS)
 

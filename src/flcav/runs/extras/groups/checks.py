@@ -10,7 +10,7 @@ from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.recipe import Federation, RunRecipe
 
 
-def find_calls(recipe: RunRecipe, how: Federation) -> Calls | None:
+def count_called(recipe: RunRecipe, how: Federation) -> Calls | None:
     """Return what a plan chooses the vehicles of a group on request from; None for a fixed roster."""
     if how.requests is None:
         return None

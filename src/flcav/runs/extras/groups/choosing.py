@@ -18,7 +18,7 @@ from flcav.geometry.arrays import Array
 from flcav.network.ledger import Ledger
 from flcav.network.messages import send
 from flcav.optimization.quality import data_quality, gradient_novelty, label_distribution_distance, visible_objects
-from flcav.runs.extras.groups.members import MESSAGE, SCORE, Member, Offer, Unreadable, read_loss
+from flcav.runs.extras.groups.members import MESSAGE, SCORE, GroupMember, Offer, Unreadable, read_loss
 from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.recipe import EDGE
 
@@ -112,7 +112,7 @@ class GroupWatch:
     """Early stopping of a group by the loss on its members' held-out frames, round by round."""
 
     how: Requests
-    members: Mapping[str, Member]  # that hold something back, by client
+    members: Mapping[str, GroupMember]  # that hold something back, by client
     losses: list[float] = field(default_factory=list)  # before the first round, and after each
 
     def enlist(self, clients: Mapping[str, Trainable]) -> dict[str, Trainable]:

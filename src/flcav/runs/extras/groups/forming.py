@@ -23,6 +23,7 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
+from flcav.runs.driving import link_scenes
 from flcav.runs.engine import Work
 from flcav.runs.extras.groups.choosing import (
     ABSENT,
@@ -45,21 +46,20 @@ from flcav.runs.extras.groups.members import (
     OFFER,
     REQUEST,
     SCENE,
-    Member,
+    GroupMember,
     Offer,
     Picked,
     Unreadable,
     answer_requests,
     hold_back,
-    read_position,
+    read_request,
     take_requests,
 )
 from flcav.runs.extras.groups.roadside import label_roadside
-from flcav.runs.extras.groups.rows import Checked, Group, Term
+from flcav.runs.extras.groups.rows import CheckedNetwork, Group, LeadTerm
 from flcav.runs.extras.groups.settings import Requests
 from flcav.runs.frames import Frames
 from flcav.runs.poles import find_sites
-from flcav.runs.radio.driving import link_scenes
 from flcav.runs.recipe import EDGE
 from flcav.runs.results.plans import Placed, Plan
 from flcav.runs.results.training import Pretrained
@@ -76,7 +76,7 @@ if TYPE_CHECKING:
 
 EVERY_SCENE = 10**6  # more than there are
 AnswerT = TypeVar("AnswerT")
-Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_places`
+Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_client_places`
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Called(Conduct):
     watch: GroupWatch
     task: Task
     book: Ledger
-    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server leads
+    terms: tuple[LeadTerm, ...] = ()  # of the leads of an ad hoc group; none: an edge server leads
 
     @property
     def within(self) -> frozenset[str]:
@@ -205,10 +205,10 @@ def call_group(
     if not validated:
         raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
     limit, split = how.excess * validated[-1].loss, Frames.open(work.inputs[inputs.frames])
-    places = find_places(split, inputs.region, [name for name in sorted(samples) if len(samples[name])])
+    places = find_client_places(split, inputs.region, [name for name in sorted(samples) if len(samples[name])])
     members = make_members(learning, frozen, how, limit, samples, places)
     with open_questions(members, deployed, Account(book, EDGE, task.name, "wireless")) as ask:
-        uplink, entered = Uplink(ask, book, task.name), len(book.entries)
+        uplink, entered = GroupUplink(ask, book, task.name), len(book.entries)
         vehicles = uplink.check([*members])
         taken = take_requests(deployed, work.folder, [*members], task.name)
         before = {name: own for name, own in taken.read().items() if name in vehicles}
@@ -222,7 +222,7 @@ def call_group(
             uplink.enter(name, *(message.encode() for message in taken.messages[name]))
             positions[name] = np.array([own.x, own.y, positions[name][2] if name in positions else 0.0])
         asking = [name for name in vehicles if name in asked and name in positions and name not in before]
-        positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
+        positions |= uplink.hear(REQUEST, asking, read_request, {SCENE: np.array([scene])})
         present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
         if not present:
             return Called(Group(limit, vehicles, "nobody", stayed=uplink.silent), {}, GroupWatch(how, {}), task, book)
@@ -253,18 +253,18 @@ def call_group(
 
 def make_members(
     learning: Learning, network: Any, how: Requests, limit: float, samples: Mapping[str, Sequence[Any]], places: Places
-) -> dict[str, Member]:
+) -> dict[str, GroupMember]:
     """Return the vehicles' parts in a group: each holds some of its samples back, and trains on the others."""
-    weights, seed, members = to_arrays(network), derive_seed(learning.seed, "offer"), dict[str, Member]()
+    weights, seed, members = to_arrays(network), derive_seed(learning.seed, "offer"), dict[str, GroupMember]()
     for name, at in places.items():
         trained, held = (Picked(samples[name], own) for own in hold_back(len(samples[name]), how.held_back))
         about = learning.task, network.config, learning.batch, trained, held, weights
-        members[name] = Member(*about, limit, seed, at)
+        members[name] = GroupMember(*about, limit, seed, at)
     return members
 
 
 @dataclass(frozen=True)
-class Uplink:
+class GroupUplink:
     """Uplink of a region's vehicles before a group: what they are asked, and the messages that they send."""
 
     ask: Ask
@@ -272,13 +272,13 @@ class Uplink:
     task: str
     silent: dict[str, str] = field(default_factory=dict)  # by client why nothing is heard of it
 
-    def check(self, clients: Sequence[str]) -> dict[str, Checked]:
+    def check(self, clients: Sequence[str]) -> dict[str, CheckedNetwork]:
         """Return the checks of clients: they are for the record, and no messages on the radio."""
-        replies, found = self.ask(CHECK, clients, counted=False), dict[str, Checked]()
+        replies, found = self.ask(CHECK, clients, counted=False), dict[str, CheckedNetwork]()
         for name, answer in replies.answers.items():
             told: Any = answer
             try:
-                found[name] = Checked(int(told[HELD][0]), float(told[LOSS][0]), asks=bool(told[ASKS][0]))
+                found[name] = CheckedNetwork(int(told[HELD][0]), float(told[LOSS][0]), asks=bool(told[ASKS][0]))
             except (KeyError, IndexError, TypeError, ValueError) as error:
                 self.silent[name] = f"{UNREADABLE}: {error}"
         self.silent.update(replies.missing)
@@ -320,7 +320,7 @@ def find_units(
     return [pole for pole in poles if f"pole{pole}" in near]
 
 
-def find_places(split: Frames, region: str, clients: Sequence[str]) -> dict[str, NDArray[np.float64]]:
+def find_client_places(split: Frames, region: str, clients: Sequence[str]) -> dict[str, NDArray[np.float64]]:
     """Return where (scenes, 3) [m] each client is when it is first in each scene of a split; NaN where it is not."""
     keys = split.data.keys
     scenes = {scene: number for number, scene in enumerate(dict.fromkeys(keys[i].scene for i in split.vehicles))}

@@ -16,7 +16,7 @@ from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.clock.records import RoundTiming
 from flcav.network.clock.rounds import LEFT_TOWN, NO_COVERAGE
 from flcav.network.ledger import Ledger, LedgerEntry
-from flcav.runs.extras.groups.rows import Term
+from flcav.runs.extras.groups.rows import LeadTerm
 from flcav.runs.stages.rounds import RunRounds
 
 LEAVES = (LEFT_TOWN, NO_COVERAGE)  # why a vehicle is lost that cannot lead any longer
@@ -29,7 +29,7 @@ class LeadLeft(Exception):
 class _LeadBook(Ledger):
     """The ledger of a term: `LeadLeft` is raised where the lead is gone when a message would be entered."""
 
-    def __init__(self, book: Ledger, term: Term) -> None:
+    def __init__(self, book: Ledger, term: LeadTerm) -> None:
         self._book, self._term, self._received = book, term, 0
 
     def check(self, entry: LedgerEntry) -> None:
@@ -43,13 +43,15 @@ class _LeadBook(Ledger):
         self._received += up and entry.round == term.left
 
 
-def follow_leads(members: Sequence[str], first: str, rounds: Sequence[RoundTiming], region: str) -> tuple[Term, ...]:
+def follow_leads(
+    members: Sequence[str], first: str, rounds: Sequence[RoundTiming], region: str
+) -> tuple[LeadTerm, ...]:
     """Return the terms of a group's leads over timed rounds, whose clients are vehicles of `region`.
 
     The lead, at first `first`, is gone where it is not in a round, or is lost in it for one of `LEAVES` while updates
     of others are under way. The member with the lowest name takes over that is there, and has not led before if any.
     """
-    terms, lead, since, gone = list[Term](), first, 1, {first}
+    terms, lead, since, gone = list[LeadTerm](), first, 1, {first}
     for timing in rounds:
         clients = {f"{region}/{each.client}": each for each in timing.clients}
         there = sorted(name for name in members if name in clients)
@@ -64,13 +66,13 @@ def follow_leads(members: Sequence[str], first: str, rounds: Sequence[RoundTimin
         following = [name for name in there if name != lead]
         if not following:
             continue  # nobody is left who could
-        terms.append(Term(lead, since, timing.round, received))
+        terms.append(LeadTerm(lead, since, timing.round, received))
         lead, since = next((name for name in following if name not in gone), following[0]), timing.round
         gone.add(lead)
-    return (*terms, Term(lead, since))
+    return (*terms, LeadTerm(lead, since))
 
 
-def _keeps(term: Term, key: tuple[int, str], outage: Outage) -> bool:
+def _keeps(term: LeadTerm, key: tuple[int, str], outage: Outage) -> bool:
     """Return whether an outage is that of the lead's own update in its term, which crosses no link."""
     number, client = key
     within = term.first <= number <= (number if term.left is None else term.left)
@@ -81,7 +83,7 @@ def federate_led(
     run: RunRounds,
     weights: Weights,
     account: Account,
-    terms: Sequence[Term],
+    terms: Sequence[LeadTerm],
     on_round: OnRound,
     *,
     state: FederationState,

@@ -74,7 +74,7 @@ class Offer:
         return cls(samples, labels, sketch)
 
 
-def read_position(message: bytes) -> Array:
+def read_request(message: bytes) -> Array:
     """Return the position (3,) [m] in a request; raises `Unreadable`."""
     return _read(message, position=(3,))["position"].astype(np.float64)
 
@@ -97,7 +97,7 @@ def _read(message: bytes, **shapes: tuple[int, ...]) -> dict[str, NDArray[Any]]:
 
 
 @dataclass(frozen=True)
-class Member:
+class GroupMember:
     """A vehicle of a region that may ask for a group, be called, and train in it. It satisfies `Answers`."""
 
     task: Task
@@ -149,7 +149,7 @@ class Member:
     def _offer(self) -> Offer:
         client = TaskClient(self.task, self.config, self.data, batch=self.batch)
         sketch = sketch_gradient(find_gradient(client, self.network, self.seed), self.seed)
-        return Offer(len(self.data), count_labels(self.data), sketch)
+        return Offer(len(self.data), count_sample_labels(self.data), sketch)
 
 
 def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
@@ -175,7 +175,7 @@ def measure_loss(task: Task, config: Any, weights: Weights, samples: Sequence[An
     return total / len(samples)
 
 
-def count_labels(samples: Sequence[Any]) -> dict[str, int]:
+def count_sample_labels(samples: Sequence[Any]) -> dict[str, int]:
     """Return the number of labels by class, where the task's samples have classes."""
     counts: Counter[str] = Counter()
     for number in range(len(samples)):

@@ -9,7 +9,7 @@ from flcav.storage.records import LEFT_OUT, Record
 
 
 @dataclass(frozen=True)
-class Checked(Record):
+class CheckedNetwork(Record):
     """A vehicle's check of the network that drives, on labelled frames that it holds back."""
 
     held_back: int  # frames
@@ -25,7 +25,7 @@ class Checked(Record):
 
 
 @dataclass(frozen=True)
-class Term(Record):
+class LeadTerm(Record):
     """The term of a lead."""
 
     lead: str  # client
@@ -39,7 +39,7 @@ class Group(Record):
     """The group of a region: its request, its members, and how it dissolved."""
 
     limit: float  # of the loss, above which a vehicle asks
-    vehicles: Mapping[str, Checked]  # by client
+    vehicles: Mapping[str, CheckedNetwork]  # by client
     lead: str  # edge server, e.g. "pole3", or the vehicle that leads ad hoc; "" without a request
     members: tuple[str, ...] = ()  # clients, those that asked first
     quality: Mapping[str, float] = field(default_factory=dict)  # of the data of those who made an offer
@@ -50,7 +50,7 @@ class Group(Record):
     dissolved: str = ""  # why
     roadside: tuple[str, ...] = ()  # units that joined, as clients
     scores: tuple[float, ...] = ()  # the task's measure on the region's validation frames before the rounds and after
-    terms: tuple[Term, ...] = ()  # of the leads of an ad hoc group; none: an edge server led
+    terms: tuple[LeadTerm, ...] = ()  # of the leads of an ad hoc group; none: an edge server led
 
     @property
     def asked(self) -> tuple[str, ...]:
@@ -94,7 +94,7 @@ class Group(Record):
         return f" and {plural(len(names), 'roadside unit')} ({', '.join(names)})" if names else ""
 
 
-def _describe_end(term: Term) -> str:
+def _describe_end(term: LeadTerm) -> str:
     """Return in words how the term of a lead ended."""
     if term.received is None:
         return f"{term.lead} was gone before round {term.left}"

@@ -14,7 +14,7 @@ from flcav.runs.extras.lifelong.settings import LEARNING, LIFELONG, NOTHING, Lif
 from flcav.runs.extras.lifelong.steps import DELIVERED, Driving, count_recorded_s, name_driving, name_learning
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
-from flcav.runs.registry import Section
+from flcav.runs.registry import PageSection
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER
 from flcav.runs.results.tests import Tested
@@ -144,7 +144,7 @@ def _reachable(graph: Graph, work: Path, condition: str, task: str) -> float:
 
 
 @dataclass(frozen=True)
-class LifelongSection(Section):
+class LifelongSection(PageSection):
     """The values of the section."""
 
     template: ClassVar[str] = "lifelong/section.html.j2"
