@@ -13,7 +13,6 @@ from typing import Annotated
 from flcav.config import InputError
 from flcav.interface.progress import DAMAGED
 from flcav.runs.arms import check_federations
-from flcav.runs.deployment import check_clients
 from flcav.runs.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.runs.frames import Frames
 from flcav.runs.provenance import Provenance, provenance
@@ -21,6 +20,7 @@ from flcav.runs.recipe import EDGE, MAIN, RunRecipe
 from flcav.runs.results.saved import WEIGHTS, Saved
 from flcav.runs.results.training import PrivacySpent, ScoredRound, StageResult, Watched
 from flcav.runs.rigs import tell_rigs
+from flcav.runs.stages.deployment import check_clients
 from flcav.runs.stages.federating import EdgeSettings, federate_step
 from flcav.runs.stages.graph import Graph
 from flcav.runs.stages.settings import make_step

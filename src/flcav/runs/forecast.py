@@ -38,7 +38,7 @@ from flcav.runs.training.private_rounds import (
     find_budget_noise,
     plan_private_rounds,
 )
-from flcav.runs.updates import measure_exchange, model_mb
+from flcav.runs.training.updates import measure_exchange, model_mb
 from flcav.storage.records import LEFT_OUT, Record
 
 STEPS = 3  # that are timed

@@ -9,12 +9,12 @@ from flcav.runs.analysis.collect import collect_results
 from flcav.runs.analysis.histories import make_history_points
 from flcav.runs.analysis.summary import summarise
 from flcav.runs.arms import check_federations
-from flcav.runs.deployment import deploy
 from flcav.runs.engine import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.runs.recipe import RunRecipe, load_run_recipe
 from flcav.runs.results.run import Run, Summary
 from flcav.runs.rigs import tell_rigs
 from flcav.runs.spread import list_spreads
+from flcav.runs.stages.deployment import deploy
 from flcav.runs.stages.graph import Graph
 from flcav.runs.tables import append_records
 from flcav.runs.training.records import save_rounds

@@ -6,8 +6,8 @@ from typing import Any
 import pytest
 
 from flcav.config import InputError
-from flcav.runs.deployment import deploy
 from flcav.runs.recipe import RunRecipe
+from flcav.runs.stages.deployment import deploy
 from flcav.runs.stages.graph import Graph
 
 

@@ -42,7 +42,7 @@ from flcav.runs.training.learning import (
     score_statistics,
 )
 from flcav.runs.training.timing import TIMES, TrainTimes, read_times, summarise_times, time_clients
-from flcav.runs.updates import UpdateForm, model_mb, update_forms
+from flcav.runs.training.updates import UpdateForm, model_mb, update_forms
 from flcav.statistics.streams import derive_seed
 
 BUSY_S = 0.05  # CPU time of a training

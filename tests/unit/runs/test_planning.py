@@ -37,7 +37,7 @@ from flcav.runs.recipe import FixedPlan, PlanLimits, load_run_recipe
 from flcav.runs.results.plans import TaskPlan
 from flcav.runs.spread import read_spreads
 from flcav.runs.tables import HistoryPoint, append_records, load_history, parse_history
-from flcav.runs.updates import model_mb
+from flcav.runs.training.updates import model_mb
 
 RECIPES = Path(__file__).parents[3] / "recipes/runs"
 FITTED: dict[tuple[bytes, ...], CurveFit] = {}

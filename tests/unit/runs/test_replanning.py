@@ -11,7 +11,7 @@ from flcav.optimization.solvers.instance import Infeasible
 from flcav.runs.allocation import continue_joins, remake_plan
 from flcav.runs.recipe import Federation
 from flcav.runs.results.plans import Plan, TaskPlan
-from flcav.runs.updates import follow_plan
+from flcav.runs.training.updates import follow_plan
 
 PREDICTED = {"pretrain": 0.4, "edge": 0.6, "cloud": 0.7}
 

@@ -19,7 +19,7 @@ from flcav.runs.label_sources import LABEL_SOURCES, choose_labels
 from flcav.runs.labels import pseudo_labels
 from flcav.runs.labels.pseudo_labels import fit_label_threshold, select_frames_near
 from flcav.runs.recipe import RunRecipe
-from flcav.runs.updates import RegionDrive, Sensors
+from flcav.runs.training.updates import RegionDrive, Sensors
 
 
 def cars(*places: tuple[float, float]) -> Boxes:

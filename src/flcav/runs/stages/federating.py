@@ -52,7 +52,7 @@ from flcav.runs.training.learning import Learning, Strategies, load_stage_networ
 from flcav.runs.training.messages import send_region_network, share_frames
 from flcav.runs.training.private_rounds import PrivateRounds, find_budget_noise, plan_private_rounds, take_noise
 from flcav.runs.training.records import read_rounds
-from flcav.runs.updates import follow_plan
+from flcav.runs.training.updates import follow_plan
 
 Recall = Callable[[Mapping[str, Sequence[Any]]], Mapping[str, Sequence[Any]]]  # adds to the samples of each client
 

@@ -32,7 +32,7 @@ from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.settings import StepSettings, make_step, read_entries
 from flcav.runs.stages.testing import list_validations
 from flcav.runs.tables import parse_history, read_history
-from flcav.runs.updates import RegionDrive, Sensors, UpdateForm, measure_exchange, model_mb, update_forms
+from flcav.runs.training.updates import RegionDrive, Sensors, UpdateForm, measure_exchange, model_mb, update_forms
 from flcav.storage.files import write_json
 
 

@@ -18,7 +18,7 @@ from flcav.runs.frames import Frames, list_window
 from flcav.runs.labels.pseudo_labels import select_frames_near
 from flcav.runs.labels.sightings import find_told_posts
 from flcav.runs.poles import find_sites, read_traces
-from flcav.runs.updates import RegionDrive, Sensors
+from flcav.runs.training.updates import RegionDrive, Sensors
 from flcav.world.map.census import measure_traffic_density
 
 
