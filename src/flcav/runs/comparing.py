@@ -69,7 +69,7 @@ class _Pair:
 
 def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
     runs = [Run.load(folder) for folder in (first, second)]
-    tests: list[Mapping[Key, Test]] = [{_key(test): test for test in run.tested} for run in runs]
+    tests: list[Mapping[Key, Test]] = [{test.key: test for test in run.tested} for run in runs]
     found = {}
     for key in (key for key in tests[0] if key in tests[1]):
         before, after = (own[key] for own in tests)
@@ -112,10 +112,6 @@ def _judge_unknown(pair: _Pair, family: int) -> str:
     """Return the verdict on one training of unknown spread: a loss too large for the spread of both runs is one."""
     lost = tell_loss(pair.compared.difference, pair.scenes, family, LARGEST_SPREAD * 2**0.5)
     return UNDECIDED if lost is None else NOT_HELD
-
-
-def _key(test: Test) -> Key:
-    return test.arm, test.stage, test.region, test.task
 
 
 def _listed(pairs: Sequence[_Pair]) -> tuple[list[float], list[tuple[Path, Path]]]:

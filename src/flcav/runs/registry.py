@@ -92,8 +92,8 @@ LABEL_SIZES = ("flcav.runs.extras.distillation.sizes:measure_messages",)
 # called with an `Outline`: yield further steps
 STEPS = ("flcav.runs.extras.lifelong.steps:list_lifelong_steps",)
 # called in stage II with its step's work, settings, `LabelledSamples`, ledger, plan and deployed vehicles: return a
-# `Conduct` and the samples of those who take part, or None
-CONDUCTS = ("flcav.runs.extras.groups.forming:conduct_group",)
+# `Conduct`, or None
+CONDUCTS = ("flcav.runs.extras.groups.forming:call_group",)
 # called with strategy, planned rounds, `RegionStart` by region and whether the cloud takes part: return both counted
 COUNTS = ("flcav.runs.extras.buffered.driving:count_buffers",)
 # called with a step's work, settings, `StageFederation` and ways by wireline [s]: return a `DrivenStage`, or None

@@ -167,7 +167,7 @@ def findings(
 
     `settings`: those of each arm. `caveats`: those of the labels, by task.
     """
-    values = {(test.arm, test.stage, test.region, test.task): test for test in tests}
+    values = {test.key: test for test in tests}
     own = [each for each in differences if each.arm == MAIN]
     asked = ask_all(own, recipe, settings)
     same = [_tell_same_poles(each, arms, settings) for each in own]

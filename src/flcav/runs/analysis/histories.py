@@ -103,7 +103,7 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
 
     The reference trains on the region's own ground truth; regions without such an arm are left out.
     """
-    values = {(test.arm, test.stage, test.region, test.task): test.estimate.mean for test in tests}
+    values = {test.key: test.estimate.mean for test in tests}
     oracle = next((name for name, arm in recipe.arms.items() if arm.central == "federate"), None)
     closed = {}
     for (arm, stage, region, task), reached in values.items():

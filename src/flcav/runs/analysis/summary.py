@@ -24,7 +24,7 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     findings. Simulated towns have traffic of their own for each seed. Where seeds are tested on the same
     recorded scenes, the intervals include what these scenes vary by; those of closed gaps do not.
     """
-    tests = [{_key(test): test for test in run.tested} for run in runs]
+    tests = [{test.key: test for test in run.tested} for run in runs]
     measures = [
         Mean(_name(first), _mean_measure([own[key] for own in tests], works)) for key, first in tests[0].items()
     ]
@@ -57,10 +57,6 @@ def count_claims(runs: Sequence[Run]) -> tuple[ClaimCount, ...]:
         if one.verdict in VERDICTS:
             claims.append(ClaimCount(one.question, one.place, one.kind, *(ways[way] for way in VERDICTS)))
     return tuple(claims)
-
-
-def _key(test: Test) -> tuple[str, str, str, str]:
-    return test.arm, test.stage, test.region, test.task
 
 
 def _name(test: Test) -> str:

@@ -40,6 +40,11 @@ class Test:
     retrained_steps: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # their folders, in the order of `retrained`
 
     @property
+    def key(self) -> tuple[str, str, str, str]:
+        """Return arm, stage, region and task."""
+        return self.arm, self.stage, self.region, self.task
+
+    @property
     def steps(self) -> tuple[str, ...]:
         """Return the folders of the tests of all trainings whose outcomes are known, the first training's first."""
         return (self.step, *(self.retrained_steps or ()))

@@ -24,7 +24,6 @@ from flcav.runs.results.plans import Plan, TaskPlan
 from flcav.runs.results.training import StageResult, StatisticsScore
 from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.regions import (
-    LabelledSamples,
     RenewedSamples,
     choose_loss,
     drive_region,
@@ -133,7 +132,11 @@ def federate_step(
     where = Whereabouts(runtime, processes, fleet, settings.vehicles, bool(timed))
     held = [name for own in labelled.values() for name in own.samples if len(own.samples[name])]
     with where.reach(held) as reached:
-        conduct, samples = _conduct(work, settings, labelled, book, plan, reached)
+        conduct, samples = Conduct(), {region: own.samples for region, own in labelled.items()}
+        if isinstance(settings, EdgeSettings) and settings.stage == EDGE:
+            about = (work, settings, labelled[first.region], book, plan, reached.deployed)
+            conduct = next((found for call in load_all(CONDUCTS) if (found := call(*about)) is not None), conduct)
+            samples[first.region] = conduct.choose(samples[first.region])
         if recall is not None:
             samples = {region: recall(own) for region, own in samples.items()}
         noise = _find_noise(work, settings, plan)
@@ -185,24 +188,6 @@ def _open_book(work: Work, settings: StageSettings, plan: Plan) -> Ledger:
     book = open_region_book(work, share, first.pretrain, vehicles, first.region)
     before = first.edge or first.errors  # the ledger of stage II includes that of the errors
     return book if before is None else Ledger(book.budget, read_entries(work, before))
-
-
-def _conduct(
-    work: Work,
-    settings: StageSettings,
-    labelled: Mapping[str, LabelledSamples],
-    book: Ledger,
-    plan: Plan,
-    where: Whereabouts,
-) -> tuple[Conduct, dict[str, Mapping[str, Sequence[Any]]]]:
-    """Return how the rounds are conducted, and the samples by region and client; extras may choose the clients."""
-    samples = {region: own.samples for region, own in labelled.items()}
-    if isinstance(settings, EdgeSettings) and settings.stage == EDGE:
-        for choose in load_all(CONDUCTS):
-            own = labelled[settings.inputs.region]
-            if (chosen := choose(work, settings, own, book, plan, where.deployed)) is not None:
-                return chosen[0], {settings.inputs.region: chosen[1]}
-    return Conduct(), samples
 
 
 def _plan_private(settings: EdgeSettings, plan: Plan) -> PrivateRounds[Federation]:

@@ -5,7 +5,7 @@ Both stages end with weights and a ledger in their folder, by way of checkpoints
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -108,6 +108,10 @@ class Conduct:
     def over(self) -> bool:
         """Return whether no further round is to begin."""
         return False
+
+    def choose(self, samples: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
+        """Return the samples of those who take part, by client."""
+        return samples
 
     def enlist(self, clients: Mapping[str, Trainable]) -> Mapping[str, Trainable]:
         """Return the clients as the rounds have them."""

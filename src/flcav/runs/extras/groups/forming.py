@@ -105,6 +105,10 @@ class Called(Conduct):
         """Return whether the group is to dissolve."""
         return self.watch.over
 
+    def choose(self, samples: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
+        """Return what the members and units train on."""
+        return self.samples
+
     def enlist(self, clients: Mapping[str, Trainable]) -> Mapping[str, Trainable]:
         """Return the clients, of which members answer questions, too."""
         return self.watch.enlist(clients)
@@ -163,42 +167,26 @@ class Called(Conduct):
         return replace(self.group, vehicles=vehicles, **about)
 
 
-def conduct_group(
+def call_group(
     work: Work,
     settings: EdgeSettings,
     labelled: LabelledSamples,
     book: Ledger,
     plan: Plan,
     deployed: "RegionalDeployment | None",
-) -> tuple[Called, Mapping[str, Sequence[Any]]] | None:
-    """Return the conduct of a group's rounds, and its members' samples; None where all vehicles federate."""
-    how = settings.federation.requests
-    if how is None:
-        return None
-    most = plan.tasks[settings.learning.task].called
-    called = call_group(work, settings, settings.inputs, how, labelled.samples, book, most, labelled.poles, deployed)
-    return called, called.samples
+) -> Called | None:
+    """Return the group that a region's vehicles form; requests and offers enter `book`. None: all vehicles federate.
 
-
-def call_group(
-    work: Work,
-    settings: FederationSettings,
-    inputs: RegionInputs,
-    how: Requests,
-    samples: Mapping[str, Sequence[Any]],
-    book: Ledger,
-    most: int | None = None,
-    poles: Sequence[int] = (),
-    deployed: "RegionalDeployment | None" = None,
-) -> Called:
-    """Return the group that a region's vehicles form, `most` of them by the plan; requests and offers enter `book`.
-
-    Units on the `poles` join, if `how` says so, that are in range of one that asked; what they send crosses no radio.
-    Vehicles that are `deployed` answer there, and those whose FL requests wait in their fleet have asked.
+    It has as many members as the plan calls. Units on poles join, if the recipe says so, that are in range of one that
+    asked; what they send crosses no radio. Vehicles that are `deployed` answer there, and those whose FL requests wait
+    in their fleet have asked.
 
     Who asks is there when the vehicle that errs most is first there. Raises `InputError` where pretraining has no loss,
     and `BudgetExceeded`.
     """
+    how, inputs, samples = settings.federation.requests, settings.inputs, labelled.samples
+    if how is None:
+        return None
     learning = settings.learning.resolve()
     task, frozen = learning.task, load_stage_network(learning.task, work.inputs[inputs.pretrain])
     validated = Pretrained.load(work.inputs[inputs.pretrain]).validated
@@ -237,14 +225,20 @@ def call_group(
     stayed |= uplink.silent
     if not offers:
         return Called(Group(limit, vehicles, lead, stayed=stayed), {}, GroupWatch(how, {}), task, book)
-    chosen = choose_members(how, [name for name in asked if name in offers], weigh_offers(offers), stayed, most)
+    chosen = choose_members(
+        how,
+        [name for name in asked if name in offers],
+        weigh_offers(offers),
+        stayed,
+        plan.tasks[settings.learning.task].called,
+    )
     answer_requests(deployed, taken, chosen.members)
     held = {name: members[name] for name in chosen.members if len(members[name].held)}
     watch = GroupWatch(how, held, [float(np.mean([vehicles[name].before for name in held])) if held else 0.0])
     sent = sum(entry.bytes for entry in book.entries[entered:] if entry.direction == "up")
     units: dict[str, list[Sample]] = {}
     if how.roadside:
-        there = find_units(split, inputs, poles, positions, present, how.range_m)
+        there = find_units(split, inputs, labelled.poles, positions, present, how.range_m)
         spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in split.vehicles}
         units = label_roadside(split, there, spins, frozen.config, inputs.region)
     group = Group(limit, vehicles, lead, chosen.members, chosen.quality, chosen.stayed, sent, roadside=tuple(units))
