@@ -185,15 +185,12 @@ def _plan_arm(graph: Graph, arm: Setting, measured: Mapping[str, _Measured]) -> 
     for name, own in plan.tasks.items():
         further = own.cloud_rounds * (k := arm.federation.edge_rounds_per_cloud_round)
         vehicles = [graph.vehicles[region] for region in arm.regions]
-        private = plan_private_rounds(arm.federation, vehicles, own.edge_rounds, _follow(arm) * further, k)
+        private = plan_private_rounds(
+            arm.federation, vehicles, own.edge_rounds, further if arm.stages[-1] in (CLOUD, MORE_EDGE) else 0, k
+        )
         found = find_budget_noise(arm.federation, private.rules)
         planned[name] = PlannedRounds(own.samples, private.edge, private.further // k, found)
     return planned
-
-
-def _follow(arm: Setting) -> bool:
-    """Return whether rounds follow stage II in an arm."""
-    return arm.stages[-1] in (CLOUD, MORE_EDGE)
 
 
 def _size_messages(settings: FirstPlanSettings, task: str, own: _Measured) -> MessageSizes:

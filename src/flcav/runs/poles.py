@@ -31,7 +31,11 @@ def find_sites(drive: Frames, edge: Frames | None) -> Sites:
     """Return the candidate sites: the town's poles or, of recorded data (`edge`), the poles whose sweeps it holds."""
     town = drive.data.town()
     if edge is None:
-        return Sites(town.poles.id, town.poles.position) if town is not None else Sites(*_none())
+        return (
+            Sites(town.poles.id, town.poles.position)
+            if town is not None
+            else Sites(np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+        )
     known = sorted(edge.poles)
     mounts = [edge.data.frame(edge.poles[pole][0]).world_from_agent[:3, 3] for pole in known]
     return Sites(np.array(known, dtype=np.int64), np.array(mounts, dtype=np.float64).reshape(-1, 3))
@@ -110,7 +114,3 @@ def _find_row(region: str, sites: Sites, pole: int) -> int:
         told = ", ".join(map(str, known))
         raise InputError(f"placement.poles: {pole} is none of the candidate poles of region '{region}': {told}")
     return known.index(pole)
-
-
-def _none() -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    return np.zeros(0, dtype=np.int64), np.zeros((0, 3))

@@ -8,7 +8,6 @@ import numpy as np
 from flcav.perception.outcomes import (
     Measure,
     Outcomes,
-    Values,
     count_once,
     difference,
     further_measures,
@@ -118,14 +117,10 @@ def _cost(graph: Graph, work: Path, tested: tuple[str, str, str], name: str, mea
     first, last = pairs[0]
     found = Estimate(*difference(own, first, last, seed, measure))
     if len(pairs) > 1 and found.low is not None:
-        shared = share_test_scenes(own, pairs, _change, seed, measure)
+        shared = share_test_scenes(own, pairs, lambda pair: pair[1] - pair[0], seed, measure)
         found = mean_over_seeds([after - before for before, after in values], shared=shared).as_estimate()
     before, after = np.mean(values, axis=0).tolist()
     return HomeCost(region, task, name, before, after, found, len(pairs))
-
-
-def _change(pair: Sequence[Values]) -> Values:
-    return pair[1] - pair[0]
 
 
 def list_home_costs(run: Run) -> list[HomeCost]:

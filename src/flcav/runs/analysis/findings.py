@@ -207,10 +207,11 @@ def _finding(
     if same is not None:
         return RunFinding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
     mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
+    trainings = "" if each.over_trainings is None else f" in the mean of {each.over_trainings.seeds} trainings"
     told = (
         f"On {each.region}, {measure} of {each.task} was {earlier:.3f} "
         f"({name_stage(each.before_arm, each.before_stage)}) and {later:.3f} "
-        f"({name_stage(each.arm, each.stage)}){_tell_trainings(each)}: {signed(mean)}"
+        f"({name_stage(each.arm, each.stage)}){trainings}: {signed(mean)}"
     )
     frames, scenes = (sum(counts) for counts in zip(*((t.result.frames, t.result.scenes) for t in tests), strict=True))
     over = f"{frames} test frames of {scenes} scenes"
@@ -230,10 +231,6 @@ def _finding(
         return RunFinding(place, question, ESTIMATE, f"{found}: an estimate, no claim{rests}.")
     said = f"{judged.describe('trainings')}: {explain_verdict(judged.verdict)}"
     return RunFinding(place, question, judged.verdict, f"{found}; {said}{rests}.")
-
-
-def _tell_trainings(each: Difference) -> str:
-    return "" if each.over_trainings is None else f" in the mean of {each.over_trainings.seeds} trainings"
 
 
 def _after(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> list[Test]:

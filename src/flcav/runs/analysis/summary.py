@@ -26,7 +26,11 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     """
     tests = [{test.key: test for test in run.tested} for run in runs]
     measures = [
-        Mean(_name(first), _mean_measure([own[key] for own in tests], works)) for key, first in tests[0].items()
+        Mean(
+            f"{first.region}, {first.task}: {name_stage(first.arm, first.stage)}",
+            _mean_measure([own[key] for own in tests], works),
+        )
+        for key, first in tests[0].items()
     ]
     differences = [
         Mean(rows[0].name, _mean_difference(rows, tests, works))
@@ -57,10 +61,6 @@ def count_claims(runs: Sequence[Run]) -> tuple[ClaimCount, ...]:
         if one.verdict in VERDICTS:
             claims.append(ClaimCount(one.question, one.place, one.kind, *(ways[way] for way in VERDICTS)))
     return tuple(claims)
-
-
-def _name(test: Test) -> str:
-    return f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}"
 
 
 def _mean_measure(tests: Sequence[Test], works: Sequence[Path]) -> MeanOverSeeds:

@@ -242,7 +242,12 @@ def plan_uploads(work: Work, plan: Plan, pools: Mapping[str, Sequence[str]], how
         mbps: dict[str, float] = {}
         for region, split in next(iter(opened.values())).items():
             found = measure_uplinks(region, split, how.network, how.range_m, seed)
-            mbps |= {name: found.get(name, 0.0) for own in asked.values() for name in own.held if _in(name, region)}
+            mbps |= {
+                name: found.get(name, 0.0)
+                for own in asked.values()
+                for name in own.held
+                if name.startswith(f"{region}/")
+            }
         shares = share_by_links(asked, mbps)
     return replace(plan, tasks={task: replace(own, uploads=shares[task]) for task, own in plan.tasks.items()})
 
@@ -253,10 +258,6 @@ def list_frames(region: str, split: Frames) -> list[tuple[str, list[int]]]:
     for frame in split.vehicles:
         found.setdefault(f"{region}/{split.data.keys[frame].agent}", []).append(frame)
     return sorted(found.items())
-
-
-def _in(vehicle: str, region: str) -> bool:
-    return vehicle.startswith(f"{region}/")
 
 
 def make_plan_step(outline: Outline, arm: Setting) -> Step:
