@@ -199,8 +199,9 @@ def _plan_private(settings: EdgeSettings, plan: Plan) -> PrivateRounds[Federatio
 
 def _find_noise(work: Work, settings: StageSettings, plan: Plan) -> float | None:
     """Return the noise that the privacy budget gives for the planned rounds; None where it is given, or none is."""
-    if (edge := settings.first.edge) is not None or isinstance(settings, CloudSettings):
-        return StageResult.load(work.inputs[edge or ""]).noise
+    if settings.first.edge is not None:
+        return StageResult.load(work.inputs[settings.first.edge]).noise
+    assert isinstance(settings, EdgeSettings)  # stage III goes on from stage II
     return find_budget_noise(settings.federation, _plan_private(settings, plan).rules)
 
 

@@ -50,6 +50,8 @@ if TYPE_CHECKING:
     from flcav.federation.runtimes.deployed import PartlyDeployed, RegionalDeployment
     from flcav.federation.runtimes.topics import RosTopics
 
+    Deployed = RegionalDeployment | PartlyDeployed | None  # vehicles of a fleet
+
 BAG = "bag-from-round"  # begins the names of the folders of ROS 2 bags
 REPLAY = "cloud-replay"  # the cloud's own training among the edge servers; no region has a hyphen in its name
 RunRounds = Callable[[Weights, Account, int, OnRound], LocalUpdate]  # `federate` after so many rounds, with the rest
@@ -135,7 +137,7 @@ class Conduct:
         """Run the rounds after `done`, which begin with the weights `start`."""
         run(start, account, done, on_round)
 
-    def report(self, work: Work, settings: Any, rounds: int, deployed: Any) -> dict[str, Any]:
+    def report(self, work: Work, settings: Any, rounds: int, deployed: "Deployed") -> dict[str, Any]:
         """Return rows of the stage's result after its rounds, of which so many were planned."""
         return {}
 

@@ -73,6 +73,7 @@ from flcav.statistics.streams import derive_seed
 
 if TYPE_CHECKING:
     from flcav.federation.runtimes.deployed import RegionalDeployment
+    from flcav.runs.stages.rounds import Deployed
 
 EVERY_SCENE = 10**6  # more than there are
 AnswerT = TypeVar("AnswerT")
@@ -141,7 +142,7 @@ class Called(Conduct):
         else:
             run(start, account, done, on_round)
 
-    def report(self, work: Work, settings: EdgeSettings, rounds: int, deployed: Any) -> dict[str, Any]:
+    def report(self, work: Work, settings: EdgeSettings, rounds: int, deployed: "Deployed") -> dict[str, Any]:
         """Return the row of the group after its rounds, of which so many were planned."""
         shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
         with open_questions(self.watch.members, deployed, Account(self.book, EDGE, self.task.name, "wireless")) as ask:
