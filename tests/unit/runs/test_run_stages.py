@@ -250,7 +250,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     learning = Learning(LINEAR, None, Training(steps=25), 3)
-    monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: -float(network.weight.detach()))
+    monkeypatch.setattr(centralised, "average_splits", lambda task, network, splits: -float(network.weight.detach()))
     found = pretrain(learning, learning.build_network(), SAMPLES, (), tmp_path, ignore_progress)
     other = learning.build_network()
     history = train(LINEAR, other, SAMPLES, steps=25, schedule="one_cycle", seed=derive_seed(3, "pretrain"))
@@ -262,7 +262,7 @@ def test_pretraining_takes_the_tasks_schedule_and_ends_with_its_last_step(
 
 
 def test_a_kill_does_not_change_pretraining(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(centralised, "mean_score", lambda task, network, splits: float(network.bias.detach()))
+    monkeypatch.setattr(centralised, "average_splits", lambda task, network, splits: float(network.bias.detach()))
 
     def killed(done: int, total: int, note: str = "") -> None:
         if done == 70:
