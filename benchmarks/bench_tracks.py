@@ -18,13 +18,13 @@ from flcav.interface.progress import ignore_progress
 from flcav.machine.threads import use_threads
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.task import OBJECTS
-from flcav.pipeline.engine import Work
-from flcav.pipeline.frames import Frames, list_window
-from flcav.pipeline.labels.tracks import WINDOW_S, load_tracks
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.steps.graph import Graph
-from flcav.pipeline.steps.tracking import TrackSettings, track_step
-from flcav.pipeline.training.learning import load_stage_network
+from flcav.runs.engine import Work
+from flcav.runs.frames import Frames, list_window
+from flcav.runs.labels.tracks import WINDOW_S, load_tracks
+from flcav.runs.results.run import Run
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.tracking import TrackSettings, track_step
+from flcav.runs.training.learning import load_stage_network
 
 BOUND_S, BOUND_MB = 120, 1000
 

@@ -18,11 +18,11 @@ from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of
 from flcav.perception.ops.boxes import iou
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.quality import RETURNS
-from flcav.pipeline.labels.tracks import load_tracks
-from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.steps.regions import load_stage_network
+from flcav.runs.frames import Frames
+from flcav.runs.labels.quality import RETURNS
+from flcav.runs.labels.tracks import load_tracks
+from flcav.runs.results.training import Pretrained
+from flcav.runs.stages.regions import load_stage_network
 from flcav.storage.markdown import format_table
 
 OVERLAP, TOUCH = 0.5, 0.1  # IoU in 3D of a right label, and of a track that has to do with an object

@@ -24,14 +24,14 @@ from pathlib import Path
 
 from flcav.interface.progress import ignore_progress
 from flcav.machine.threads import use_threads
-from flcav.pipeline.alone import WORK, list_needed
-from flcav.pipeline.engine import Step, ignore_steps, run_steps
-from flcav.pipeline.engine.step import StepRecord, read_record
-from flcav.pipeline.engine.workers import perform
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, load_run_recipe
-from flcav.pipeline.results.saved import LEDGER, RESULT, WEIGHTS
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.edge_stage import WORK, list_needed
+from flcav.runs.engine import Step, ignore_steps, run_steps
+from flcav.runs.engine.step import StepRecord, read_record
+from flcav.runs.engine.workers import perform
+from flcav.runs.provenance import provenance
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, load_run_recipe
+from flcav.runs.results.saved import LEDGER, RESULT, WEIGHTS
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.streams import stream
 from flcav.storage.files import sha256
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 from flcav.config import InputError, read_json
 from flcav.experiments.experiment import load_experiment
-from flcav.pipeline.results.run import Run, Summary
-from flcav.pipeline.running import RESULTS, seed_folders
 from flcav.report import run_tables, seed_tables
+from flcav.runs.results.run import Run, Summary
+from flcav.runs.running import RESULTS, seed_folders
 from flcav.storage.files import write_bytes
 
 Tables = Mapping[str, str]

@@ -8,13 +8,13 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from flcav import pipeline
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import RESULTS
-from flcav.pipeline.spread import SpreadRow, list_spreads
-from flcav.pipeline.tables import append_records
+from flcav import runs
+from flcav.runs.results.run import Run
+from flcav.runs.running import RESULTS
+from flcav.runs.spread import SpreadRow, list_spreads
+from flcav.runs.tables import append_records
 
-PACKAGE = Path(pipeline.__path__[0])
+PACKAGE = Path(runs.__path__[0])
 NAME = "seed1"  # of the run, in the table
 
 

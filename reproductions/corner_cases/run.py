@@ -26,13 +26,13 @@ from flcav.perception.objects.predict import detect_frames
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import CARS, FrameTruth
 from flcav.perception.weights import load_network
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import WEIGHTS
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.runs.frames import Frames
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import WEIGHTS
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table

@@ -13,13 +13,13 @@ import numpy as np
 
 from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
-from flcav.pipeline.analysis.histories import gap_closed
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.training import LabelQuality
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.runs.analysis.histories import gap_closed
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.results.training import LabelQuality
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table

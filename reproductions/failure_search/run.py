@@ -24,8 +24,8 @@ from flcav.odd.scenery import Scenery
 from flcav.odd.searching import RULES, Searched, distinct, search_failures
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.storage.markdown import format_table

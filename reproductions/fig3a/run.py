@@ -20,10 +20,10 @@ from flcav.optimization.curves.fitting import Fit, explain_exponent, fit_additiv
 from flcav.optimization.curves.history import History, article_histories
 from flcav.optimization.curves.levels import level_seeds
 from flcav.optimization.graph import Layers, build_graph
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.tables import load_history
 from flcav.report import style
 from flcav.report.charts import curves as curve_charts
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.tables import load_history
 from flcav.storage.markdown import format_bullets, format_table
 from flcav.storage.records import Record
 

@@ -25,11 +25,11 @@ from flcav.optimization.placement.solve import Candidates, Placement, find_candi
 from flcav.perception.errors import Registry
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.task import OBJECTS
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.figures import town_map
 from flcav.report.charts.placement import draw_cover
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE, ErrorMap, poles_of
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.storage.markdown import format_table

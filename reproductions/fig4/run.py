@@ -29,9 +29,9 @@ from flcav.perception.agents import frame_reader, pole_backgrounds
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.truth import CARS
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.reproductions.fig4.cameras import CALIBRATED, CORRECTED, CameraResult, associate_camera, tabulate_cameras
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sensors.rig import RIGS, CalibrationError
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -4,9 +4,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from flcav.config import Json
-from flcav.pipeline.provenance import Provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, PRETRAIN
-from flcav.pipeline.results.run import LinkUse
+from flcav.runs.provenance import Provenance
+from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN
+from flcav.runs.results.run import LinkUse
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, mean_over_seeds

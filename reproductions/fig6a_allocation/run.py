@@ -15,11 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from flcav.experiments.experiment import Experiment, Options, Outcome, use_demo_size
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import run_several
-from flcav.pipeline.tables import load_history
 from flcav.report import style
 from flcav.report.charts import plans
 from flcav.reproductions.fig6a_allocation.findings import (
@@ -36,6 +31,11 @@ from flcav.reproductions.fig6a_allocation.findings import (
     StageAP,
     allocation_findings,
 )
+from flcav.runs.provenance import provenance
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.running import run_several
+from flcav.runs.tables import load_history
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.seeds import mean_over_seeds
 from flcav.storage.markdown import format_bullets, format_signed, format_table

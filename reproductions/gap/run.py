@@ -20,15 +20,15 @@ from flcav.network.ledger import BYTES_PER_MB, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import load_network
-from flcav.pipeline.analysis.histories import gap_closed
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import LEDGER, WEIGHTS
-from flcav.pipeline.training.checkpoints import load_round_network
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.runs.analysis.histories import gap_closed
+from flcav.runs.frames import Frames
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import LEDGER, WEIGHTS
+from flcav.runs.training.checkpoints import load_round_network
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table

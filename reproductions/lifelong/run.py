@@ -12,13 +12,13 @@ import numpy as np
 
 from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
-from flcav.pipeline.lifelong import NOTHING, PLAIN, REPLAY
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results.lifelong import LifelongArm
-from flcav.pipeline.results.run import Run
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_conditions
+from flcav.runs.extras.lifelong.rows import LifelongArm
+from flcav.runs.extras.lifelong.settings import NOTHING, PLAIN, REPLAY
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.results.run import Run
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table

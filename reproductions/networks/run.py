@@ -21,10 +21,10 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.study import read_recipe
 from flcav.perception.task import build_network
 from flcav.perception.training.loop import train
-from flcav.pipeline.engine import Notify, Step, Work, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.studies import costs
+from flcav.runs.engine import Notify, Step, Work, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.storage.markdown import format_table

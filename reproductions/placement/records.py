@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from flcav.config import Json
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.provenance import Provenance
+from flcav.runs.provenance import Provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.statistics.verdicts import describe_means

@@ -29,15 +29,6 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.outcomes import Outcomes
 from flcav.perception.weights import load_network
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.pseudo_labels import road_views, select_frames_near
-from flcav.pipeline.poles import find_sites, read_traces
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import ERRORS, OUTCOMES, WEIGHTS
-from flcav.pipeline.results.training import Pretrained
 from flcav.report import style
 from flcav.report.charts.placement import draw_gains
 from flcav.reproductions.placement.records import (
@@ -65,6 +56,15 @@ from flcav.reproductions.placement.records import (
     spread_over_seeds,
 )
 from flcav.reproductions.placement.tables import tables
+from flcav.runs.frames import Frames
+from flcav.runs.labels.pseudo_labels import road_views, select_frames_near
+from flcav.runs.poles import find_sites, read_traces
+from flcav.runs.provenance import provenance
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import ERRORS, OUTCOMES, WEIGHTS
+from flcav.runs.results.training import Pretrained
 from flcav.statistics.power import MOST_SEEDS
 from flcav.statistics.seeds import MeanOverSeeds, half_width, mean_over_seeds
 from flcav.world.line_of_sight import find_visible_pairs

@@ -20,8 +20,6 @@ from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.experiments.study import record_split
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes, Times, Values
-from flcav.pipeline.engine import Notify, Step, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
 from flcav.reproductions.redundant_tasks.scenarios import (
@@ -37,6 +35,8 @@ from flcav.reproductions.redundant_tasks.scenarios import (
     outcomes_file,
     try_splits,
 )
+from flcav.runs.engine import Notify, Step, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.bootstrap import share_scenes
 from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream

@@ -27,8 +27,8 @@ from flcav.perception.study import RecipeFields, read_recipe
 from flcav.perception.task import build_network
 from flcav.perception.training.loop import train
 from flcav.perception.weights import from_arrays, to_arrays
-from flcav.pipeline.engine import Work
-from flcav.pipeline.recipe import EDGE
+from flcav.runs.engine import Work
+from flcav.runs.recipe import EDGE
 from flcav.statistics.streams import derive_seed, stream
 from flcav.storage.records import Record
 

@@ -28,9 +28,9 @@ from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar, ground_truth
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_errors
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sensors.frame import Frame
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

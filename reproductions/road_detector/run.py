@@ -23,12 +23,12 @@ from flcav.perception.metrics import match
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.model import CONFIGURATIONS, SecondConfig
 from flcav.perception.objects.truth import CARS, LOOKALIKE, choose_lidar, in_range, network_from_lidar
-from flcav.pipeline.frames import Frames, group_frames
-from flcav.pipeline.labels.pseudo_labels import Spin, road_views, select_frames_near
-from flcav.pipeline.poles import find_sites
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_recall
+from flcav.runs.frames import Frames, group_frames
+from flcav.runs.labels.pseudo_labels import Spin, road_views, select_frames_near
+from flcav.runs.poles import find_sites
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.bootstrap import bootstrap_over_scenes

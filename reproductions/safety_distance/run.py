@@ -22,8 +22,8 @@ from flcav.driving.scenarios import spread_scenarios
 from flcav.driving.studies.importance import paired_difference
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.interface.progress import Report, ignore_progress
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.estimates import Estimate
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record

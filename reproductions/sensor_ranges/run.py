@@ -24,10 +24,10 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import frame_reader
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.predict import detect
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.charts.roadside import draw_ranges
 from flcav.reproductions.fig4.run import LIDAR, OVERLAP, find_range, list_cars
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe

@@ -40,8 +40,6 @@ from flcav.perception.objects.predict import (
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import CARS, FrameTruth, asked_of, choose_lidar, select_class
 from flcav.perception.ops.boxes import Kind
-from flcav.pipeline.engine import Notify, Step, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.report.pictures.clouds import real_frame
 from flcav.reproductions.sim_to_real.clouds import (
@@ -52,6 +50,8 @@ from flcav.reproductions.sim_to_real.clouds import (
     cloud_statistics,
     summarise_clouds,
 )
+from flcav.runs.engine import Notify, Step, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.storage.markdown import format_table
 from flcav.storage.records import LEFT_OUT, Class, Record
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from flcav.network import Ledger, StagePlan, price
     from flcav.optimization import Problem, allocate, fit, load_problem, place
     from flcav.perception import TASKS, evaluate, infer, register_errors, task_named, train
-    from flcav.pipeline import RunRecipe, load_run_recipe, run
+    from flcav.runs import RunRecipe, load_run_recipe, run
     from flcav.sensors import Frame
     from flcav.sources import Recipe, load_recipe
     from flcav.world import Town, Trace, load_town
@@ -48,9 +48,9 @@ PLACES = {
     "fit": "flcav.optimization",
     "load_problem": "flcav.optimization",
     "place": "flcav.optimization",
-    "RunRecipe": "flcav.pipeline",
-    "load_run_recipe": "flcav.pipeline",
-    "run": "flcav.pipeline",
+    "RunRecipe": "flcav.runs",
+    "load_run_recipe": "flcav.runs",
+    "run": "flcav.runs",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -33,8 +33,8 @@ from flcav.perception.errors import MISS, PerceptionError, Registry
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.training.messages import release_network, report_errors, upload_samples
+from flcav.runs.frames import Frames
+from flcav.runs.training.messages import release_network, report_errors, upload_samples
 
 
 class Wire:

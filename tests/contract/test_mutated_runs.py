@@ -8,8 +8,8 @@ import pytest
 from mutations import mutate
 
 from flcav.config import InputError
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.stages.graph import Graph
 
 TOY = Path(__file__).parents[1] / "integration" / "toy.yaml"
 

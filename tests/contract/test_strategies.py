@@ -26,9 +26,9 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Stateful
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.pipeline.engine import Step
-from flcav.pipeline.recipe import Federation, load_run_recipe
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.engine import Step
+from flcav.runs.recipe import Federation, load_run_recipe
+from flcav.runs.stages.graph import Graph
 from flcav.sources.recipe import recipe_path
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "06_bring_your_own_strategy.py"

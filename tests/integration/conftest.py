@@ -10,7 +10,7 @@ import pytest
 if TYPE_CHECKING:
     from toy_run import Studied
 
-    from flcav.pipeline.results.run import Run
+    from flcav.runs.results.run import Run
 
 
 @pytest.fixture(scope="session")
@@ -18,11 +18,11 @@ def studied(tmp_path_factory: pytest.TempPathFactory) -> "Studied":
     """Return the folder of both comparisons of one seed, and their results."""
     from toy_run import RECIPE
 
-    from flcav.pipeline.results.run import Run
-    from flcav.pipeline.running import run_seeds
     from flcav.report.pages.run_page import write_report
     from flcav.reproductions.demo_arms.run import compare_arms
     from flcav.reproductions.fig6a_allocation.run import compare_plans
+    from flcav.runs.results.run import Run
+    from flcav.runs.running import run_seeds
 
     base = tmp_path_factory.getbasetemp()
     folder = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base  # the workers' own lie in one
@@ -45,6 +45,6 @@ def finished(studied: "Studied") -> Path:
 @pytest.fixture(scope="session")
 def result(finished: Path) -> "Run":
     """Return the results of the run."""
-    from flcav.pipeline.results.run import Run
+    from flcav.runs.results.run import Run
 
     return Run.load(finished)

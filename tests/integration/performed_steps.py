@@ -5,9 +5,9 @@ from pathlib import Path
 
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import LedgerEntry
-from flcav.pipeline.engine import Work
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.engine import Work
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.stages.graph import Graph
 
 
 def perform(recipe: RunRecipe, made: Path, out: Path, names: Sequence[str]) -> None:

@@ -13,12 +13,12 @@ from flcav.config import InputError
 from flcav.dataset.layout import navigation_path
 from flcav.dataset.store import Dataset
 from flcav.geometry import yaw_of
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.sightings import draw_clock_offset, navigate
-from flcav.pipeline.labels.tracks import load_tracks
-from flcav.pipeline.recipe import EDGE, MAIN, RunRecipe
-from flcav.pipeline.running import run
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.frames import Frames
+from flcav.runs.labels.sightings import draw_clock_offset, navigate
+from flcav.runs.labels.tracks import load_tracks
+from flcav.runs.recipe import EDGE, MAIN, RunRecipe
+from flcav.runs.running import run
+from flcav.runs.stages.graph import Graph
 
 pytestmark = pytest.mark.slow
 

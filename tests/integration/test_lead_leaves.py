@@ -6,9 +6,9 @@ import pytest
 import yaml
 
 from flcav.network.ledger import Ledger
-from flcav.pipeline.alone import federate_regions
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results.groups import Term
+from flcav.runs.edge_stage import federate_regions
+from flcav.runs.extras.groups.rows import LeadTerm
+from flcav.runs.recipe import RunRecipe
 
 DOCS = Path(__file__).parents[2] / "docs" / "groups.md"
 
@@ -25,7 +25,7 @@ def test_the_next_lead_begins_the_round_again(tmp_path: Path) -> None:
     (found,) = federate_regions(read_recipe(), tmp_path, jobs=1).federations
     group = found.result.group
     assert group is not None
-    assert group.terms == (Term("grid/cav0", 1, 1, 1), Term("grid/cav1", 1))
+    assert group.terms == (LeadTerm("grid/cav0", 1, 1, 1), LeadTerm("grid/cav1", 1))
     assert "grid/cav0 left in round 1 with 1 update, and the round began again" in group.describe()
     ledger = Ledger.load(tmp_path / "work" / "grid-federate-weather" / "ledger.parquet")
     network = [each for each in ledger if each.round == 1 and each.bytes > 100_000]

@@ -7,10 +7,10 @@ import pytest
 
 from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import Ledger
-from flcav.pipeline.alone import federate_regions
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe, Training, load_run_recipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import run
+from flcav.runs.edge_stage import federate_regions
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe, Training, load_run_recipe
+from flcav.runs.results.run import Run
+from flcav.runs.running import run
 
 pytestmark = pytest.mark.slow
 

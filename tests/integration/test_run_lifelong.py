@@ -10,10 +10,10 @@ from safetensors.numpy import load_file
 
 from flcav.config import parse_config
 from flcav.network.ledger import Ledger
-from flcav.pipeline.recipe import RunRecipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import WORK, run
 from flcav.report.pages.run_page import write_report
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.results.run import Run
+from flcav.runs.running import WORK, run
 
 pytestmark = pytest.mark.slow
 

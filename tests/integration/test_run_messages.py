@@ -18,12 +18,12 @@ from flcav.network.clock.records import load_rounds
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import find_configuration
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, RunRecipe
-from flcav.pipeline.results.plans import ErrorRegistry, Plan
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import LEDGER
-from flcav.pipeline.results.training import FederatedRound, StageResult
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe
+from flcav.runs.results.plans import ErrorRegistry, Plan
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import LEDGER
+from flcav.runs.results.training import FederatedRound, StageResult
 
 pytestmark = pytest.mark.slow
 

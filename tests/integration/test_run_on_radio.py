@@ -8,14 +8,14 @@ import pytest
 from flcav.cli.main import run as command
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
-from flcav.pipeline.alone import TRAIN_TIMES, Federations, name_results
-from flcav.pipeline.radio.driving import TOO_SLOW
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, Training, load_run_recipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import SPREAD, run
-from flcav.pipeline.training.timing import TrainTimes
 from flcav.report.pages.run_page import draw
 from flcav.report.run_tables import tables
+from flcav.runs.driving import TOO_SLOW
+from flcav.runs.edge_stage import TRAIN_TIMES, Federations, name_results
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, RunRecipe, Training, load_run_recipe
+from flcav.runs.results.run import Run
+from flcav.runs.running import SPREAD, run
+from flcav.runs.training.timing import TrainTimes
 
 pytestmark = pytest.mark.slow
 

@@ -17,11 +17,13 @@ from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects import distillation
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
-from flcav.pipeline.analysis.histories import ORIGIN, HistoryOrigin
-from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side
-from flcav.pipeline.forecast import forecast_run
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import (
+from flcav.report.pages.run_page import page, write_report
+from flcav.reproductions.gap.run import IN_BYTES, UPLOADED, trace_bytes
+from flcav.runs.analysis.histories import ORIGIN, HistoryOrigin
+from flcav.runs.engine import Step, ignore_steps, run_side_by_side
+from flcav.runs.forecast import forecast_run
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import (
     CLOUD,
     EDGE,
     MAIN,
@@ -36,17 +38,15 @@ from flcav.pipeline.recipe import (
     Training,
     load_run_recipe,
 )
-from flcav.pipeline.results import tests as results
-from flcav.pipeline.results.plans import Plan
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import LEDGER, WEIGHTS
-from flcav.pipeline.results.tests import Difference
-from flcav.pipeline.results.training import Pretrained, StageResult
-from flcav.pipeline.running import RESULTS, run
-from flcav.pipeline.steps.graph import Graph
-from flcav.pipeline.tables import parse_history
-from flcav.report.pages.run_page import page, write_report
-from flcav.reproductions.gap.run import IN_BYTES, UPLOADED, trace_bytes
+from flcav.runs.results import tests as results
+from flcav.runs.results.plans import Plan
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import LEDGER, WEIGHTS
+from flcav.runs.results.tests import Difference
+from flcav.runs.results.training import Pretrained, StageResult
+from flcav.runs.running import RESULTS, run
+from flcav.runs.stages.graph import Graph
+from flcav.runs.tables import parse_history
 from flcav.statistics.verdicts import UNDECIDED
 from flcav.world.opendrive.importing import import_town
 

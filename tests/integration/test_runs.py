@@ -14,17 +14,17 @@ from toy_run import RECIPE, TOY, Studied
 
 from flcav.cli.main import run as command
 from flcav.dataset.store import Dataset
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
-from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.run import Run, Summary
-from flcav.pipeline.results.training import StageResult, Watched
-from flcav.pipeline.steps.graph import Graph
 from flcav.report.run_tables import judge_anew
 from flcav.reproductions.demo_arms.run import ARMS
 from flcav.reproductions.fig6a_allocation.findings import MEAN
 from flcav.reproductions.placement.records import COVERAGE, NEAR, TOWN, TRAFFIC
 from flcav.reproductions.placement.run import prove_placement
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.training import StageResult, Watched
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
 from flcav.world.map.town import load_town
 

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from flcav.experiments.study import open_split, record_split
-from flcav.pipeline.engine import Step, Work, run_side_by_side, run_steps
+from flcav.runs.engine import Step, Work, run_side_by_side, run_steps
 
 pytest.importorskip("ray", reason="the extra 'ray' is not installed")
 pytestmark = pytest.mark.slow

@@ -16,12 +16,12 @@ from waiting import LONGEST_S, wait_for
 
 from flcav.cli.main import run as command
 from flcav.config import InputError
-from flcav.pipeline.alone import federate_regions
-from flcav.pipeline.comparing import compare
-from flcav.pipeline.recipe import EDGE, MAIN, PRETRAIN, load_run_recipe
-from flcav.pipeline.results.training import Pretrained
-from flcav.pipeline.running import run
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.comparing import compare
+from flcav.runs.edge_stage import federate_regions
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, load_run_recipe
+from flcav.runs.results.training import Pretrained
+from flcav.runs.running import run
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.verdicts import UNDECIDED
 
 pytestmark = pytest.mark.slow
@@ -29,8 +29,8 @@ pytestmark = pytest.mark.slow
 GO = """
 import sys
 from pathlib import Path
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.running import run
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.running import run
 run(load_run_recipe(Path(sys.argv[1])), sys.argv[2])
 """
 

@@ -6,10 +6,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.running import RESULTS
 from flcav.reproductions.demo_arms.run import ArmsResult
 from flcav.reproductions.fig6a_allocation.findings import AllocationResult
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.running import RESULTS
 
 Studied = tuple[Path, ArmsResult, AllocationResult]
 TOY = Path(__file__).parent / "toy.yaml"

@@ -21,10 +21,10 @@ from flcav.interface.progress import ignore_progress
 from flcav.machine import locks
 from flcav.machine.locks import only_writer
 from flcav.perception.training.run import train_prepared
-from flcav.pipeline.engine import Step, ignore_steps, run_side_by_side, run_steps
-from flcav.pipeline.engine.step import StepRecord
-from flcav.pipeline.engine.workers import perform
-from flcav.pipeline.provenance import provenance
+from flcav.runs.engine import Step, ignore_steps, run_side_by_side, run_steps
+from flcav.runs.engine.step import StepRecord
+from flcav.runs.engine.workers import perform
+from flcav.runs.provenance import provenance
 from flcav.sources.recipe import Recipe
 from flcav.world.opendrive.importing import import_town
 

@@ -22,10 +22,10 @@ ALLOWED: Mapping[str, str] = {
     "flcav.config:read_yaml": UNCHECKED,
     "flcav.config:shorten": UNCHECKED,
     "flcav.interface.fields:lazy_names": OWN,
-    "flcav.pipeline.engine.run:run_steps": STEPS,
-    "flcav.pipeline.engine.step:Step.arguments": STEPS,
-    "flcav.pipeline.engine.step:Step.run": STEPS,
-    "flcav.pipeline.engine.step:Work.result": STEPS,
+    "flcav.runs.engine.run:run_steps": STEPS,
+    "flcav.runs.engine.step:Step.arguments": STEPS,
+    "flcav.runs.engine.step:Step.run": STEPS,
+    "flcav.runs.engine.step:Work.result": STEPS,
 }
 
 

@@ -41,10 +41,6 @@ from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
 from flcav.network.radio.recorded import link_scene
 from flcav.perception.weather.task import WEATHER
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.radio.buffered import BufferedFleet
-from flcav.pipeline.radio.driving import AWAY, Fleet
-from flcav.pipeline.recipe import Stragglers, draw_stragglers
 from flcav.report import style
 from flcav.reproductions.federation.drives import (
     Drives,
@@ -54,6 +50,10 @@ from flcav.reproductions.federation.drives import (
     record_drives,
     spread_over_scenes,
 )
+from flcav.runs.driving import AWAY, Fleet
+from flcav.runs.extras.buffered.driving import BufferedFleet
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import Stragglers, draw_stragglers
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import judge_means
 from flcav.storage.markdown import format_table

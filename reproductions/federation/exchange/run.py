@@ -26,16 +26,16 @@ from flcav.network.clock.records import ClientWork, work_of_messages
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_round
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
-from flcav.pipeline.arms import name_steps
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.radio.driving import link_scenes
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import WORK
 from flcav.report import style
 from flcav.report.cloud_rounds import format_divergence, span_divergence
+from flcav.runs.arms import name_steps
+from flcav.runs.driving import link_scenes
+from flcav.runs.frames import Frames
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.run import Run
+from flcav.runs.running import WORK
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED, Judged, judge_means
 from flcav.storage.markdown import format_table

@@ -25,7 +25,6 @@ from flcav.federation.trainable import LocalUpdate, Trainable, Weights, learned_
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.reproductions.federation.drives import (
     CLASSES,
     Drives,
@@ -35,6 +34,7 @@ from flcav.reproductions.federation.drives import (
     record_drives,
     spread_over_scenes,
 )
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.statistics.verdicts import Claim, judge

@@ -1,7 +1,7 @@
 """Groups on request against a fixed roster: accuracy by megabytes of uplink, at equal megabytes and after the plan.
 
 Ten vehicles drive with a network that knows six of eight weathers. In one setting all of them meet the other two, in
-the other three do. A group is called as in stage II of a run (`flcav.pipeline.training.groups`): who errs asks, all
+the other three do. A group is called as in stage II of a run (`flcav.runs.extras.groups.choosing`): who errs asks, all
 offer, the lead chooses by their data, and the group dissolves when its loss on held-back pictures has levelled off.
 """
 
@@ -31,9 +31,6 @@ from flcav.federation.trainable import Weights
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes, pack_arrays, send_message
 from flcav.perception.weather.task import WEATHER
-from flcav.pipeline.provenance import Provenance, provenance
-from flcav.pipeline.recipe import EDGE, Requests
-from flcav.pipeline.training.groups import Levelled, choose_members, has_levelled, weigh_offers
 from flcav.report import style
 from flcav.reproductions.federation.drives import (
     Drives,
@@ -44,6 +41,11 @@ from flcav.reproductions.federation.drives import (
     spread_over_scenes,
 )
 from flcav.reproductions.federation.groups.vehicles import Fleet, make_offer, open_fleet
+from flcav.runs.extras.groups.choosing import choose_members, has_levelled, weigh_offers
+from flcav.runs.extras.groups.settings import Requests
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import EDGE
+from flcav.runs.stages.rounds import RoundsOver
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import judge_means
 from flcav.storage.markdown import format_table
@@ -180,10 +182,10 @@ def follow(
             for name in members:
                 send_message(book, told, client=name, round_=number, **UP)
             if has_levelled(losses, REQUESTS):
-                raise Levelled
+                raise RoundsOver
 
     pictures = fleet.train if asked else fleet.whole
-    with suppress(Levelled):
+    with suppress(RoundsOver):
         federate(
             {name: Vehicle(pictures[name]) for name in sorted(members)},
             fleet.start,

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from flcav.federation.trainable import Weights
-from flcav.pipeline.training.members import Offer, hold_back, sketch_gradient
 from flcav.reproductions.federation.drives import (
     Drives,
     Pictures,
@@ -19,6 +18,7 @@ from flcav.reproductions.federation.drives import (
     draw_head,
     measure_losses,
 )
+from flcav.runs.extras.groups.members import Offer, hold_back, sketch_gradient
 from flcav.statistics.streams import derive_seed, stream
 
 PRETRAIN_SCENES = 3  # the first ones

@@ -30,7 +30,6 @@ from flcav.federation.wire import ARRAYS, VECTOR, LocalWork, decode_update, read
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.reproductions.federation.drives import (
     HIDDEN,
@@ -44,6 +43,7 @@ from flcav.reproductions.federation.drives import (
     record_drives,
     spread_over_scenes,
 )
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.storage.markdown import format_table

@@ -24,9 +24,9 @@ from flcav.federation.strategies import FEDAVG, Strategy
 from flcav.federation.strategies.robust import Krum, Median, TrimmedMean
 from flcav.federation.trainable import LocalUpdate, Weights
 from flcav.interface.progress import Report, ignore_progress
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.report import style
 from flcav.reproductions.federation.drives import CLASSES, HIDDEN, OUT, Labels, Pictures, Vector, find_right
+from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.streams import stream
 from flcav.storage.markdown import format_table

@@ -11,8 +11,8 @@ from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
-    from flcav.pipeline.engine import Notify
-    from flcav.pipeline.results.training import StageResult
+    from flcav.runs.engine import Notify
+    from flcav.runs.results.training import StageResult
 
 
 @when_interrupted()
@@ -43,9 +43,9 @@ def federate(
         refuse_unused(f"--runtime {runtime.value}", "fleet")
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.pipeline.alone import TRAIN_TIMES, federate_regions, measure_times, name_results
-    from flcav.pipeline.recipe import load_run_recipe
-    from flcav.pipeline.results.training import TOGETHER
+    from flcav.runs.edge_stage import TRAIN_TIMES, federate_regions, measure_times, name_results
+    from flcav.runs.recipe import load_run_recipe
+    from flcav.runs.results.training import TOGETHER
     from flcav.sources.recipe import find_recipe
     from flcav.storage.files import check_writable
 
@@ -79,12 +79,12 @@ def _describe(result: "StageResult") -> str:
     told += f", {sum(seconds):.1f} s on the network" if seconds else ""
     rest = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
     told = ", ".join([told, *filter(None, rest)])
-    return told if result.group is None else f"{told}; {result.group.describe()}"
+    return "; ".join([told, *result.describe_rows().values()])
 
 
 def _telling(notify: "Notify") -> "Notify":
     """Return a `Notify` that also prints the rounds as they end."""
-    from flcav.pipeline.alone import tells_of_round
+    from flcav.runs.edge_stage import tells_of_round
 
     def tell(step: str, done: int, total: int, note: str) -> None:
         of_round = tells_of_round(step, note)

@@ -43,7 +43,7 @@ class Device(StrEnum):
 
 
 class EngineName(StrEnum):
-    """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.pipeline.engine`."""
+    """Execution engine, see `flcav.dataset.recording.recorder` and `flcav.runs.engine`."""
 
     processes = "processes"
     ray = "ray"
@@ -58,7 +58,7 @@ class Runtime(StrEnum):
 
 
 class Stale(StrEnum):
-    """Treatment of steps that were done by other code, see `flcav.pipeline.engine`."""
+    """Treatment of steps that were done by other code, see `flcav.runs.engine`."""
 
     refuse = "refuse"
     redo = "redo"

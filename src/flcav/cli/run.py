@@ -14,7 +14,7 @@ from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
-    from flcav.pipeline.results.run import Run, Summary
+    from flcav.runs.results.run import Run, Summary
 
 
 RUNTIME = typer.Option(
@@ -52,8 +52,8 @@ def run(
 def _forecast(path: Path) -> Answer:
     use_threads(1)
     from flcav.interface.progress import show_progress
-    from flcav.pipeline.forecast import forecast_run
-    from flcav.pipeline.recipe import load_run_recipe
+    from flcav.runs.forecast import forecast_run
+    from flcav.runs.recipe import load_run_recipe
     from flcav.sources.recipe import find_recipe
 
     found = find_recipe(path)
@@ -86,11 +86,11 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: M
     """Run a recipe; `how`: arguments of `flcav.run`."""
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.pipeline.recipe import load_run_recipe
-    from flcav.pipeline.running import run as run_one
-    from flcav.pipeline.running import run_seeds
     from flcav.report.pages.run_page import write_report
     from flcav.report.seed_tables import draw_seeds
+    from flcav.runs.recipe import load_run_recipe
+    from flcav.runs.running import run as run_one
+    from flcav.runs.running import run_seeds
     from flcav.sources.recipe import find_recipe
     from flcav.storage.files import check_writable, write_bytes
 
@@ -117,9 +117,9 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: M
 
 
 def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str]:
-    from flcav.pipeline.analysis.caveats import PLACED_BARE
-    from flcav.pipeline.analysis.costs import tell_gain
-    from flcav.pipeline.results.training import TOGETHER
+    from flcav.runs.analysis.caveats import PLACED_BARE
+    from flcav.runs.analysis.costs import tell_gain
+    from flcav.runs.results.training import TOGETHER
 
     if summary is None:
         yield from tell_gain(results[0])
@@ -128,8 +128,7 @@ def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str
         for name, arm in results[0].arms.items():
             if arm.privacy is not None:
                 yield f"{name}, {TOGETHER}: {arm.privacy.describe()}"
-        for arm in results[0].lifelong or ():
-            yield f"lifelong, {arm.task}, {arm.describe()}"
+        yield from results[0].describe_rows()
         if PLACED_BARE in results[0].caveats:
             yield f"privacy: {PLACED_BARE}"
         return
@@ -156,7 +155,7 @@ def compare(
     for option, value in (("--task", task), ("--agents", agents)):
         if value is not None:
             raise InputError(f"{option}: only two networks have one, and without --data two runs are compared")
-    from flcav.pipeline.comparing import compare as compare_runs
+    from flcav.runs.comparing import compare as compare_runs
 
     rows = compare_runs(first, second)
     yield {"compared": [dataclasses.asdict(row) for row in rows]}

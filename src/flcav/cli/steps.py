@@ -9,8 +9,8 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from flcav.federation.state import FAILED
 from flcav.interface.progress import DAMAGED
 from flcav.interface.wording import plural
-from flcav.pipeline.engine import FINISHED, Notify
-from flcav.pipeline.rigs import RIG
+from flcav.runs.engine import FINISHED, Notify
+from flcav.runs.rigs import RIG
 
 EPSILON = "epsilon"  # in the notes of rounds with differential privacy
 

@@ -16,10 +16,10 @@ from flcav.config import InputError, Json
 from flcav.experiments import FOLDER, list_experiments
 from flcav.interface.progress import Report
 from flcav.interface.wording import suggest
-from flcav.pipeline.engine import Notify
-from flcav.pipeline.recipe import RunRecipe, load_run_recipe
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.running import WORK, run_seeds
+from flcav.runs.engine import Notify
+from flcav.runs.recipe import RunRecipe, load_run_recipe
+from flcav.runs.results.run import Run
+from flcav.runs.running import WORK, run_seeds
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import judge_means
@@ -36,7 +36,7 @@ OPTIONS = (*STUDY, "kitti", "data", "around", "weights")  # all
 
 
 class HowToRun(TypedDict):
-    """How steps are run, see `flcav.pipeline.engine.run_steps`."""
+    """How steps are run, see `flcav.runs.engine.run_steps`."""
 
     jobs: int
     notify: Notify

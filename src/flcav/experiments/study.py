@@ -18,11 +18,11 @@ from flcav.perception.study import RecipeFields, Studied, StudyRecipe, test_seed
 from flcav.perception.task import Evaluated, Task
 from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
 from flcav.perception.weights import Card, load_network
-from flcav.pipeline.engine import Notify, Step, Work, run_steps
-from flcav.pipeline.provenance import Provenance, provenance
 from flcav.plugins import load_named
 from flcav.report import style
 from flcav.report.charts.studies import Bar, precisions
+from flcav.runs.engine import Notify, Step, Work, run_steps
+from flcav.runs.provenance import Provenance, provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.power import MOST_SEEDS, plan_seeds

@@ -18,8 +18,8 @@ from flcav.geometry import Array
 from flcav.odd.measure import measure_domain, scenery_of
 from flcav.odd.scenery import Scenery
 from flcav.perception.tasks import task_named
-from flcav.pipeline.label_sources import choose_labels
-from flcav.pipeline.recipe import RunRecipe
+from flcav.runs.label_sources import choose_labels
+from flcav.runs.recipe import RunRecipe
 from flcav.storage.records import Record
 from flcav.world.map.town import PACKAGED
 

@@ -1,13 +1,13 @@
-"""Data quality of vehicles under non-IID data: label distribution distance, visible objects, gradient diversity.
+"""Data quality of vehicles under non-IID data: label distribution distance, visible objects, gradient novelty.
 
 Each measure is over a fleet of V vehicles; `data_quality` combines them into one weight per vehicle. For IID data all
 weights are equal.
 """
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Array = NDArray[np.float64]
+from flcav.geometry.arrays import Array
 
 LEAST = 0.01  # least factor of a quality, relative to the fleet's best: no data are worth nothing
 
@@ -36,18 +36,6 @@ def visible_objects(objects: ArrayLike, samples: ArrayLike) -> Array:
     """
     seen, held = np.asarray(objects, dtype=np.float64), np.asarray(samples, dtype=np.float64)
     return np.divide(seen, held, out=np.zeros_like(seen), where=held > 0)
-
-
-def gradient_diversity(gradients: ArrayLike) -> float:
-    """Return the gradient diversity sum_v ||g_v||^2 / ||sum_v g_v||^2 of gradients (V, P).
-
-    It is 1/V where all gradients are equal, 1 where they are orthogonal, infinite where they cancel (Yin et al. 2018,
-    "Gradient diversity: a key ingredient for scalable distributed learning").
-    """
-    rows = np.asarray(gradients, dtype=np.float64)
-    together = float((rows.sum(axis=0) ** 2).sum())
-    apart = float((rows**2).sum())
-    return apart / together if together > 0 else float("inf") if apart > 0 else 1 / len(rows)
 
 
 def gradient_novelty(gradients: ArrayLike) -> Array:

@@ -42,7 +42,7 @@ class Shared(Protocol):
 
     @property
     def labels(self) -> tuple[str, ...]:
-        """Return the kinds of labels that clients can train on, the default first: see `flcav.pipeline.labels`."""
+        """Return the kinds of labels that clients can train on, the default first: see `flcav.runs.labels`."""
         ...
 
     def pack_samples(self, data: Dataset, config: Any, frames: Sequence[int]) -> Iterator[bytes]:

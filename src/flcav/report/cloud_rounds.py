@@ -6,9 +6,9 @@ import numpy as np
 from scipy.stats import permutation_test, rankdata
 
 from flcav.federation.state import RoundDivergence
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.training import FederatedRound, StageResult
+from flcav.runs.recipe import CLOUD, EDGE, MAIN
+from flcav.runs.results.run import Run
+from flcav.runs.results.training import FederatedRound, StageResult
 from flcav.statistics.streams import stream
 from flcav.storage.markdown import format_table
 

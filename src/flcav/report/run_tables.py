@@ -7,15 +7,15 @@ import numpy as np
 
 from flcav.federation.state import FAILED
 from flcav.network.ledger import LINKS
-from flcav.pipeline.analysis.costs import list_home_costs
-from flcav.pipeline.analysis.findings import findings, name_stage
-from flcav.pipeline.arms import resolve_settings
-from flcav.pipeline.label_sources import LABEL_SOURCES
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.tests import RunFinding
-from flcav.pipeline.spread import read_spreads, widen_anew
 from flcav.report.cloud_rounds import cloud_tables
+from flcav.runs.analysis.costs import list_home_costs
+from flcav.runs.analysis.findings import findings, name_stage
+from flcav.runs.arms import resolve_settings
+from flcav.runs.label_sources import LABEL_SOURCES
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.runs.results.run import Run
+from flcav.runs.results.tests import RunFinding
+from flcav.runs.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
 
 

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from flcav.pipeline.analysis.costs import list_home_costs
-from flcav.pipeline.recipe import MAIN, PRETRAIN
-from flcav.pipeline.results.run import Run, Summary
-from flcav.pipeline.results.tests import Difference
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.run_tables import LABELS, judge_anew
+from flcav.runs.analysis.costs import list_home_costs
+from flcav.runs.recipe import MAIN, PRETRAIN
+from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.tests import Difference
 from flcav.statistics.estimates import Estimate
 from flcav.storage.markdown import format_table
 

@@ -28,12 +28,12 @@ from flcav.dataset.validation import find_leaks, validate
 from flcav.geometry import inverse, wrap_angle
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger
-from flcav.pipeline.engine import Step, Work
-from flcav.pipeline.frames import group_frames
-from flcav.pipeline.recipe import EDGE, SPLITS_OF, RunRecipe
-from flcav.pipeline.results.plans import Plan
-from flcav.pipeline.results.saved import LEDGER
-from flcav.pipeline.steps.graph import Graph
+from flcav.runs.engine import Step, Work
+from flcav.runs.frames import group_frames
+from flcav.runs.recipe import EDGE, SPLITS_OF, RunRecipe
+from flcav.runs.results.plans import Plan
+from flcav.runs.results.saved import LEDGER
+from flcav.runs.stages.graph import Graph
 from flcav.sensors.frame import Frame
 
 SCENES = 2

@@ -8,7 +8,7 @@ import yaml
 from flcav.cli.federate import _describe, _telling
 from flcav.cli.main import run
 from flcav.cli.steps import live_steps
-from flcav.pipeline.results.training import FederatedRound, StageResult
+from flcav.runs.results.training import FederatedRound, StageResult
 
 NAME = "cars [3D] :car:"
 RECIPE = Path(__file__).parents[3] / "recipes" / "allocation" / "objects.yaml"

@@ -6,8 +6,8 @@ import pytest
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import RadioLinks
-from flcav.pipeline.radio.driving import Fleet
 from flcav.reproductions.federation.asynchrony.run import Rival, Scheduled, schedule_buffers, schedule_rounds
+from flcav.runs.driving import Fleet
 
 NAMES = tuple(f"ring/cav{number}" for number in range(3))
 FLEET = Fleet("ring", NAMES, 0, 1000, 1.0, {"ring/cav2": 0.2})

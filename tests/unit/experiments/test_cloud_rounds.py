@@ -6,9 +6,9 @@ from typing import Any, cast
 import numpy as np
 
 from flcav.federation.state import Divergence, RoundDivergence
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.results.training import FederatedRound, StageResult, StatisticsScore
 from flcav.report.cloud_rounds import cloud_tables, describe_correlation
+from flcav.runs.recipe import CLOUD, EDGE, MAIN
+from flcav.runs.results.training import FederatedRound, StageResult, StatisticsScore
 
 GAINS = {"grid": (0.01, -0.02, 0.03, 0.0), "ring": (0.02, 0.0, 0.01, -0.01)}
 BEGUN, TRAINED = (0.4, 0.3, 0.1, 0.2), (0.2, 0.1, 0.4, 0.3)

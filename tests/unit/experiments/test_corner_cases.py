@@ -13,7 +13,6 @@ from PIL import Image
 from flcav.geometry import Boxes
 from flcav.perception.objects.evaluate import score_detections
 from flcav.perception.objects.truth import FrameTruth
-from flcav.pipeline.recipe import MAIN, load_run_recipe
 from flcav.reproductions.corner_cases import run as corner_cases
 from flcav.reproductions.corner_cases.run import (
     ARMS,
@@ -30,6 +29,7 @@ from flcav.reproductions.corner_cases.run import (
     is_rare,
     only_rare,
 )
+from flcav.runs.recipe import MAIN, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.world.shapes import PARKED_ONLY, RARE, SHAPES
 

@@ -17,8 +17,6 @@ from flcav.network.radio.links import RadioLinks
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.arms import check_federations, resolve_settings
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.reproductions.federation.exchange import run as exchanges
 from flcav.reproductions.federation.exchange.run import (
     NAMES,
@@ -37,6 +35,8 @@ from flcav.reproductions.federation.exchange.run import (
     summarise,
     tables,
 )
+from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
 

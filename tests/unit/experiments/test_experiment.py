@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from flcav.experiments.experiment import Experiment, Options, Outcome
-from flcav.pipeline.engine import Step, Work, run_steps
+from flcav.runs.engine import Step, Work, run_steps
 from flcav.storage.markdown import format_table
 
 

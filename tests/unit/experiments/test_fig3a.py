@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from flcav.optimization.graph import to_problem
-from flcav.pipeline.tables import load_history
 from flcav.reproductions.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
+from flcav.runs.tables import load_history
 
 pytestmark = pytest.mark.slow
 

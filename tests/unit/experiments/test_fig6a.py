@@ -4,10 +4,6 @@ import numpy as np
 import pytest
 
 from flcav.config import InputError
-from flcav.pipeline.provenance import provenance
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results.plans import Placed, Pole
-from flcav.pipeline.results.run import LinkUse
 from flcav.report.charts.plans import predicted_and_realised
 from flcav.reproductions.fig6a_allocation.findings import (
     EQUAL,
@@ -30,6 +26,10 @@ from flcav.reproductions.fig6a_allocation.run import (
     summarise,
     tables,
 )
+from flcav.runs.provenance import provenance
+from flcav.runs.recipe import load_run_recipe
+from flcav.runs.results.plans import Placed, Pole
+from flcav.runs.results.run import LinkUse
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.estimates import Estimate
 

@@ -5,8 +5,6 @@ from typing import Any, cast
 
 import pytest
 
-from flcav.pipeline.recipe import MAIN, load_run_recipe
-from flcav.pipeline.results.training import LabelQuality
 from flcav.reproductions.gap.run import (
     ARMS,
     AT_HOME,
@@ -31,6 +29,8 @@ from flcav.reproductions.gap.run import (
     gap_tables,
     list_uploads,
 )
+from flcav.runs.recipe import MAIN, load_run_recipe
+from flcav.runs.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/gap"))

@@ -5,9 +5,6 @@ from typing import Any, cast
 
 import pytest
 
-from flcav.pipeline.recipe import EDGE, MAIN, load_run_recipe
-from flcav.pipeline.results.run import Spent
-from flcav.pipeline.results.training import LabelQuality
 from flcav.reproductions.distillation.run import (
     ARMS,
     AVERAGE,
@@ -20,6 +17,9 @@ from flcav.reproductions.distillation.run import (
     compare_labels,
     tables,
 )
+from flcav.runs.recipe import EDGE, MAIN, load_run_recipe
+from flcav.runs.results.run import Spent
+from flcav.runs.results.training import LabelQuality
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/distillation"))

@@ -7,8 +7,6 @@ from typing import Any, cast
 import pytest
 from PIL import Image
 
-from flcav.pipeline.recipe import load_run_recipe
-from flcav.pipeline.results.lifelong import LifelongArm, Passed
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_rounds
 from flcav.reproductions.lifelong.run import (
@@ -19,6 +17,8 @@ from flcav.reproductions.lifelong.run import (
     draw_lifelong,
     lifelong_tables,
 )
+from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
+from flcav.runs.recipe import load_run_recipe
 from flcav.sources.recipe import recipe_path
 
 RECIPE = load_run_recipe(recipe_path("runs/lifelong"))

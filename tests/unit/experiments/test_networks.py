@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.pipeline.recipe import load_run_recipe
 from flcav.reproductions.networks import run as networks
 from flcav.reproductions.networks.run import (
     CHOSEN,
@@ -22,6 +21,7 @@ from flcav.reproductions.networks.run import (
     networks_tables,
     search_networks,
 )
+from flcav.runs.recipe import load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.seeds import mean_over_seeds
 
@@ -84,7 +84,7 @@ def test_seeds_train_every_candidate_and_shares_are_of_the_same_seed(
 @pytest.mark.slow
 def test_every_candidate_is_trained_and_scored(tmp_path: Path) -> None:
     """The step itself, on four sweeps and two optimiser steps."""
-    from flcav.pipeline.engine import run_steps
+    from flcav.runs.engine import run_steps
 
     steps = list_steps((1,), quick=True)
     kept = [step for step in steps if step.arguments.get("name") in (None, CHOSEN)]

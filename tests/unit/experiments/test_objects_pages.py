@@ -7,13 +7,13 @@ from flcav.geometry import Boxes
 from flcav.perception.images import CameraView
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.weights import Card
-from flcav.pipeline.provenance import provenance
 from flcav.report.pictures.clouds import real_frame
 from flcav.reproductions.sim_to_real import run as sim_to_real_tables
 from flcav.reproductions.sim_to_real.clouds import CloudNumbers, SeenCar, Street
 from flcav.reproductions.sim_to_real.run import FrameResult, LabelledCar, RealScore, SimToReal, draw_clouds
 from flcav.reproductions.task_objects import run as objects_tables
 from flcav.reproductions.task_objects.run import STUDY
+from flcav.runs.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 
 

@@ -19,8 +19,8 @@ import pytest
 import yaml
 
 from flcav.config import Json, read_json
-from flcav.pipeline.results.run import Run, Summary
-from flcav.pipeline.spread import read_spreads, widen_anew
+from flcav.runs.results.run import Run, Summary
+from flcav.runs.spread import read_spreads, widen_anew
 
 ROOT = Path(__file__).parents[3]
 TIES: Mapping[str, Any] = yaml.safe_load((ROOT / "reproductions" / "figures.yaml").read_text(encoding="utf-8"))

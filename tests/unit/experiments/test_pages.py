@@ -5,9 +5,9 @@ import pytest
 from reproduction_pages import fill, fill_folder, tables_of
 
 from flcav.config import InputError, read_json
-from flcav.pipeline.results.run import Summary
-from flcav.pipeline.running import RESULTS
 from flcav.reproductions.demo_arms.run import ARMS, ArmsResult, order_arms
+from flcav.runs.results.run import Summary
+from flcav.runs.running import RESULTS
 from flcav.storage.markdown import format_table
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"

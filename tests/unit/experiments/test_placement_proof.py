@@ -19,8 +19,6 @@ from flcav.optimization.curves.held_out import rank_correlation
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.recipe import load_run_recipe
 from flcav.reproductions.placement import records
 from flcav.reproductions.placement import run as placement_run
 from flcav.reproductions.placement.records import (
@@ -52,6 +50,8 @@ from flcav.reproductions.placement.run import (
     summarise_gains,
 )
 from flcav.reproductions.placement.tables import tables
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import load_run_recipe
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.verdicts import judge_means

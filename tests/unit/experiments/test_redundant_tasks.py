@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from flcav.config import InputError
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes
-from flcav.pipeline.engine import run_steps
 from flcav.reproductions.redundant_tasks.run import (
     ALL,
     LEAST,
@@ -41,6 +40,7 @@ from flcav.reproductions.redundant_tasks.scenarios import (
     split_tasks,
     spread_frames,
 )
+from flcav.runs.engine import run_steps
 from flcav.storage.records import from_json
 
 

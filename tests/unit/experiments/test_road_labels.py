@@ -3,8 +3,8 @@
 import numpy as np
 
 from flcav.geometry import Boxes
-from flcav.pipeline.provenance import provenance
 from flcav.reproductions.road_detector.run import RoadDetectorResult, RoadLabels, detector_tables, grade_labels
+from flcav.runs.provenance import provenance
 
 
 def cars(*rows: tuple[float, float, float]) -> Boxes:

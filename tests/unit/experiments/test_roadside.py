@@ -8,13 +8,13 @@ from flcav.cli.planning.place_inputs import read_given
 from flcav.config import parse_config
 from flcav.fusion.average import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
-from flcav.pipeline.provenance import provenance
 from flcav.reproductions.fig3b.run import ZONE_M, TownCover, _count_zones, cover_town, list_kinds
 from flcav.reproductions.fig4.run import EDGES_M, find_range
 from flcav.reproductions.road_average.run import Errors, apply_errors, measure_residual
 from flcav.reproductions.road_detector.run import _Frames, fit_threshold, score_town
 from flcav.reproductions.sensor_ranges.run import EDGES_M as SENSOR_EDGES_M
 from flcav.reproductions.sensor_ranges.run import SHARED, LidarModel, SensorRanges
+from flcav.runs.provenance import provenance
 from flcav.sensors.rig import RIGS, Rig
 from flcav.sources.recipe import Recipe
 from flcav.world.map.town import load_town

@@ -7,7 +7,6 @@ import numpy as np
 from flcav.fusion.association import PairedShot, Pairs
 from flcav.fusion.registration import Offset
 from flcav.geometry import Boxes
-from flcav.pipeline.provenance import provenance
 from flcav.reproductions.fig4.cameras import (
     CALIBRATED,
     CORRECTED,
@@ -20,6 +19,7 @@ from flcav.reproductions.fig4.cameras import (
     name_actors,
 )
 from flcav.reproductions.fig4.run import Fig4, fig4_tables
+from flcav.runs.provenance import provenance
 from flcav.sensors.frame import Annotations, Calibration, Frame, Views
 
 NONE = np.zeros(0, np.int64)

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from flcav.pipeline.analysis.summary import count_claims
-from flcav.pipeline.results.run import Run, Summary
 from flcav.report.seed_tables import draw_seeds, tables
+from flcav.runs.analysis.summary import count_claims
+from flcav.runs.results.run import Run, Summary
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"

@@ -7,8 +7,8 @@ from flcav.dataset.rectangles import SIGNS
 from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
 from flcav.perception.signs.evaluate import ClassPrecision, SignsEvaluation, SizePrecision
 from flcav.perception.weights import Card
-from flcav.pipeline.provenance import provenance
 from flcav.reproductions.task_signs.run import STUDY, tables
+from flcav.runs.provenance import provenance
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.seeds import mean_over_seeds

@@ -9,8 +9,8 @@ from flcav.experiments.study import SeedResult, StudyRecordings, StudyResult
 from flcav.perception.trajectory.config import FUTURE, PAST
 from flcav.perception.trajectory.evaluate import TrajectoryEvaluation, evaluate_paths
 from flcav.perception.weights import Card
-from flcav.pipeline.provenance import provenance
 from flcav.reproductions.task_trajectory.run import CAMERAS, STUDY, tables
+from flcav.runs.provenance import provenance
 from flcav.statistics.seeds import mean_over_seeds
 
 

@@ -28,7 +28,7 @@ from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.trainable import LocalUpdate, Update, Weights
 from flcav.federation.wire import VECTOR, read_arrays
 from flcav.network.ledger import Ledger, LinkMegabytes
-from flcav.pipeline.training.private_rounds import PrivateTraining, compose_trainings
+from flcav.runs.training.private_rounds import PrivateTraining, compose_trainings
 
 ABOVE = {"gaussian": 1.25, "poisson": 1.4, "uniform": 2.0}  # factors, by what amplifies
 DELTA, NOISE, CLIENTS = 1e-5, 2.0, 5

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from federations import cloud_federation, federate_cloud
 from line_task import LineTask, Slope
 
 from flcav.federation.rules import Rules
@@ -14,10 +15,10 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.task import Task
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.recipe import CLOUD, Training
-from flcav.pipeline.steps.cloud import CloudFederation, RegionStart, federate_cloud
-from flcav.pipeline.training.checkpoints import LAST, Checkpoint, FederationCheckpoints
-from flcav.pipeline.training.learning import Learning, Strategies, make_clients
+from flcav.runs.recipe import CLOUD, Training
+from flcav.runs.stages.rounds import RegionStart
+from flcav.runs.training.checkpoints import LAST, Checkpoint, FederationCheckpoints
+from flcav.runs.training.learning import Learning, Strategies, make_clients
 
 
 def test_divergence_is_the_mean_relative_distance_from_the_mean() -> None:
@@ -57,7 +58,7 @@ def test_a_cloud_round_records_how_far_regions_were_apart(tmp_path: Path, monkey
     def run(folder: Path) -> Any:
         folder.mkdir(exist_ok=True)
         where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folder, ignore_progress)
-        federate_cloud(CloudFederation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, Rules())
+        federate_cloud(cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, Rules())
         return Checkpoint.read(folder, LAST).records[CLOUD]
 
     first, second = run(tmp_path / "whole")

@@ -28,11 +28,12 @@ from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import FrameTruth
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels import quality, road_average
-from flcav.pipeline.labels.quality import measure_labels, read_history
-from flcav.pipeline.labels.road_average import RoadAverageLabels
-from flcav.pipeline.results.training import Found
+from flcav.runs.extras.distillation import labelling as road_average
+from flcav.runs.extras.distillation.labelling import RoadAverageLabels
+from flcav.runs.frames import Frames
+from flcav.runs.labels import quality
+from flcav.runs.labels.quality import measure_labels, read_label_history
+from flcav.runs.results.training import FoundTargets
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.world.map.layers import MapLane, MapLayers
 
@@ -240,7 +241,7 @@ def test_precision_and_recall_of_labels_count_targets_once_and_neutral_ones_not(
     assert (found.precision, found.recall) == (pytest.approx(3 / 5), pytest.approx(3 / 6))
     assert (found.tight, found.size_m) == (pytest.approx(3 / 3), 0)  # .3 m along 4 m or more: IoU above .7
     assert found.offset_m == 0  # the median of 0, 0 and .3
-    assert found.by_returns == (Found(5, 2, 2), Found(20, 2, 1), Found(100, 2, 0))
+    assert found.by_returns == (FoundTargets(5, 2, 2), FoundTargets(20, 2, 1), FoundTargets(100, 2, 0))
     low = Sample(points, replace(boxes((10.5, 0), z=-1.0), size=boxes((10.5, 0)).size - (0, 0, 0.4)))
     worse = measure_labels(3, split, (0, 1), "grid", {"grid/cav0": [low], "grid/cav1": [low]}, CONFIG)
     assert (worse.tight, worse.offset_m, worse.size_m) == (0, pytest.approx(0.5), pytest.approx(0.4))
@@ -294,7 +295,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     def detections(network, frames, **how):
         return [seen_cars[len(frames[0].lidar["lidar"])]]
 
-    monkeypatch.setattr("flcav.pipeline.labels.sightings.detect_in", detections)
+    monkeypatch.setattr("flcav.runs.labels.sightings.detect_in", detections)
     truth = FrameTruth("s", boxes(BOTH, z=-1.0), Boxes.empty(), Boxes.empty())
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     how, errors = Distillation(), NavigationErrors(position_m=0.05, heading_deg=0.1)
@@ -329,14 +330,14 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     assert abs(sent[1].bytes - sent[0].bytes - 15 * 4 - len("Car\n")) <= 8  # one box more, and padding of the header
     labels.renew(2, weights)
     labels.renew(2, weights)  # as after a stop
-    history = read_history(tmp_path).rounds
+    history = read_label_history(tmp_path).rounds
     assert [(each.round, each.precision, each.recall) for each in history] == [(1, 1.0, 1.0), (2, 1.0, 1.0)]
     last = RoadAverageLabels(*about, "grid", later := Ledger(LinkMegabytes(1.0, 0.0)), "cloud")
     last.renew(1, weights)
     assert [replace(entry, stage="edge") for entry in later.entries] == list(sent)  # the same messages
     assert {entry.stage for entry in later.entries} == {"cloud"}
     np.testing.assert_array_equal(last["grid/cav0"][0].boxes.array(), own[0].boxes.array())
-    assert read_history(tmp_path).rounds == history
+    assert read_label_history(tmp_path).rounds == history
     mapless = (how.model_copy(update={"map_context": False}), *about[1:])
     as_told = RoadAverageLabels(*mapless, "grid", Ledger(LinkMegabytes(1.0, 0.0)), "cloud")
     as_told.renew(1, weights)

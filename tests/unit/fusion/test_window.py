@@ -15,10 +15,11 @@ from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.objects.model import second_tiny
 from flcav.perception.weights import to_arrays
-from flcav.pipeline.frames import Frames, list_window
-from flcav.pipeline.labels import pseudo_labels, road_average, sightings
-from flcav.pipeline.labels.pseudo_labels import pseudo_label_samples
-from flcav.pipeline.labels.road_average import RoadAverageLabels
+from flcav.runs.extras.distillation import labelling as road_average
+from flcav.runs.extras.distillation.labelling import RoadAverageLabels
+from flcav.runs.frames import Frames, list_window
+from flcav.runs.labels import pseudo_labels, sightings
+from flcav.runs.labels.pseudo_labels import pseudo_label_samples
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from flcav.interface import progress
 from flcav.interface.progress import DAMAGED, print_progress
-from flcav.pipeline.engine import print_steps
+from flcav.runs.engine import print_steps
 
 
 @pytest.fixture

@@ -21,9 +21,8 @@ from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.network.clock.rounds import NetworkSettings, RoundRules
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.network.radio.links import RadioLinks, Wireline
-from flcav.pipeline.poles import Sites
-from flcav.pipeline.radio import driving as prediction
-from flcav.pipeline.radio.driving import (
+from flcav.runs import driving as prediction
+from flcav.runs.driving import (
     DrivenRounds,
     Fleet,
     drive_rounds,
@@ -32,7 +31,8 @@ from flcav.pipeline.radio.driving import (
     measure_uplinks,
     predict_air_s,
 )
-from flcav.pipeline.recipe import CLOUD, Stragglers, draw_stragglers
+from flcav.runs.poles import Sites
+from flcav.runs.recipe import CLOUD, Stragglers, draw_stragglers
 
 GOOD, NONE = 30.0, -40.0  # dB: 20 Mbit/s of 10 MHz; nothing
 MB = 1_000_000
@@ -366,7 +366,7 @@ def test_a_cloud_round_waits_for_the_slowest_region_and_the_wireline() -> None:
     grid = drive([made_links(TIMES, {"cav0": GOOD})], rounds=4)
     two = drive([made_links(TIMES, {"cav0": GOOD}), made_links(TIMES, {"cav0": GOOD, "cav2": GOOD})], rounds=4)
     settings = NetworkSettings(wireline=Wireline(rate_mbps=8.0, latency_s=0.5))
-    both = join_regions({"grid": grid, "ring": two}, 2, settings, 2 * MB)
+    both = join_regions({"grid": grid, "ring": two}, 2, 2 * settings.wireline.seconds(2 * MB))
     assert both.rules == grid.rules
     assert both.seconds[CLOUD] == pytest.approx([2 * 2.5 + 7 + 13] * 2)
     assert both.seconds["grid"] == pytest.approx([7.0] * 4)

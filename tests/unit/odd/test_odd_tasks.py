@@ -1,4 +1,4 @@
-"""Tasks per scenario: more where it is complex, never fewer, and a run recipe that the pipeline takes."""
+"""Tasks per scenario: more where it is complex, never fewer, and a run recipe that a run takes."""
 
 import json
 from pathlib import Path
@@ -12,7 +12,7 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.odd.scenario_tasks import ORDER, Complexity, count_tasks, generate_tasks, make_run, saturate, town_of
-from flcav.pipeline.recipe import load_run_recipe
+from flcav.runs.recipe import load_run_recipe
 
 SHARE = st.floats(0, 0.999)
 

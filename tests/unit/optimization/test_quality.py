@@ -5,7 +5,6 @@ from scipy.stats import wasserstein_distance
 
 from flcav.optimization.quality import (
     data_quality,
-    gradient_diversity,
     gradient_novelty,
     label_distribution_distance,
     visible_objects,
@@ -37,12 +36,6 @@ def test_iid_is_0_disjoint_and_unlabelled_are_1() -> None:
 
 def test_objects_per_sample() -> None:
     assert visible_objects([30, 0, 0], [10, 5, 0]) == pytest.approx([3, 0, 0])
-
-
-def test_diversity_of_equal_orthogonal_and_opposite_gradients() -> None:
-    assert gradient_diversity(np.tile([1.0, 2, 3], (5, 1))) == pytest.approx(1 / 5)
-    assert gradient_diversity(np.eye(4)) == pytest.approx(1)
-    assert gradient_diversity([[1, 0], [-1, 0]]) == np.inf
 
 
 def test_novelty_of_equal_orthogonal_and_opposite_gradients() -> None:

@@ -13,8 +13,7 @@ from made_problems import SMALL, parsed, searched, written
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.placement.cheapest import cover_share
 from flcav.optimization.placement.solve import find_candidates, place_budget
-from flcav.optimization.verification.allocation import verify_allocation
-from flcav.optimization.verification.dual_bounds import bound_largest, bound_weighted
+from flcav.optimization.verification.allocation import bound_largest, bound_weighted, verify_allocation
 from flcav.optimization.verification.placement import PlacementProblem, verify_placement
 from flcav.optimization.verification.record import Verification, exact
 from flcav.optimization.verification.tasks import least_cost, list_branches, read_tasks

@@ -16,12 +16,12 @@ from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.perception.agents import choose_frames
 from flcav.perception.objects.model import tiny_config
 from flcav.perception.objects.task import OBJECTS
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.labels.pseudo_labels import road_views
 from flcav.report import style
 from flcav.report.pictures import birdseye
 from flcav.report.pictures.birdseye import BirdseyeView
 from flcav.report.pictures.clouds import read_sweep
+from flcav.runs.frames import Frames
+from flcav.runs.labels.pseudo_labels import road_views
 from flcav.sensors.frame import Calibration, Frame
 from flcav.world.map.town import load_town
 

@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 
 from flcav.geometry import Boxes
-from flcav.pipeline.provenance import Provenance
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
-from flcav.pipeline.results.plans import Placed, Plan, Pole, TaskPlan
-from flcav.pipeline.results.run import ArmResult, LinkUse, Run, Spent
-from flcav.pipeline.results.tests import Difference, RunFinding, Test, Tested
-from flcav.pipeline.results.training import Pretrained, Validated
 from flcav.report.pictures.clouds import ComparedSweep, MatchedDetections
 from flcav.report.pictures.maps import DENSEST, ErrorMap, poles_of
+from flcav.runs.provenance import Provenance
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
+from flcav.runs.results.plans import Placed, Plan, Pole, TaskPlan
+from flcav.runs.results.run import ArmResult, LinkUse, Run, Spent
+from flcav.runs.results.tests import Difference, RunFinding, Test, Tested
+from flcav.runs.results.training import Pretrained, Validated
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.world.map.town import load_town
 

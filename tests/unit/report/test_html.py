@@ -7,13 +7,13 @@ import made_up_run
 import pytest
 from jinja2 import UndefinedError
 
-from flcav.pipeline.recipe import MAIN
-from flcav.pipeline.results.plans import Plan
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.tests import HomeCost, RunFinding
-from flcav.pipeline.running import RESULTS
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
+from flcav.runs.recipe import MAIN
+from flcav.runs.results.plans import Plan
+from flcav.runs.results.run import Run
+from flcav.runs.results.tests import HomeCost, RunFinding
+from flcav.runs.running import RESULTS
 from flcav.statistics.estimates import Estimate
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"

@@ -13,15 +13,15 @@ from tensorboard.backend.event_processing.event_accumulator import EventAccumula
 from flcav.federation.privacy import SEEDED, Privacy
 from flcav.federation.state import RoundRecord
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
-from flcav.pipeline.analysis.caveats import PLACED_BARE
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN
-from flcav.pipeline.results.run import Run
-from flcav.pipeline.results.saved import LEDGER
-from flcav.pipeline.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
-from flcav.pipeline.training.checkpoints import Checkpoint
-from flcav.pipeline.training.records import EVENTS, ROUNDS, read_rounds, rounds_table, save_rounds
 from flcav.report.pages import html
 from flcav.report.pages.run_page import page
+from flcav.runs.analysis.caveats import PLACED_BARE
+from flcav.runs.recipe import CLOUD, EDGE, MAIN
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import LEDGER
+from flcav.runs.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
+from flcav.runs.training.checkpoints import Checkpoint
+from flcav.runs.training.records import EVENTS, ROUNDS, read_rounds, save_rounds, tabulate_rounds
 
 
 def entry(link: Link, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
@@ -67,7 +67,7 @@ def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
     save_rounds(run, tmp_path)
     save_rounds(run, tmp_path)  # a run that is collected again leaves one set of curves
     rows = pq.read_table(tmp_path / ROUNDS).to_pylist()
-    assert rows == rounds_table(run).to_pylist()
+    assert rows == tabulate_rounds(run).to_pylist()
     assert [(row["arm"], row["stage"], row["task"], row["round"]) for row in rows] == [
         (MAIN, EDGE, "objects", number) for number in (1, 2)
     ]

@@ -7,8 +7,8 @@ import pytest
 import shapely
 
 from flcav.config import InputError, parse_config
-from flcav.pipeline.frames import make_recording_recipe
-from flcav.pipeline.recipe import RunRecipe, SplitName
+from flcav.runs.frames import make_recording_recipe
+from flcav.runs.recipe import RunRecipe, SplitName
 from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream
 from flcav.world.map.parameters import TownParameters

@@ -34,9 +34,9 @@ def history(
     """
     use_threads(1)
     from flcav.cli.steps import live_steps
-    from flcav.pipeline.analysis.histories import history_recipes, save_origin
-    from flcav.pipeline.recipe import load_run_recipe
-    from flcav.pipeline.running import HISTORY, run_several
+    from flcav.runs.analysis.histories import history_recipes, save_origin
+    from flcav.runs.recipe import load_run_recipe
+    from flcav.runs.running import HISTORY, run_several
     from flcav.sources.recipe import find_recipe
     from flcav.storage.files import check_writable
 

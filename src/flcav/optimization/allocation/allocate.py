@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.geometry.arrays import Array
 from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
@@ -20,8 +20,6 @@ from flcav.optimization.solvers.branches import call_vehicles, solve_branches
 from flcav.optimization.solvers.fairness import minimise_largest_error
 from flcav.optimization.solvers.instance import Clock, Instance, build_instance, price_counts, shared_clock
 from flcav.optimization.solvers.weighted import minimise_weighted_error
-
-Array = NDArray[np.float64]
 
 MB_PER_GB = 1000.0
 EXACT = 1e-9  # gap for problems of few tasks

@@ -7,10 +7,10 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 
 from flcav.config import InputError, shorten
+from flcav.geometry.arrays import Array
 from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.allocation.allocate import (
     TaskAllocation,
@@ -27,8 +27,6 @@ from flcav.optimization.solvers.instance import Infeasible, Instance, build_inst
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import relax
 from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
-
-Array = NDArray[np.float64]
 
 GAP = 1e-4  # relative optimality gap
 LONGEST_S = 5.0  # time limit of the search for most messages

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from flcav.config import InputError
+from flcav.geometry.arrays import Array
 from flcav.optimization.allocation.allocate import resolve_problem
 from flcav.optimization.curves.curves import Additive, OwnCurve
 from flcav.optimization.curves.fitting import QUANTITIES, CurveFit
@@ -43,7 +43,6 @@ TERMS = {
     "proven": "the solver also finds a bound that no plan can be below, so how far this one could still be improved is "
     "known. It is a bound for the fitted curves; a training may go otherwise.",
 }
-Array = NDArray[np.float64]
 Edit = tuple[int, int, str]  # start, end, replacement
 DIGITS = 6  # significant digits of a number
 ENDLESS = 10**9  # width of a line that is never wrapped

@@ -20,16 +20,14 @@ from dataclasses import dataclass
 from itertools import chain
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, milp
 from scipy.sparse import coo_array, csr_array
 
+from flcav.geometry.arrays import Array
 from flcav.interface.wording import plural
 from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Infeasible
-
-Array = NDArray[np.float64]
 
 TIE = 1e-7  # relative: how much an earlier objective may lose to a later one, against rounding
 GAP = 1e-6  # relative optimality gap for rounds and samples

@@ -10,13 +10,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit, refit
 from flcav.statistics.streams import stream
-
-Array = NDArray[np.float64]
 
 METHOD = "residual bootstrap"
 BEYOND = (1.0, 2.0, 4.0)  # times the largest measured resources: where the upper curve must not be below the band

@@ -9,10 +9,11 @@ from collections.abc import Sequence
 from typing import Annotated, ClassVar, Literal, Self, overload
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field, model_validator
 
 from flcav.config import Config
+from flcav.geometry.arrays import Array
 
 STAGES = ("pretrain", "edge", "cloud")  # their resources are samples, edge rounds, cloud rounds
 
@@ -20,9 +21,6 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Sizeable = Annotated[float, Field(ge=1e-9)]  # large enough to divide by
 Change = Annotated[float, Field(ge=-1, le=1)]  # of an error
-
-
-Array = NDArray[np.float64]
 
 
 @overload

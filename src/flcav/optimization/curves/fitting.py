@@ -12,10 +12,11 @@ from pathlib import Path
 from typing import Any, Generic, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from scipy.optimize import least_squares
 
 from flcav.config import InputError
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import STAGES, Additive, Effective, Federated
 from flcav.optimization.curves.forms import (
     FLATTEST,
@@ -28,8 +29,6 @@ from flcav.optimization.curves.forms import (
 )
 from flcav.optimization.curves.history import History, load_history
 from flcav.optimization.curves.levels import level_seeds
-
-Array = NDArray[np.float64]
 
 ROBUST_FROM = 10  # independent points: the spread of fewer residuals does not tell which of them are outliers
 SAME_COST = 1e-3  # relative difference of equal costs

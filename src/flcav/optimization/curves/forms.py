@@ -11,9 +11,9 @@ from itertools import product
 from typing import Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError, parse_config
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import (
     STAGES,
     Additive,
@@ -25,7 +25,6 @@ from flcav.optimization.curves.curves import (
     split_regions,
 )
 
-Array = NDArray[np.float64]
 CurveT = TypeVar("CurveT", Additive, Effective, Federated, covariant=True)
 ValueT = TypeVar("ValueT", float, Array)  # of a parameter, or its column of a Jacobian
 

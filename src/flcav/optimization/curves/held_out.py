@@ -17,9 +17,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.stats import rankdata
 
 from flcav.config import InputError
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit
-from flcav.optimization.curves.history import Array, History
+from flcav.optimization.curves.history import History
 from flcav.optimization.curves.levels import Levelled, level_seeds
 from flcav.statistics.streams import stream
 

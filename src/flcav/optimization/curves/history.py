@@ -22,11 +22,10 @@ import pyarrow.csv
 from numpy.typing import ArrayLike, NDArray
 
 from flcav.config import InputError, shorten
+from flcav.geometry.arrays import Array
 from flcav.interface.wording import describe_number, hint_share
 from flcav.optimization.curves.curves import STAGES
 from flcav.storage.records import read_csv
-
-Array = NDArray[np.float64]
 
 Table = Mapping[str, Sequence[str | float | None]]  # columns by name
 

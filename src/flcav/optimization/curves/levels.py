@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.curves.history import Array, History
+from flcav.geometry.arrays import Array
+from flcav.optimization.curves.history import History
 
 LEAST_ERROR = 1e-4  # an error of 0 has no logarithm
 

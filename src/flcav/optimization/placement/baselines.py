@@ -5,7 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.optimization.placement.instance import TIE, Array, as_float
+from flcav.geometry.arrays import Array
+from flcav.optimization.placement.instance import TIE, as_float
 from flcav.optimization.placement.solve import Candidates, Placement, describe
 from flcav.statistics.streams import stream
 

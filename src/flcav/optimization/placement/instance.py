@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-Array = NDArray[np.float64]
+from flcav.geometry.arrays import Array
 
 TIE = 1e-9  # relative difference below which the search takes covered weights and costs for equal
 DECIMALS = 25  # of a float from 1e-9 on, which has 17 digits at most

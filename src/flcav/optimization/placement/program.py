@@ -6,7 +6,8 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import csr_array, eye_array, hstack, vstack
 
-from flcav.optimization.placement.instance import TIE, Array, CoverageInstance, as_float, common_unit, reach
+from flcav.geometry.arrays import Array
+from flcav.optimization.placement.instance import TIE, CoverageInstance, as_float, common_unit, reach
 
 NODES = 2000  # of the search tree at most, where a limit is asked for
 CUTS = 20  # times that a choice beyond a limit, within HiGHS' tolerances, is excluded and the program solved again

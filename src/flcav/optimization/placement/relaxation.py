@@ -15,7 +15,8 @@ from math import fsum
 
 import numpy as np
 
-from flcav.optimization.placement.instance import TIE, Array, CoverageInstance
+from flcav.geometry.arrays import Array
+from flcav.optimization.placement.instance import TIE, CoverageInstance
 
 STEPS = 1600
 RESTARTS = (200, 400, 800)  # steps after which the average is the new start

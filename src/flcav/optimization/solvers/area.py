@@ -10,14 +10,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import SharedCurve
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Clock, build_instance
 from flcav.optimization.solvers.weighted import minimise_weighted_error
-
-Array = NDArray[np.float64]
 
 STEPS = 12  # most steps from each start
 EMPHASIS = 3.0  # weight of one corner in the start that emphasises it

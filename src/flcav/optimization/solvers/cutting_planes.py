@@ -14,13 +14,11 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import Bounds, LinearConstraint, linprog, milp
 from scipy.sparse import coo_array, csr_array
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.solvers.instance import require_optimum
-
-Array = NDArray[np.float64]
 
 LARGE = 1e4  # size to which the objective is scaled: the solver's tolerances are absolute, around 1e-6
 

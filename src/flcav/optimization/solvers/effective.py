@@ -16,12 +16,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import Effective, Federated, drift_part, effective_samples
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.rounds import fewest_cloud_rounds, pair_rounds
 from flcav.optimization.solvers.separable import BUDGET_SLACK
-
-Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)

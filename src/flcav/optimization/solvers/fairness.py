@@ -15,14 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import Additive, Federated, OwnCurve, drift_part
 from flcav.optimization.problem import Problem
 from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill
 from flcav.optimization.solvers.rounds import pair_rounds
 from flcav.optimization.solvers.separable import BUDGET_SLACK
-
-Array = NDArray[np.float64]
 
 MOST_MERGED = 4000  # partial plans kept while tasks are combined
 PROVEN = 1e-9  # of the budgets: tolerance for rounding of sums

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from scipy.optimize import OptimizeResult
 
 from flcav.config import InputError, shorten
+from flcav.geometry.arrays import Array
 from flcav.network.ledger import LinkMegabytes
 from flcav.network.plan import StagePlan, price
 from flcav.optimization.curves.curves import Additive
@@ -15,8 +16,6 @@ from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.effective import EffectiveTask, EffectiveTasks, build_effective_tasks
 from flcav.optimization.solvers.rounding import outermost
 from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
-
-Array = NDArray[np.float64]
 
 
 def require_optimum(result: OptimizeResult) -> Array:

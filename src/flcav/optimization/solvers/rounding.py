@@ -6,9 +6,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.solvers.separable import BUDGET_SLACK
-
-Array = NDArray[np.float64]
 
 
 class Budgeted(Protocol):

@@ -1,11 +1,9 @@
 """The choices of edge and cloud rounds of one task, for solvers that try each of them."""
 
 import numpy as np
-from numpy.typing import NDArray
 
 from flcav.config import InputError
-
-Array = NDArray[np.float64]
+from flcav.geometry.arrays import Array
 
 MOST_CHOICES = 1_000_000  # pairs of rounds of one task
 

@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
+from flcav.geometry.arrays import Array
 
 LARGEST_STEP = 4.0  # of a multiplier's logarithm in one iteration
 BUDGET_SLACK = 1e-12  # relative tolerance of budgets, for rounding of sums

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.optimize import linprog
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import drift_part, effective_samples
 from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer_approximation
 from flcav.optimization.solvers.effective import EffectiveTasks
@@ -22,7 +22,6 @@ from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
 from flcav.optimization.solvers.separable import newton_step, relax
 
-Array = NDArray[np.float64]
 CORRECTIONS = 6  # Newton steps of the multipliers over whole quantities; dual points tried
 PLANES = 60  # most cutting planes of the dual
 

@@ -20,9 +20,9 @@ from math import fsum, gcd, inf, lcm, nextafter
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.geometry.arrays import Array
 from flcav.optimization.verification.record import Verification, exact, judge
 
-Array = NDArray[np.float64]
 NOTHING = Fraction(1, 10**300)  # in place of 0, to divide by
 ROUNDING = 1e-14  # relative to the sum: of floats that bounds are stated with
 PLACES = "the positions, weights and ranges, and what each pole sees, where that is given"

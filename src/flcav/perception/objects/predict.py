@@ -277,8 +277,8 @@ def detect_objects(
 ) -> Iterator[Finding]:
     """Yield the objects of score `threshold` or more in each point cloud of `path`.
 
-    path: a file of a point cloud, see `read_cloud_file`, a folder of them, or a dataset folder, of which `frames` (None:
-    all). Raises `InputError` as `read_point_clouds` does.
+    path: a file of a point cloud, see `read_cloud_file`, a folder of them, or a dataset folder, of which `frames`
+    (None: all). Raises `InputError` as `read_point_clouds` does.
     """
     for cloud in read_point_clouds(path, frames, network.config):
         (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)

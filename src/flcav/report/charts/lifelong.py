@@ -5,13 +5,20 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from matplotlib.figure import Figure
 
-from flcav.pipeline.results.lifelong import LifelongArm
 from flcav.report import style
+from flcav.runs.extras.lifelong.rows import LifelongArm
+from flcav.runs.results.run import Run
 from flcav.statistics.estimates import Estimate
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY)  # of conditions, in turn
 ARM_COLOURS = (style.BLUE, style.ORANGE, style.MUTED)  # of arms, in turn
 APART = 0.06  # of arms along the horizontal axis
+
+
+def draw_lifelong(run: Run) -> dict[str, Figure]:
+    """Return the chart of each task of a run by the name of its picture; none where it has no lifelong learning."""
+    arms = {task: [arm for arm in run.lifelong or () if arm.task == task] for task in run.recipe.tasks}
+    return {f"lifelong_{task.replace(':', '_')}": draw_rounds(own) for task, own in arms.items() if own}
 
 
 @style.styled

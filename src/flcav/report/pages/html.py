@@ -4,7 +4,7 @@ import base64
 from collections.abc import Mapping
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 
 def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: str = "report.html.j2") -> str:
@@ -15,7 +15,7 @@ def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: 
     `jinja2.UndefinedError` where `results` lack a value that the page shows.
     """
     environment = Environment(
-        loader=PackageLoader("flcav", "report"),
+        loader=ChoiceLoader([PackageLoader("flcav", "report"), PackageLoader("flcav", "runs/extras")]),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,

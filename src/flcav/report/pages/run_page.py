@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,33 +14,41 @@ from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.objects.truth import choose_lidar
-from flcav.pipeline.analysis.caveats import PLACED_BARE
-from flcav.pipeline.analysis.costs import list_arm_costs, list_home_costs, tell_gain
-from flcav.pipeline.analysis.findings import WORDS
-from flcav.pipeline.arms import Names
-from flcav.pipeline.frames import Frames
-from flcav.pipeline.radio.driving import CLOCK
-from flcav.pipeline.recipe import CLOUD, EDGE, MAIN, PRETRAIN
-from flcav.pipeline.results.plans import Placed
-from flcav.pipeline.results.run import ArmCost, LinkUse, Run
-from flcav.pipeline.results.saved import ERRORS
-from flcav.pipeline.results.tests import SweepComparison, SweepDetections
-from flcav.pipeline.results.training import TOGETHER
-from flcav.pipeline.running import WORK
-from flcav.pipeline.steps.testing import LOOK
-from flcav.pipeline.training.records import list_rounds
+from flcav.plugins import load_named
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.report.charts.lifelong import draw_rounds
 from flcav.report.charts.runs import STAGES, Row
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
+from flcav.runs.analysis.caveats import PLACED_BARE
+from flcav.runs.analysis.costs import list_arm_costs, list_home_costs, tell_gain
+from flcav.runs.analysis.findings import WORDS
+from flcav.runs.arms import Names
+from flcav.runs.driving import CLOCK
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.runs.results.plans import Placed
+from flcav.runs.results.run import ArmCost, LinkUse, Run
+from flcav.runs.results.saved import ERRORS
+from flcav.runs.results.tests import SweepComparison, SweepDetections
+from flcav.runs.results.training import TOGETHER
+from flcav.runs.running import WORK
+from flcav.runs.stages.testing import LOOK
+from flcav.runs.training.records import list_rounds
 from flcav.storage.files import write_bytes
 
 CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))
 OBJECTS = "objects"
 SHOWN_ROUNDS = 3  # of a region's timeline
+
+
+class DrawSection(Protocol):
+    """A function that draws the pictures of a section."""
+
+    def __call__(self, run: Run, /) -> dict[str, Figure]:
+        """Return the pictures by name."""
+        ...
 
 
 def write_report(run: Run, out: Path | str) -> Path:
@@ -114,14 +122,13 @@ def page(run: Run) -> dict[str, Any]:
         "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
         "together": TOGETHER,
         "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
-        "groups": [
-            (arm, stage.region, stage.group.describe())
+        "notes": [
+            (arm, name, stage.region, note)
             for arm, result in run.arms.items()
             for stage in result.stages
-            if stage.group is not None
+            for name, note in stage.describe_rows().items()
         ],
-        "lifelong": run.lifelong or (),
-        "conditions": [(arm, passed) for arm in run.lifelong or () for passed in arm.passed if passed.asked],
+        "sections": run.list_sections(),
         "private": any(row["epsilon"] is not None for row in rounds),
         "timed": any(row["seconds"] is not None for row in rounds),
         "differences": run.differences,
@@ -165,8 +172,8 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     for task, chart in charts.items():
         drawn[f"rounds_{_file_name(task)}"] = figures.by_round(*chart)
     drawn |= _timelines(run, work)
-    for task in run.recipe.tasks if run.lifelong else ():
-        drawn[f"lifelong_{_file_name(task)}"] = draw_rounds([arm for arm in run.lifelong or () if arm.task == task])
+    for section in run.list_sections():
+        drawn |= load_named("chart", section.chart, {section.chart: section.chart}, DrawSection)(run)
     drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
     if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
         drawn["gain"] = figures.gains({task: _list_gains(costs, task) for task in {each.task: None for each in costs}})

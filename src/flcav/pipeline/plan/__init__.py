@@ -1,1 +1,0 @@
-"""Plans under both uplink budgets: before a run and between its stages."""

@@ -1,1 +1,0 @@
-"""Radio network of a run's vehicles."""

@@ -1,0 +1,395 @@
+"""Arms of a run: their complete settings, and the names of their steps, which equal arms share."""
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+from flcav.config import InputError
+from flcav.federation.checks import check_rules
+from flcav.federation.privacy import affordable_rounds, find_noise
+from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.fedbuff import FedBuff
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.strategies.strategy import Corrects, needs_known_number
+from flcav.federation.trainable import statistics_names
+from flcav.fusion.distillation import Distillation
+from flcav.perception.client import Imitates
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import build_network, find_configuration
+from flcav.perception.tasks import TASKS, task_named
+from flcav.perception.weights import to_arrays
+from flcav.runs.label_sources import LABEL_SOURCES, choose_labels
+from flcav.runs.recipe import (
+    CENTRAL,
+    CLOUD,
+    EDGE,
+    MAIN,
+    MORE_EDGE,
+    PRETRAIN,
+    Arm,
+    Fault,
+    Federation,
+    PlacementSettings,
+    RunRecipe,
+    Training,
+)
+from flcav.runs.registry import ARM_CHECKS, AVERAGES, CALLS, load_all
+
+PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
+PLANNED = ("plan", "calls")  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
+PLACED = (*PLANNED, "placement")  # those that decide where sensors stand
+PRETRAINED = (*PLANNED, "pretraining", "pretrain_repeat")  # those that decide pretraining
+OF_ROUNDS = (  # fields of `Training` of federations alone
+    "local_steps",
+    "local_rate",
+    "final_rate",
+    "average_rounds",
+    "start_share",
+    "imitation",
+)
+LEARNED = (  # those that decide a federation
+    *PLANNED,
+    "training",
+    "repeat",
+    "placement",
+    "labels",
+    "fault",
+    "distillation",
+    "federation",
+)
+TRACKED = (*PRETRAINED, "placement", "labels")  # those that decide the vehicles' tracks
+OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
+
+
+class Calls(NamedTuple):
+    """The numbers of vehicles that a plan chooses a group's from."""
+
+    least: int
+    most: int
+    overlap: float  # share of a further vehicle's data that those called before it have
+
+
+@dataclass(frozen=True)
+class Setting:
+    """The complete settings of one arm, those it takes over from the recipe included."""
+
+    name: str
+    repeat: int  # 0: the arm itself; n: its n-th retraining
+    pretrain_repeat: int  # of its pretraining; 0 where retrainings share it
+    plan: PlanRule
+    calls: Calls | None  # vehicles that the plan calls to a group; None: it does not decide
+    placement: PlacementSettings
+    labels: Mapping[str, str]  # kind of labels, by task
+    fault: Fault | None  # of the labels, the rest of which are ground truth
+    distillation: Distillation  # where the labels are the road average
+    federation: Federation
+    training: Mapping[str, Training]  # by task
+    central: Literal["pretrain", "federate", "all"] | None
+    uploads: int | None  # frames of each region that centralised training has; None: all
+    regions: tuple[str, ...]  # that federate
+    stages: tuple[str, ...]  # after pretraining
+    replanned: bool  # whether the rest is planned again after stages I and II, from what the run itself reached
+
+    @property
+    def pretraining(self) -> Mapping[str, Training]:
+        """Return the training by task without what decides federations alone."""
+        of_rounds = {name: field.default for name, field in Training.model_fields.items() if name in OF_ROUNDS}
+        return {task: training.model_copy(update=of_rounds) for task, training in self.training.items()}
+
+    @property
+    def edge_federation(self) -> Federation:
+        """Return the federation without what decides stage III alone."""
+        of_cloud = (
+            "personal",
+            "cloud_strategy",
+            "cloud_rate",
+            "cloud_start_share",
+            "replay",
+            "score_statistics",
+            "cloud_topics",
+        )
+        return self.federation.model_copy(update={name: Federation.model_fields[name].default for name in of_cloud})
+
+
+def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str] | None = None) -> dict[str, Setting]:
+    """Return the settings of the run itself and of its arms by name, the run first.
+
+    After them come those of every arm's retrainings, by `name_repeat`. `labels`: the run's kinds of labels by task;
+    None: those of the recipe, or each task's first. Raises `InputError` for labels that a task does not have.
+    """
+    if labels is None:
+        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
+    arms = {MAIN: Arm(), **recipe.arms}
+    return {
+        name_repeat(name, repeat): _setting(recipe, labels, name_repeat(name, repeat), repeat, arm)
+        for repeat in range(1 + recipe.retrainings)
+        for name, arm in arms.items()
+    }
+
+
+def name_repeat(arm: str, repeat: int) -> str:
+    """Return the name of an arm's n-th retraining; of the arm itself for 0."""
+    return f"{arm}-again{repeat}" if repeat else arm
+
+
+def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: int, arm: Arm) -> Setting:
+    learned = _learns(recipe, arm.plan)
+    federation = Federation.model_validate(recipe.federation.model_dump() | dict(arm.federation))
+    calls = find_calls(recipe, federation) if learned else None
+    return Setting(
+        name,
+        repeat,
+        repeat if recipe.retrain_from == PRETRAIN else 0,
+        arm.plan,
+        calls,
+        PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
+        dict(labels) | dict(arm.labels),
+        arm.fault,
+        next((resolve(recipe, arm) for resolve in load_all(AVERAGES)), Distillation()),
+        federation,
+        {
+            task: Training.model_validate(recipe.training_of(task).model_dump() | dict(arm.training))
+            for task in recipe.tasks
+        },
+        arm.central,
+        arm.uploads,
+        arm.regions or recipe.with_role("federate"),
+        (CENTRAL,) if arm.central else arm.stages,
+        learned and recipe.replan != "none" and calls == find_calls(recipe, recipe.federation),
+    )
+
+
+def find_calls(recipe: RunRecipe, how: Federation) -> Calls | None:
+    """Return the numbers of vehicles that a plan chooses from; None where all of a region take part."""
+    return next((found for find in load_all(CALLS) if (found := find(recipe, how)) is not None), None)
+
+
+def _learns(recipe: RunRecipe, rule: PlanRule) -> bool:
+    """Return whether a plan by `rule` is the best one by learning curves; others divide the budgets by themselves."""
+    return rule == "joint" and any(task.history for task in recipe.tasks.values())
+
+
+def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
+    """Return the strategies of edge servers and of the cloud; raises `InputError` as `strategy_named` does."""
+    edge = strategy_named(how.strategy)
+    cloud = of_servers(edge) if how.cloud_strategy is None else strategy_named(how.cloud_strategy)
+    if isinstance(cloud, Corrects):
+        raise InputError(f"cloud_strategy: {type(cloud).__name__} corrects local steps, and edge servers take none")
+    if isinstance(cloud, FedBuff):
+        raise InputError("cloud_strategy: fedbuff does not wait for clients, and the cloud waits for all edge servers")
+    if isinstance(cloud, FedMD):
+        raise InputError(
+            "cloud_strategy: FedMD shares frames among vehicles, and edge servers have no networks of their own"
+        )
+    return edge, cloud
+
+
+def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
+    """Raise `InputError` where an arm's strategies and rules do not go together, or not with so many vehicles.
+
+    Raises it also where a pose graph is asked for without GTSAM. The vehicles of regions of recorded data are not known
+    before their frames are dealt; and for a horizon that no plan is made by.
+    """
+    settings = [*settings]
+    if recipe.horizon_s is not None and not any(_learns(recipe, setting.plan) for setting in settings):
+        raise InputError(
+            "horizon_s: every task has a fixed plan, so that nothing is planned by time; give a task a 'history' in "
+            "place of its 'plan', or leave horizon_s out and have rounds timed by 'federation.network'"
+        )
+    for setting in settings:
+        try:
+            _check_federation(recipe, setting)
+        except InputError as error:
+            if setting.name == MAIN:
+                raise
+            raise InputError(f"arm '{setting.name}': {error}") from None
+
+
+def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
+    how = setting.federation
+    edge, cloud = find_strategies(how)
+    selection, privacy = how.selection, how.privacy
+    for check in load_all(ARM_CHECKS) if setting.central is None else ():
+        check(recipe, setting, edge)
+    if how.network is not None and selection.rule == "importance":
+        raise InputError("federation.network: importance selection draws the clients after they have trained")
+    if how.network is not None and selection.unbiased:
+        raise InputError("federation.network: unbiased weights need known probabilities, and the radio loses any")
+    if how.network is not None and privacy is not None and privacy.hides_draws(selection):
+        raise InputError(
+            f"federation.network: rounds are timed before they are run, and {selection.rule} selection under "
+            "central noise draws in secret; 'privacy.seeded' simulates both"
+        )
+    if how.replay and (how.personal or isinstance(edge, FedMD)):
+        raise InputError("federation.replay: the cloud's own training goes with whole networks, not personal or fedmd")
+    if how.replay and how.cloud_topics:
+        raise InputError("federation.replay: the cloud's own training, which no topic is for; leave out 'cloud_topics'")
+    if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
+        raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
+    _check_imitation(setting)
+    _check_numbers(recipe, setting, edge)
+    if isinstance(edge, FedMD) and setting.central is None:
+        _check_outputs(recipe, setting)
+    for region in setting.regions:
+        if recipe.regions[region].data is None:
+            names = [f"{region}/cav{i}" for i in range(recipe.vehicles(region))]
+            check_rules(edge, how, names)
+            if privacy is not None:
+                affordable_rounds(find_noise(privacy, selection, len(names), 1), selection, names, 1, 0)
+    if CLOUD in setting.stages:
+        try:
+            check_rules(cloud, how.of_servers(), setting.regions)
+        except InputError as error:
+            given = "" if how.cloud_strategy else " (that of 'strategy', as none is given)"
+            raise InputError(f"cloud_strategy{given}, among edge servers: {error}") from None
+    for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
+        _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _check_imitation(setting: Setting) -> None:
+    """Raise `InputError` where an arm keeps the boxes of a task without any, or of one with another loss."""
+    for task, training in setting.training.items():
+        if training.imitation and task != OBJECTS.name:
+            raise InputError(f"training.imitation: it keeps boxes, and '{task}' has none; give it to 'objects' alone")
+
+
+def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where an arm needs a known number of vehicles in a round, and its rounds may have any.
+
+    The numbers are known only when a region's rounds are timed, after its recordings and pretraining. Raises it also
+    for a deadline that no network predicts round times for.
+    """
+    how, predicted = setting.federation, setting.federation.selection.predicts
+    if predicted and how.network is None:
+        raise InputError(
+            "selection: a deadline needs the predicted 'seconds' of a round by client, or a federation.network"
+        )
+    if predicted:
+        why, instead = "federation.network: a predicted deadline leaves other numbers of vehicles to its rounds", ""
+    elif how.selection.rule == "all" and plans_joiners(recipe, setting):
+        why = "horizon_s: a plan by speeds or the time of messages leaves other numbers of vehicles to its rounds"
+        instead = "; choose another 'selection' than all, or leave out horizon_s"
+        if how.secure is not None:
+            raise InputError(f"{why}, some of them one, and secure aggregation takes two or more{instead}")
+    else:
+        return
+    if how.privacy is not None:
+        raise InputError(f"{why}, and noise is for one number{instead}")
+    if needs_known_number(strategy):
+        raise InputError(f"{why}, and {type(strategy).__name__} needs a known one{instead}")
+
+
+def plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:
+    """Return whether a plan says which vehicles join a round, as it does where it times each of them."""
+    speeds = any(recipe.speeds(region) for region in recipe.with_role("federate"))
+    timed = recipe.federation.network is not None or speeds
+    return recipe.horizon_s is not None and timed and setting.central is None and _learns(recipe, setting.plan)
+
+
+def _check_outputs(recipe: RunRecipe, setting: Setting) -> None:
+    """Raise `InputError` where vehicles cannot send class probabilities: for such a task, or on a network."""
+    for name in recipe.tasks:
+        if not isinstance(task_named(name), Imitates):
+            fit = " and ".join(each for each in TASKS if isinstance(task_named(each), Imitates))
+            raise InputError(f"strategy fedmd: '{name}' has no class probabilities of shared frames; {fit} have")
+    if setting.federation.network is not None:
+        raise InputError("federation.network: its clock knows updates of weights alone, and fedmd sends probabilities")
+
+
+def _check_arrays(task: str, network: str | None, setting: Setting) -> None:
+    """Raise `InputError` where patterns of names do not fit the arrays of a task's network."""
+    learned = task_named(task)
+    weights = to_arrays(build_network(learned, find_configuration(learned, network), 0))
+    if setting.federation.upload.layers:
+        setting.federation.upload.check_layers(weights)
+    if CLOUD in setting.stages:
+        setting.federation.check_personal(weights)
+        if setting.federation.score_statistics and not statistics_names(weights):
+            raise InputError(f"federation.score_statistics: the network of {task} has no batch normalisation")
+
+
+class Names:
+    """Names of a run's steps. Arms that agree in all settings a step depends on share it, named after the first arm."""
+
+    def __init__(self, settings: Mapping[str, Setting]) -> None:
+        self._settings = settings
+
+    def recording(self, region: str, split: str, task: str) -> str:
+        """Return the step that records a split for a task; all arms share it."""
+        return f"{region}-{split}-{task}"
+
+    def plan(self, arm: str, stage: str = PRETRAIN) -> str:
+        """Return the step that allocates the budgets, in the state in which `stage` is carried out.
+
+        All arms with the same rule follow the same plan, that of the first of them: so they differ in nothing else.
+        """
+        before = {EDGE: PRETRAIN, CENTRAL: PRETRAIN, CLOUD: EDGE, MORE_EDGE: EDGE}.get(stage)
+        replanned = self._settings[arm].replanned and before is not None
+        return "plan" + (f"-after-{before}" if replanned else "") + self._suffix(arm, PLANNED)
+
+    def pretrain(self, arm: str, task: str) -> str:
+        """Return stage I of a task."""
+        return f"{PRETRAIN}-{task}" + self._suffix(arm, PRETRAINED)
+
+    def errors(self, arm: str, region: str, task: str) -> str:
+        """Return the step that registers a task's errors in a region."""
+        return f"{region}-errors-{task}" + self._suffix(arm, PLANNED)
+
+    def place(self, arm: str, region: str) -> str:
+        """Return the step that places roadside sensors in a region."""
+        return f"{region}-place" + self._suffix(arm, PLACED)
+
+    def tracks(self, arm: str, region: str, task: str) -> str:
+        """Return the tracks around a task's training frames in a region."""
+        return f"{region}-tracks-{task}" + self._suffix(arm, TRACKED, task)
+
+    def edge(self, arm: str, region: str, task: str) -> str:
+        """Return stage II of a task in a region."""
+        return f"{region}-{EDGE}-fl-{task}" + self._suffix(arm, OF_EDGE, task)
+
+    def more_edge(self, arm: str, region: str, task: str) -> str:
+        """Return the further edge rounds of a task in a region."""
+        return f"{region}-more-{EDGE}-fl-{task}" + self._suffix(arm, OF_EDGE, task)
+
+    def cloud(self, arm: str, task: str) -> str:
+        """Return stage III of a task."""
+        return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
+
+    def central(self, arm: str, region: str, task: str) -> str:
+        """Return the centralised training of an arm in a region; but on the region's own frames it is one for all."""
+        shared = self._settings[arm].central != "federate"
+        return f"{CENTRAL}-{task}-{arm}" if shared else f"{region}-{CENTRAL}-{task}-{arm}"
+
+    def stage(self, arm: str, stage: str, region: str, task: str) -> str:
+        """Return the step that trained an arm's network for a region in a stage."""
+        if stage == PRETRAIN:
+            return self.pretrain(arm, task)
+        if stage == CLOUD:
+            return self.cloud(arm, task)
+        return {EDGE: self.edge, MORE_EDGE: self.more_edge, CENTRAL: self.central}[stage](arm, region, task)
+
+    def test(self, trained: str, region: str, model: str | None = None) -> str:
+        """Return the test of a step's network, or of the own model of the region `model`, in a region."""
+        return f"test-{trained}-{region}" if model is None else f"test-{trained}-of-{model}-{region}"
+
+    def rounds(self, trained: str, region: str) -> str:
+        """Return the validation of a step's network after each of its rounds in a region."""
+        return f"rounds-{trained}-{region}"
+
+    def _suffix(self, arm: str, fields: tuple[str, ...], task: str | None = None) -> str:
+        own = self._rests_on(arm, fields, task)
+        first = next(name for name in self._settings if self._rests_on(name, fields, task) == own)
+        return "" if first == MAIN else f"-{first}"
+
+    def _rests_on(self, arm: str, fields: tuple[str, ...], task: str | None) -> list[object]:
+        """Return the settings that a step depends on, of the labels only those of `task`."""
+        setting = self._settings[arm]
+        values = {name: getattr(setting, name) for name in fields}
+        if task is not None:
+            values["labels"] = setting.labels[task]
+        return list(values.values())
+
+
+def name_steps(recipe: RunRecipe) -> Names:
+    """Return the names of a recipe's steps, whose folders lie in the folder `work` of its run."""
+    return Names(resolve_settings(recipe))

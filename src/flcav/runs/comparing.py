@@ -1,0 +1,124 @@
+"""Paired comparison of two runs, over all tests that both made on the same frames."""
+
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from flcav.config import InputError
+from flcav.runs.analysis.differences import compare_tests, mean_of_tests, mean_over_trainings
+from flcav.runs.results.run import Run
+from flcav.runs.results.tests import Test
+from flcav.runs.running import WORK, seed_folders
+from flcav.statistics.estimates import Estimate, combine_spreads, widen
+from flcav.statistics.seeds import LARGEST_SPREAD, MeanOverSeeds, OneTraining, of_one_training
+from flcav.statistics.verdicts import NOT_HELD, UNDECIDED, Claim, Judged, judge, judge_known, tell_loss
+
+Key = tuple[str, str, str, str]  # arm, stage, region, task
+
+
+@dataclass(frozen=True)
+class Compared:
+    """Difference of a measure between two runs on the same frames: second minus first."""
+
+    arm: str
+    stage: str
+    region: str
+    task: str
+    measure: str
+    first: float
+    second: float
+    difference: Estimate  # over scenes and retraining; over seeds and scenes where both runs have several seeds
+    verdict: str  # of the claim that the second is better, corrected for the number of tests
+    judged: Judged | None = None  # with its p-value; None for one training of unknown spread
+
+
+def compare(first: Path, second: Path) -> tuple[Compared, ...]:
+    """Return the paired difference of every test that both runs made, over the seeds that both have.
+
+    Its interval (95 %) for one common seed is over the trainings that both runs have; of one training a bootstrap over
+    scenes, widened by the spread of retraining in both; where that is not known, one seed decides only a loss that is
+    too large for any spread. For several seeds it is over seeds and scenes, of each seed's mean over its trainings.
+    Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
+    """
+    folders = [seed_folders(folder) for folder in (first, second)]
+    seeds = [seed for seed in folders[0] if seed in folders[1]]
+    rows = [_of_seed(folders[0][seed], folders[1][seed], seed) for seed in seeds]
+    common = [key for key in (rows[0] if rows else {}) if all(key in row for row in rows)]
+    if not common:
+        raise InputError(f"{first} and {second}: no test was made by both on the same frames, with the same seed")
+    if len(rows) == 1:
+        return _judge_trainings([rows[0][key] for key in common])
+    means = [mean_of_tests(key[3], *_listed([row[key] for row in rows])) for key in common]
+    judged = judge([Claim(mean) for mean in means])
+    return tuple(
+        _compared(key, [row[key].compared for row in rows], mean, one)
+        for key, mean, one in zip(common, means, judged, strict=True)
+    )
+
+
+@dataclass(frozen=True)
+class _Pair:
+    compared: Compared  # of one seed
+    folders: tuple[Path, Path]  # of the first training's tests, the second run's and the first's
+    estimate: OneTraining | MeanOverSeeds | None  # what is judged; None for one training of unknown spread
+    scenes: int  # of the test
+
+
+def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
+    runs = [Run.load(folder) for folder in (first, second)]
+    tests: list[Mapping[Key, Test]] = [{test.key: test for test in run.tested} for run in runs]
+    found = {}
+    for key in (key for key in tests[0] if key in tests[1]):
+        before, after = (own[key] for own in tests)
+        with suppress(InputError):  # they were made on other frames
+            found[key] = _pair(key, before, after, (first / WORK, second / WORK), seed)
+    return found
+
+
+def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: int) -> _Pair:
+    """Return the difference of two tests: in the mean of the trainings that both runs have, or in one of each."""
+    folders = [(works[1] / new, works[0] / old) for new, old in zip(after.steps, before.steps, strict=False)]
+    over_scenes = compare_tests(key[3], folders[0][1], folders[0][0], seed)
+    measures = np.array([test.trainings[: len(folders)] for test in (before, after)])
+    values = (over_scenes.mean, *np.diff(measures, axis=0)[0, 1:])
+    mean = mean_over_trainings(key[3], over_scenes, values, folders, seed, share=False)
+    if mean is not None:
+        change, known = mean.as_estimate(), mean
+    else:
+        spread, measures = combine_spreads(before.spread, after.spread), measures[:, :1]
+        change = over_scenes if spread is None else widen(over_scenes, spread)
+        known = None if spread is None else of_one_training(over_scenes, after.result.scenes, spread)
+    first, second = measures.mean(axis=1).tolist()
+    return _Pair(
+        Compared(*key, after.result.measure, first, second, change, UNDECIDED), folders[0], known, after.result.scenes
+    )
+
+
+def _judge_trainings(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
+    """Return the differences of one seed with their verdicts, judged together; of unknown spread only losses are."""
+    judged = judge_known([None if pair.estimate is None else Claim(pair.estimate) for pair in pairs])
+    return tuple(
+        replace(pair.compared, verdict=_judge_unknown(pair, len(pairs)))
+        if one is None
+        else replace(pair.compared, verdict=one.verdict, judged=one)
+        for pair, one in zip(pairs, judged, strict=True)
+    )
+
+
+def _judge_unknown(pair: _Pair, family: int) -> str:
+    """Return the verdict on one training of unknown spread: a loss too large for the spread of both runs is one."""
+    lost = tell_loss(pair.compared.difference, pair.scenes, family, LARGEST_SPREAD * 2**0.5)
+    return UNDECIDED if lost is None else NOT_HELD
+
+
+def _listed(pairs: Sequence[_Pair]) -> tuple[list[float], list[tuple[Path, Path]]]:
+    """Return the difference and the folders of each seed."""
+    return [pair.compared.difference.mean for pair in pairs], [pair.folders for pair in pairs]
+
+
+def _compared(key: Key, rows: Sequence[Compared], change: Estimate, judged: Judged) -> Compared:
+    first, second = float(np.mean([row.first for row in rows])), float(np.mean([row.second for row in rows]))
+    return Compared(*key, rows[0].measure, first, second, change, judged.verdict, judged)

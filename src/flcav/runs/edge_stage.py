@@ -1,0 +1,178 @@
+"""Stage II of a run recipe alone: the federation of each region's vehicles, with the steps that it rests on.
+
+They are the steps of `flcav run`, so that a folder of one goes on with what the other left in it, and the weights are
+the same. Here each round is validated as it ends, and vehicles train in several processes.
+"""
+
+import shutil
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated
+
+from flcav.config import InputError
+from flcav.interface.progress import DAMAGED
+from flcav.runs.arms import check_federations
+from flcav.runs.engine import Notify, Stale, Step, print_steps, run_steps
+from flcav.runs.frames import Frames
+from flcav.runs.provenance import Provenance, provenance
+from flcav.runs.recipe import EDGE, MAIN, RunRecipe
+from flcav.runs.results.saved import WEIGHTS, Saved
+from flcav.runs.results.training import PrivacySpent, ScoredRound, StageResult, Watched
+from flcav.runs.rigs import tell_rigs
+from flcav.runs.stages.deployment import check_clients
+from flcav.runs.stages.federating import EdgeSettings, federate_step
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.settings import make_step
+from flcav.runs.training.checkpoints import LAST, LOSS, Checkpoint
+from flcav.runs.training.private_rounds import PrivateTraining, compose_trainings, count_private_rounds
+from flcav.runs.training.timing import TrainTimes, read_times, summarise_times
+from flcav.storage.files import atomic_path
+from flcav.storage.records import LEFT_OUT
+
+WORK, TRAIN_TIMES = "work", "times.json"
+FEDERATE = "federate"  # in the names of the steps
+
+
+@dataclass(frozen=True)
+class RegionFederation:
+    """The federation of a region's vehicles: its result, and the scores of its network after each round."""
+
+    result: StageResult
+    watched: tuple[Watched, ...]  # on the validation frames of each region
+    weights: str  # file of the weights after the last round (safetensors), beside the results
+
+
+@dataclass(frozen=True)
+class Federations(Saved):
+    """Results of stage II alone."""
+
+    recipe: RunRecipe
+    arm: str
+    federations: tuple[RegionFederation, ...]
+    provenance: Provenance
+    privacy: Annotated[PrivacySpent | None, LEFT_OUT] = None  # all tasks together; None: no noise
+
+
+def federate_regions(
+    recipe: RunRecipe,
+    out: Path | str,
+    *,
+    arm: str = MAIN,
+    beside: Path | str | None = None,
+    jobs: int = 2,
+    runtime: str = "embedded",
+    fleet: Path | None = None,
+    notify: Notify = print_steps,
+    stale: Stale = "refuse",
+) -> Federations:
+    """Run or finish stage II of a recipe's arm in the folder `out`; return its results, see `name_results`.
+
+    In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
+    the `runtime`, one of `RUNTIMES`, is "ray", or on the vehicles of a deployed `fleet` (None: one that is brought up
+    for as long) where it is "flower". The weights do not depend on that, on Ray up to rounding. Others are those of
+    `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
+    `ClientFailed` where fewer vehicles are left in a round than are wanted.
+    """
+    out, graph = Path(out), Graph(recipe, Path(beside or "."))
+    if arm not in graph.settings:
+        raise InputError(f"--arm {arm}: the recipe has {', '.join(graph.settings)}")
+    if graph.settings[arm].central:
+        raise InputError(f"--arm {arm}: it trains centrally, without a federation")
+    check_federations(recipe, graph.settings.values())
+    check_clients(graph, [arm], runtime)
+    tell_rigs([graph], notify)
+    asked = list_federations(graph, arm)
+    means = {"processes": jobs, "runtime": runtime, "timed": 1, "fleet": "" if fleet is None else str(fleet)}
+    alone = {name: _federation_step(graph, *about, means) for name, about in asked.items()}
+    before = list_needed(graph.steps, alone.values())
+    run_steps(before, out / WORK, jobs=jobs, notify=notify, stale=stale)
+
+    def tell(step: str, done: int, total: int, note: str) -> None:
+        if step in alone:
+            notify(step, done, total, note)
+
+    run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
+    found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
+    trained = [each.result for each in found]
+    how = graph.settings[arm].federation
+    rounds = [count_private_rounds(how, {EDGE: own}, own.region or "") for own in trained]
+    about = zip(trained, rounds, strict=True)
+    trainings = [PrivateTraining(own.region or "", own.clients, number, own.noise) for own, number in about]
+    spent = compose_trainings(how, trainings)
+    results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
+    results.save(out, name_results(arm))
+    return results
+
+
+def name_results(arm: str) -> str:
+    """Return the name of an arm's file of results; each arm has its own."""
+    return "federation.json" if arm == MAIN else f"federation-{arm}.json"
+
+
+def measure_times(results: Federations, out: Path) -> TrainTimes:
+    """Return how long vehicles trained, and their speeds, by the trainings in the folder `out`; times.json there.
+
+    `results` are those in that folder. Tasks that were federated without a measurement are left out.
+    """
+    measured: dict[str, dict[str, list[float]]] = {}
+    for each in results.federations:
+        measured.setdefault(each.result.task, {}).update(read_times(out / WORK / Path(each.weights).stem))
+    times = summarise_times(measured)
+    times.save(out, TRAIN_TIMES)
+    return times
+
+
+def tells_of_round(step: str, note: str) -> bool:
+    """Return whether a note of a step tells of a round of a federation, or of a damaged checkpoint."""
+    return FEDERATE in step and (note.startswith(LOSS) or DAMAGED in note)
+
+
+def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
+    """Return arm, region and task of each federation of an arm, by the name of its step."""
+    setting = graph.settings[arm]
+    named = {(region, task): f"{region}-{FEDERATE}-{task}" for task in graph.recipe.tasks for region in setting.regions}
+    return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
+
+
+def list_needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
+    """Return those of `steps` that the steps `last` need, directly or not, in their order."""
+    needs = {step.name: step.needs for step in steps}
+    wanted, open_ = set(), [name for step in last for name in step.needs]
+    while open_:
+        name = open_.pop()
+        if name not in wanted:
+            wanted.add(name)
+            open_ += needs[name]
+    return [step for step in steps if step.name in wanted]
+
+
+def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
+    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
+    edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
+    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
+    name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
+    asked: EdgeSettings = edge.arguments["settings"]
+    scored = make_step(name, federate_step, asked.model_copy(update={"validation": frames}))
+    return replace(scored, means=means)
+
+
+def _collect(graph: Graph, out: Path, step: str, region: str) -> RegionFederation:
+    """Return the results of a finished federation, and copy its weights beside them."""
+    folder = out / WORK / step
+    result = StageResult.load(folder)
+    scores = Checkpoint.read(folder, LAST).scores if result.rounds else ()
+    frames = {
+        name: len(Frames.open(out / WORK / graph.names.recording(name, "validation", result.task)).vehicles)
+        for name in graph.recipe.regions
+    }
+    watched = tuple(
+        Watched(
+            EDGE, result.task, name, count, tuple(ScoredRound(i, each[name]) for i, each in enumerate(scores, start=1))
+        )
+        for name, count in frames.items()
+    )
+    weights = f"{step}.safetensors"
+    with atomic_path(out / weights) as temporary:
+        shutil.copyfile(folder / WEIGHTS, temporary)
+    return RegionFederation(result, watched, weights)

@@ -1,0 +1,261 @@
+"""Execution of steps in dependency order, by processes or on a cluster, resuming from those that are finished.
+
+A step is finished when its folder has a `done.json`: value, fingerprint, hash of the code it reaches, sizes of its
+files, and provenance. One with a file that is missing or of another size is repeated.
+That is written last, so an interrupted run resumes after its last finished step; a step may also keep checkpoints of
+its own. `started.json` has fingerprint and code before, so that a checkpoint is not resumed with other arguments.
+
+Steps with another fingerprint (function or arguments) need another folder. Steps begun or finished by other code are
+stale, and so are all steps that depend on them: they are refused, done again or kept, by the argument `stale`.
+"""
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty
+from typing import Any
+
+from flcav.config import InputError, read_json
+from flcav.interface.progress import DAMAGED
+from flcav.machine.locks import only_writer
+from flcav.runs.engine.cluster import open_actors
+from flcav.runs.engine.source_hash import Sources, find_definitions
+from flcav.runs.engine.step import (
+    DONE,
+    DONE_BEFORE,
+    DONE_NOW,
+    KEPT,
+    STALE,
+    Notify,
+    Step,
+    StepRecord,
+    asks_the_same,
+    find_damage,
+    make_edited_error,
+    make_stale_error,
+    read_record,
+    read_value,
+    remove,
+    reserve_sibling,
+    take_over,
+)
+from flcav.runs.engine.workers import Workers, open_step_processes
+from flcav.storage.files import write_json
+
+ENGINES: Mapping[str, Callable[[int], contextlib.AbstractContextManager[Workers]]] = {
+    "processes": open_step_processes,
+    "ray": open_actors,
+}
+POLL_S = 0.2
+
+
+def run_steps(
+    steps: Sequence[Step],
+    folder: Path,
+    *,
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
+) -> dict[str, Any]:
+    """Run `steps`, given in topological order, in `folder`, and return their values by name.
+
+    `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
+    a Ray cluster, see `flcav.runs.engine.cluster`. Of the processes, those that no step waits for are lent to steps
+    that can make use of several, until these end. Steps begun or finished by other code are refused, done again
+    ("redo") or kept ("keep", their records unchanged); those of other arguments, and what needs them, are done again by
+    "redo" and else refused. Steps whose functions have moved to other modules since count as those of other code.
+    Raises `InputError` for what is refused, and where another process runs steps in the folder; `OSError` where a
+    worker was killed.
+    """
+    return _run({folder: steps}, {folder: notify}, jobs, stale, engine)[folder]
+
+
+def run_side_by_side(
+    runs: Mapping[Path, Sequence[Step]],
+    *,
+    jobs: int,
+    notify: Notify,
+    stale: str = "refuse",
+    engine: str = "processes",
+    names: Mapping[Path, str] | None = None,
+) -> dict[Path, dict[str, Any]]:
+    """Run the steps of each folder, on the same `jobs` workers; return each folder's values as `run_steps` does.
+
+    Earlier folders come first. A step that is finished in another of the folders, asked in the same way and by the same
+    code, is taken over; one that is under way there is waited for. `names`: prefixes of the folders' steps in `notify`
+    (None: the folders' own names).
+    """
+
+    def named(folder: Path) -> Notify:
+        name = folder.name if names is None else names[folder]
+        return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
+
+    return _run(runs, {folder: named(folder) for folder in runs}, jobs, stale, engine)
+
+
+@dataclass(frozen=True)
+class _Run:
+    """The work that is left in a folder."""
+
+    folder: Path
+    records: Mapping[str, StepRecord]
+    waiting: list[Step]
+    values: dict[str, Any]  # of finished steps
+    notify: Notify
+
+    def finish(self, step: Step) -> None:
+        """Take the value of a step whose folder is complete."""
+        self.values[step.name] = read_value(self.folder / step.name)
+        self.notify(step.name, 1, 1, DONE_NOW)
+
+
+def _run(
+    steps: Mapping[Path, Sequence[Step]], notify: Mapping[Path, Notify], jobs: int, stale: str, engine: str
+) -> dict[Path, dict[str, Any]]:
+    """Run the steps of each folder; return the values of each."""
+    with contextlib.ExitStack() as locks:
+        for folder in steps:
+            locks.enter_context(only_writer(folder))
+        sources = Sources()
+        runs = [_plan(own, folder, notify[folder], stale, sources) for folder, own in steps.items()]
+        if any(run.waiting for run in runs):
+            if engine not in ENGINES:
+                raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
+            with ENGINES[engine](jobs) as workers:
+                _perform(runs, workers, jobs)
+        return {run.folder: run.values for run in runs}
+
+
+def _plan(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Run:
+    """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`.
+
+    A finished step that lacks a file is left to do: its own checkpoints, and what else is whole, it goes on from.
+    """
+    records, kept = _settle_records(steps, folder, stale, sources)
+    values: dict[str, Any] = {}
+    for step in steps:
+        done = folder / step.name / DONE
+        if done.exists() and (damage := find_damage(done.parent)):
+            notify(step.name, 0, 1, f"{done.parent / damage} {DAMAGED}, the step is done anew")
+            done.unlink()
+        if done.exists():
+            values[step.name] = read_value(folder / step.name)
+            notify(step.name, 1, 1, KEPT if step.name in kept else DONE_BEFORE)
+    waiting = _most_waited_for_first([step for step in steps if step.name not in values])
+    return _Run(folder, records, waiting, values, notify)
+
+
+def _perform(runs: Sequence[_Run], workers: Workers, jobs: int) -> None:
+    """Do the work that is left on `jobs` workers; steps that are finished in another folder are taken over."""
+    by_folder = {run.folder: run for run in runs}
+    running: dict[Future[Any], tuple[_Run, Step, int]] = {}
+    while running or any(run.waiting for run in runs):
+        free = jobs - sum(taken for _, _, taken in running.values())
+        ready = _list_ready(runs, [(run, step) for run, step, _ in running.values()])
+        for run, step, taken in _share_workers(ready, free, lent=workers.lent):
+            run.waiting.remove(step)
+            record = run.records[step.name]
+            others = [other.folder / step.name for other in runs if other is not run]
+            if take_over(run.folder / step.name, record, others):
+                run.finish(step)
+            else:
+                running[workers.submit(run.folder, step.on(taken), record)] = run, step, taken
+        finished, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+        with contextlib.suppress(Empty):
+            while True:
+                folder, *report = workers.reports.get_nowait()
+                by_folder[folder].notify(*report)
+        for future in finished:
+            run, step, _ = running.pop(future)
+            future.result()
+            run.finish(step)
+
+
+def _list_ready(runs: Sequence[_Run], running: Sequence[tuple[_Run, Step]]) -> list[tuple[_Run, Step]]:
+    """Return the steps that can begin: what they need is finished, and no other folder is about to do the same."""
+    begun = [(step.name, run.records[step.name]) for run, step in running]
+    ready = []
+    for run in runs:
+        for step in run.waiting:
+            asked = step.name, run.records[step.name]
+            if all(name in run.values for name in step.needs) and asked not in begun:
+                begun.append(asked)
+                ready.append((run, step))
+    return ready
+
+
+def _share_workers(ready: Sequence[tuple[_Run, Step]], free: int, *, lent: bool) -> Iterator[tuple[_Run, Step, int]]:
+    """Yield the steps that begin on `free` workers, and how many each has: one and, if `lent`, spare ones."""
+    spare = max(0, free - len(ready)) if lent else 0
+    for run, step in ready[:free]:
+        more = min(step.workers - 1, spare)
+        spare -= more
+        yield run, step, 1 + more
+
+
+def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
+    """Sort the steps by how many others depend on them, directly or not, most first: those hold up the run."""
+    rests: dict[str, set[str]] = {step.name: set() for step in steps}
+    for step in reversed(steps):
+        for name in step.needs:
+            if name in rests:
+                rests[name] |= {step.name} | rests[step.name]
+    return sorted(steps, key=lambda step: -len(rests[step.name]))
+
+
+def _settle_records(
+    steps: Sequence[Step], folder: Path, stale: str, sources: Sources
+) -> tuple[dict[str, StepRecord], set[str]]:
+    """Return the record by which each step is, or is to be, done, and the stale steps.
+
+    "redo" removes these, and those of other arguments.
+    """
+    if stale not in STALE:
+        raise InputError(f"stale '{stale}': choose one of {', '.join(STALE)}")
+    records: dict[str, StepRecord] = {}
+    outdated: dict[str, tuple[StepRecord, StepRecord]] = {}
+    edited: dict[str, tuple[StepRecord, StepRecord]] = {}
+    for step in steps:
+        asked = step.fingerprint({name: records[name].fingerprint for name in step.needs})
+        code = sources.hashes(find_definitions((step.run, step.arguments)))
+        record = StepRecord.of(asked, code, [records[name] for name in step.needs], step.asked)
+        held = read_record(folder / step.name)
+        moved = held is not None and asks_the_same(held, step.asked) and sources.lack(held.code)
+        moved = moved and not edited.keys() & {*step.needs}
+        if held is not None and held.fingerprint != asked and not moved:
+            edited[step.name] = held, record
+        elif held is not None and held.lineage != record.lineage:
+            outdated[step.name] = held, record
+            record = held if stale == "keep" else record
+        records[step.name] = record
+    if edited and stale != "redo":
+        raise make_edited_error(folder, edited, steps)
+    if outdated and stale == "refuse":
+        raise make_stale_error(folder, outdated)
+    for step in steps:
+        for what in ("old", "copy"):
+            reserve_sibling(folder / step.name, what)
+        if stale == "redo" and step.name in outdated | edited:
+            remove(folder / step.name)
+    return records, set(outdated)
+
+
+def stopwatch(folder: Path) -> Callable[[], float]:
+    """Return a clock of the wall time [s] spent on the run in `folder`, its earlier, interrupted starts included.
+
+    Each reading is saved; of an earlier start, the time up to its last reading counts.
+    """
+    path, start = folder / "elapsed.json", time.monotonic()
+    kept: Any = read_json(path) if path.exists() else {"elapsed_s": 0.0}
+    earlier = kept["elapsed_s"]
+
+    def clock() -> float:
+        elapsed = earlier + time.monotonic() - start
+        write_json(path, {"elapsed_s": elapsed})
+        return elapsed
+
+    return clock

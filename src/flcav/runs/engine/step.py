@@ -1,0 +1,289 @@
+"""A step of a workflow, the context it runs in, and the record of its execution on disk.
+
+The record says what was asked (function, arguments, inputs), which decides whether a folder is the right one, and by
+which code it was done, which decides whether its result still holds.
+"""
+
+import hashlib
+import json
+import os
+import shutil
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from flcav.config import SHOWN, Config, InputError, Json, read_json, shorten
+from flcav.interface.progress import Report, print_progress
+from flcav.interface.wording import plural
+from flcav.storage.files import flush_tree, write_json
+from flcav.storage.records import flatten_record
+
+Notify = Callable[[str, int, int, str], None]  # step, done, total, note
+DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps
+DONE, STARTED = "done.json", "started.json"
+Stale = str  # one of STALE
+STALE = ("refuse", "redo", "keep")  # what to do with steps of other code; "redo": of other arguments, too
+NAMED = 3  # most steps, or modules, that a message lists
+
+
+def print_steps(step: str, done: int, total: int, note: str) -> None:
+    """Write each finished step on stderr where somebody watches: the `Notify` of Python."""
+    if note in FINISHED:
+        print_progress(1, 1, f"{step} {note}")
+
+
+def ignore_steps(step: str, done: int, total: int, note: str) -> None:
+    """Do nothing: the default `Notify`, without a display."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """The context that a step runs in."""
+
+    folder: Path  # the step's own
+    inputs: Mapping[str, Path]  # folders of the steps it needs
+    report: Report  # to be called when the folder's files are a checkpoint
+
+    def result(self, step: str) -> Any:
+        """Return the value of the finished step `step`, one that this step needs."""
+        return read_value(self.inputs[step])
+
+
+@dataclass(frozen=True)
+class Step:
+    """One unit of work: a module-level function of (Work, **arguments) that returns a JSON value."""
+
+    name: str
+    run: Callable[..., Any]
+    arguments: Mapping[str, Any]  # JSON values, and frozen records of them: dataclasses or `Config`
+    needs: tuple[str, ...] = ()
+    means: Mapping[str, int | str] = field(default_factory=dict)  # further arguments, which do not change the result
+    workers: int = 1  # most that it can make use of; where several, it takes how many they are as `processes`
+
+    def on(self, workers: int) -> "Step":
+        """Return the step with so many workers."""
+        return self if workers == 1 else replace(self, means={**self.means, "processes": workers})
+
+    @property
+    def asked(self) -> dict[str, Json]:
+        """Return the arguments as JSON values, by dotted name, to say in which of them two steps differ."""
+        values = json.loads(json.dumps(self.arguments, default=_fields))
+        return {name.removeprefix("settings.").removeprefix("recipe."): value for name, value in flatten_record(values)}
+
+    def fingerprint(self, inputs: Mapping[str, str]) -> str:
+        """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).
+
+        Raises `TypeError` for an argument that is neither a JSON value nor a record of them.
+        """
+        asked = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
+        return digest(asked, default=_named)
+
+
+def _named(value: Any) -> list[Any]:
+    """Return the identity of a record among a step's arguments as JSON: its class and its fields."""
+    return [type(value).__module__, type(value).__qualname__, _fields(value)]
+
+
+def _fields(value: Any) -> dict[str, Any]:
+    """Return the fields of a record among a step's arguments."""
+    if isinstance(value, Config):
+        return value.model_dump(mode="json")
+    if is_dataclass(value):
+        return {each.name: getattr(value, each.name) for each in fields(value)}
+    raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a record of them")
+
+
+@dataclass(frozen=True)
+class StepRecord:
+    """The record of a step's execution: hashes of what was asked and of the code that did it."""
+
+    fingerprint: str  # see `Step.fingerprint`
+    code: Mapping[str, str]  # hash of the code it reaches, by module: see `engine.source_hash`
+    lineage: str  # of its code and of the lineages of the steps it needs; "" where the code is not known
+    asked: Mapping[str, Json] | None = field(default=None, compare=False)  # see `Step.asked`; None: not recorded
+
+    @classmethod
+    def of(
+        cls,
+        fingerprint: str,
+        code: Mapping[str, str],
+        needs: Iterable["StepRecord"],
+        asked: Mapping[str, Json] | None = None,
+    ) -> "StepRecord":
+        """Return the record of a step done by `code`, where the steps it needs have the records `needs`."""
+        return cls(fingerprint, code, digest([sorted(code.items()), *(need.lineage for need in needs)]), asked)
+
+
+def digest(value: Any, **how: Any) -> str:
+    """Return the first 16 digits of the SHA-256 of a JSON value, in hexadecimal; `how`: options of `json.dumps`."""
+    return hashlib.sha256(json.dumps(value, sort_keys=True, **how).encode()).hexdigest()[:16]
+
+
+def read_record(folder: Path) -> StepRecord | None:
+    """Read the record by which the step in `folder` was done or, if it is not, begun; None where it was neither.
+
+    Without recorded code, `code` is empty and `lineage` is "". Where that by which it was done is damaged, it is the
+    one by which it was begun. Raises `InputError` for a file that is no record.
+    """
+    for path in (folder / DONE, folder / STARTED):
+        if path.exists():
+            if path.name == DONE and (folder / STARTED).exists() and find_damage(folder) == DONE:
+                continue
+            values: Any = read_json(path)
+            if not isinstance(values, dict) or not isinstance(values.get("fingerprint"), str):
+                raise InputError(f"{path}: not the record of a step; choose another folder")
+            known = (values["fingerprint"], values.get("code") or {}, values.get("lineage") or "")
+            return StepRecord(*known, values.get("asked"))
+    return None
+
+
+def read_value(folder: Path) -> Any:
+    """Read the value of the finished step in `folder`."""
+    return json.loads((folder / DONE).read_text())["value"]
+
+
+def write_started(folder: Path, record: StepRecord) -> None:
+    """Write the record of the step in `folder` that begins."""
+    write_json(folder / STARTED, asdict(record))
+
+
+def write_done(folder: Path, record: StepRecord, value: Any, provenance: Mapping[str, Any]) -> None:
+    """Write record, value and provenance of the step in `folder`, and the sizes of its files; it is finished with that.
+
+    The files are on the disk before.
+    """
+    flush_tree(folder)
+    files = {
+        path.relative_to(folder).as_posix(): path.stat().st_size
+        for path in sorted(folder.rglob("*"))
+        if path.is_file() and path.name != STARTED and not path.name.startswith(".")
+    }
+    write_json(folder / DONE, asdict(record) | {"value": value, "files": files, "provenance": provenance})
+
+
+def find_damage(folder: Path) -> str | None:
+    """Return the name of a file of a finished step that is missing, or not as long as it was; None where none is.
+
+    Its record counts, too: one that cannot be read is damaged. Of a step that was finished before sizes were recorded,
+    the record alone is looked at.
+    """
+    try:
+        done: Any = read_json(folder / DONE)
+    except InputError:
+        return DONE
+    if not isinstance(done, dict) or not {"fingerprint", "value"} <= done.keys():
+        return DONE
+    for name, size in done.get("files", {}).items():
+        if not (folder / name).is_file() or (folder / name).stat().st_size != size:
+            return name
+    return None
+
+
+def changed_modules(held: StepRecord, wanted: StepRecord) -> list[str]:
+    """Return the modules whose reached code differs between two records; none where `held` does not know its code."""
+    if not held.code:
+        return []
+    return [name for name in sorted({*held.code, *wanted.code}) if held.code.get(name) != wanted.code.get(name)]
+
+
+def make_stale_error(folder: Path, outdated: Mapping[str, tuple[StepRecord, StepRecord]]) -> InputError:
+    """Return the error for a folder whose steps are of other code; `outdated`: records (held, wanted) by step."""
+    moved = [name for name, (held, wanted) in outdated.items() if held.fingerprint != wanted.fingerprint]
+    modules = {name: changed_modules(*records) for name, records in outdated.items()}
+    unknown = [name for name, (held, _) in outdated.items() if not held.code]
+    changed = [name for name in outdated if modules[name] and name not in moved]
+    after = [name for name in outdated if name not in unknown and name not in (*changed, *moved)]
+    which = sorted({module for name in changed for module in modules[name]})
+    told = [
+        f"{_some(moved)} by an earlier flcav, whose steps have moved since" if moved else "",
+        f"{_some(changed)} by other code ({_some(which)} changed)" if changed else "",
+        f"{_some(unknown)} by code that was not recorded" if unknown else "",
+        f"{_some(after)} on top of other code" if after else "",
+    ]
+    return InputError(
+        f"{folder}: did {', '.join(filter(None, told))}; choose another folder, or --stale redo to do that again, or "
+        "--stale keep to take it as it is"
+    )
+
+
+def make_edited_error(
+    folder: Path, edited: Mapping[str, tuple[StepRecord, StepRecord]], steps: Sequence[Step]
+) -> InputError:
+    """Return the error for a folder some of whose `steps` are of other arguments: records (held, wanted) by step."""
+    changes: dict[str, list[str]] = {}  # steps by how their arguments differ
+    after = []
+    for step in steps:
+        if step.name in edited:
+            differences = describe_differences(*edited[step.name])
+            if not differences and any(name in edited for name in step.needs):
+                after.append(step.name)
+            else:
+                changes.setdefault(_some(differences), []).append(step.name)
+    told = [
+        f"{_some(names)} by another configuration{f' ({fields})' if fields else ''}"
+        for fields, names in changes.items()
+    ]
+    told += [f"{_some(after)} on top of that"] if after else []
+    return InputError(
+        f"{folder}: did {'; '.join(told)}; choose another folder, or --stale redo to do that again and keep "
+        f"{plural(len(steps) - len(edited), 'other step')}"
+    )
+
+
+def asks_the_same(held: StepRecord, wanted: Mapping[str, Json]) -> bool:
+    """Return whether a step was given the same arguments; one that is not there is like one that is None."""
+    told = [{name: each for name, each in (own or {}).items() if each is not None} for own in (held.asked, wanted)]
+    return held.asked is not None and told[0] == told[1]
+
+
+def describe_differences(held: StepRecord, wanted: StepRecord) -> list[str]:
+    """Return the arguments of a step that are not as they were, in words; none where they were not recorded."""
+    if held.asked is None or wanted.asked is None:
+        return []
+    names = [*dict.fromkeys((*wanted.asked, *held.asked))]
+    pairs = {name: (wanted.asked.get(name), held.asked.get(name)) for name in names}
+    return [f"{name}: {_said(new)}, was {_said(old)}" for name, (new, old) in pairs.items() if new != old]
+
+
+def _said(value: Any) -> str:
+    text = json.dumps(value, ensure_ascii=False)
+    return text if len(text) <= SHOWN else shorten(text)
+
+
+def _some(names: Sequence[str]) -> str:
+    """Return the first `NAMED` names in words, and how many more there are."""
+    more = len(names) - NAMED
+    return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
+
+
+def take_over(folder: Path, record: StepRecord, others: Iterable[Path]) -> bool:
+    """Make `folder` a step that is finished in one of the folders `others` by the same record; False where none is.
+
+    Files are linked, not copied, and the folder appears at once. A step that has begun is left to go on.
+    """
+    for other in () if folder.exists() else others:
+        if (other / DONE).exists() and read_record(other) == record:
+            copy = reserve_sibling(folder, "copy")
+            shutil.copytree(other, copy, copy_function=os.link)
+            copy.rename(folder)
+            return True
+    return False
+
+
+def remove(folder: Path) -> None:
+    """Remove a step's folder, or the link to it; the folder is renamed first, so that it disappears at once."""
+    if folder.is_symlink():
+        folder.unlink()
+        return
+    old = reserve_sibling(folder, "old")
+    if folder.exists():
+        folder.rename(old)
+    shutil.rmtree(old, ignore_errors=True)
+
+
+def reserve_sibling(folder: Path, what: str) -> Path:
+    """Return a hidden path beside a step's folder, free for use: what an interrupted run left there is removed."""
+    path = folder.with_name(f".{folder.name}.{what}")
+    shutil.rmtree(path, ignore_errors=True)
+    return path

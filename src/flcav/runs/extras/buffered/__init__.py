@@ -1,0 +1,1 @@
+"""Buffered asynchronous rounds on the radio network: vehicles go on at their own pace, and nobody waits for them."""

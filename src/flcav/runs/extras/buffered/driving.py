@@ -1,0 +1,167 @@
+"""Buffered asynchronous rounds of a run's vehicles on the radio network: the schedule that federations follow.
+
+The scenes of a region's training data follow one another without a gap, and repeat. Stage III is asynchronous below
+and synchronous above: a region's edge server waits, after its buffers of a cloud round, until the slowest region's are
+full and the models have gone up and down by wireline. Meanwhile vehicles go on, and none begins.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+from flcav.config import InputError
+from flcav.federation.modes.buffered import BrokenUpdate, Buffers, FilledBuffer, count_participations
+from flcav.federation.rules import Rules
+from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedbuff import FedBuff
+from flcav.network.clock.buffers import BufferClock, BufferTiming
+from flcav.network.clock.records import ClientTiming
+from flcav.network.clock.rounds import NetworkSettings
+from flcav.network.radio.links import RadioLinks
+from flcav.runs.arms import Setting, plans_joiners
+from flcav.runs.driving import DrivenRounds, DrivenStage, Fleet, join_regions
+from flcav.runs.engine import Work
+from flcav.runs.label_sources import LABEL_SOURCES
+from flcav.runs.recipe import CLOUD, RunRecipe
+from flcav.runs.results.training import StageResult
+from flcav.runs.stages.federating import StageSettings
+from flcav.runs.stages.regions import link_stage_scenes, open_region_fleet, save_clock
+from flcav.runs.stages.rounds import RegionStart, StageFederation
+from flcav.runs.stages.settings import FederationSettings, RegionInputs
+from flcav.runs.training.learning import Learning
+
+ALL_SCENES = 10**6  # more than there are
+
+
+@dataclass(frozen=True)
+class BufferedFleet:
+    """The vehicles of a region that fill buffers: their work, the scenes that they drive in, and rounds before."""
+
+    fleet: Fleet
+    scenes: Sequence[RadioLinks]
+    before: Mapping[str, int]  # in how many rounds each client took part
+
+    def open_clock(self, strategy: FedBuff, settings: NetworkSettings) -> BufferClock:
+        """Return the clock of the region's buffers."""
+        work = [self.fleet.work(client) for client in self.fleet.clients]
+        return BufferClock(self.scenes, work, strategy.buffer, settings.rounds)
+
+    def read(self, rules: Rules, timings: Sequence[BufferTiming]) -> DrivenRounds:
+        """Return the rounds of these buffers."""
+
+        def named(timing: ClientTiming) -> ClientTiming:
+            return replace(timing, client=f"{self.fleet.region}/{timing.client}")
+
+        rounds = []
+        for each in timings:
+            broken = tuple(
+                BrokenUpdate(own.client, own.dropped, own.downloaded_bytes, own.uploaded_bytes)
+                for own in map(named, each.broken)
+            )
+            versions = {f"{self.fleet.region}/{vehicle}": version for vehicle, version in each.versions.items()}
+            rounds.append(FilledBuffer(versions, broken))
+        records = tuple(each.as_round() for each in timings)
+        return DrivenRounds(rules, {}, records, Buffers(tuple(rounds), self.before))
+
+
+def drive_buffers(
+    fleets: Mapping[str, BufferedFleet],
+    strategy: FedBuff,
+    settings: NetworkSettings,
+    rules: Rules,
+    each: Mapping[str, int],
+    cloud_rounds: int = 1,
+    ways_s: float | None = None,
+) -> tuple[dict[str, DrivenRounds], DrivenStage]:
+    """Return the buffered rounds of a stage by region, and all together; raises `InputError` as `BufferClock`.
+
+    Args:
+        fleets: vehicles by region.
+        strategy: of the regions.
+        settings: of radio and the rounds of vehicles.
+        rules: of all regions.
+        each: number of buffers of a region, in a cloud round.
+        cloud_rounds: number of cloud rounds.
+        ways_s: that the ways of a model down and up by wireline take [s]; None: there is no cloud.
+    """
+    clocks = {region: own.open_clock(strategy, settings) for region, own in fleets.items()}
+    timings: dict[str, list[BufferTiming]] = {region: [] for region in fleets}
+    ended, seconds = 0.0, list[float]()
+    for _ in range(cloud_rounds):
+        for region, clock in clocks.items():
+            timings[region] += [clock.fill() for _ in range(each[region])]
+        ends = max((own[-1].end_s for own in timings.values() if own), default=ended) + (ways_s or 0.0)
+        for clock in clocks.values():
+            clock.hold(ends)
+        seconds.append(ends - ended)
+        ended = ends
+    driven = {region: own.read(rules, timings[region]) for region, own in fleets.items()}
+    joined = join_regions(driven)
+    return driven, joined if ways_s is None else replace(joined, seconds={**joined.seconds, CLOUD: seconds})
+
+
+def count_buffers(
+    strategy: Strategy, rounds: int, starts: Mapping[str, RegionStart], cloud: bool
+) -> tuple[int, Mapping[str, RegionStart]]:
+    """Return rounds and regions with as many buffers as have the updates of so many rounds.
+
+    In a cloud round each region fills one at least. Raises `InputError` where a region has fewer vehicles than a buffer
+    has updates.
+    """
+    if not isinstance(strategy, FedBuff):
+        return rounds, starts
+    for region, own in starts.items():
+        strategy.check_buffer(len(own.clients))
+        if cloud:
+            k = max(strategy.count_rounds(own.edge_rounds, len(own.clients)), 1)
+            starts = {**starts, region: replace(own, edge_rounds=k)}
+        else:
+            rounds = strategy.count_rounds(rounds, len(own.clients))
+    return rounds, starts
+
+
+def drive_stage(
+    work: Work, settings: StageSettings, federation: StageFederation, ways_s: float | None
+) -> DrivenStage | None:
+    """Return the buffered rounds of a stage, and write their clock; None of another strategy, or without a network.
+
+    ways_s: that the ways of a model down and up by wireline take [s]; None: there is no cloud.
+    """
+    strategy, network = federation.strategies.edge, settings.federation.network
+    if not isinstance(strategy, FedBuff) or network is None:
+        return None
+    fleets = {
+        region: open_buffered_fleet(work, settings, federation.learning, settings.regions[region], [*own.clients])
+        for region, own in federation.regions.items()
+    }
+    rounds = federation.schedule.rounds
+    each = {name: rounds if ways_s is None else own.edge_rounds for name, own in federation.regions.items()}
+    times = 1 if ways_s is None else rounds
+    driven, stage = drive_buffers(fleets, strategy, network, settings.federation, each, times, ways_s)
+    for region, own in driven.items():
+        save_clock(own, work, region)
+    return stage
+
+
+def open_buffered_fleet(
+    work: Work, settings: FederationSettings, learning: Learning, inputs: RegionInputs, clients: Sequence[str]
+) -> BufferedFleet:
+    """Return the vehicles of a region that fill buffers, in all scenes of its training data."""
+    network, before = settings.federation.network, ()
+    assert network is not None  # of recipes that are checked
+    if inputs.edge is not None:
+        before = StageResult.load(work.inputs[inputs.edge]).records or ()
+    scenes = link_stage_scenes(work, inputs, network, ALL_SCENES, learning.seed)
+    took_part = count_participations([(each.clients, [*each.failed]) for each in before])
+    return BufferedFleet(open_region_fleet(settings, learning, inputs.region, clients), scenes, took_part)
+
+
+def check_buffers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where an arm's rounds are buffers, and no clock is theirs, or something goes by rounds."""
+    if not isinstance(strategy, FedBuff):
+        return
+    if setting.federation.network is None:
+        raise InputError("strategy fedbuff: vehicles go on at their own pace, by the clock of 'federation.network'")
+    if plans_joiners(recipe, setting):
+        raise InputError("strategy fedbuff: nobody joins rounds by a plan; leave out horizon_s")
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("strategy fedbuff: labels 'road-average' are made anew before a round that all begin together")

@@ -1,0 +1,46 @@
+"""Checks of groups on request in a recipe, and the numbers of vehicles that a plan may call."""
+
+from flcav.config import InputError
+from flcav.federation.strategies import Strategy
+from flcav.federation.strategies.fedbuff import FedBuff
+from flcav.federation.strategies.fedmd import FedMD
+from flcav.federation.strategies.strategy import needs_known_number
+from flcav.runs.arms import Calls, Setting, plans_joiners
+from flcav.runs.label_sources import LABEL_SOURCES
+from flcav.runs.recipe import Federation, RunRecipe
+
+
+def count_called(recipe: RunRecipe, how: Federation) -> Calls | None:
+    """Return what a plan chooses the vehicles of a group on request from; None for a fixed roster."""
+    if how.requests is None:
+        return None
+    most = how.requests.most or max(map(recipe.vehicles, recipe.with_role("federate")))
+    return Calls(1, most, how.requests.overlap)
+
+
+def check_groups(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where an arm has groups on request, and these do not go with the rest of it."""
+    if setting.federation.requests is not None:
+        check_roster(recipe, setting, strategy)
+
+
+def check_roster(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
+    """Raise `InputError` where a group of any number of vehicles does not go with a strategy, rules or labels."""
+    how, told = setting.federation, "requests: how many vehicles a group has is not known before"
+    if isinstance(strategy, FedBuff | FedMD) or needs_known_number(strategy):
+        raise InputError(f"{told}, and {type(strategy).__name__} needs a known roster")
+    if how.selection.rule != "all" or how.least_clients is not None or how.secure is not None:
+        raise InputError(f"{told}; leave out 'selection', 'least_clients' and 'secure'")
+    if how.privacy is not None:
+        raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
+    if plans_joiners(recipe, setting):
+        raise InputError("requests: nobody joins rounds by a plan; leave out horizon_s")
+    if how.requests is not None and how.requests.roadside:
+        for task, kind in setting.labels.items():
+            if not LABEL_SOURCES[kind].trained or LABEL_SOURCES[kind].averaged:
+                raise InputError(
+                    f"requests.roadside: units label by their trained detector, and the labels of '{task}' are "
+                    f"'{kind}'; choose 'road' or 'road+tracks'"
+                )
+    if any(LABEL_SOURCES[kind].averaged for kind in setting.labels.values()):
+        raise InputError("requests: vehicles check the network by labels of their own, not by those of 'road-average'")

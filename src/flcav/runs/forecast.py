@@ -1,0 +1,268 @@
+"""Forecast of a run before anything is spent: rounds, megabytes, epsilon, time, and effects that its tests can tell.
+
+One scene is recorded for each task, in a temporary folder, and a few steps are trained on it: sizes of samples and
+times are measured so. Plans are made as the run makes its first ones; what only a run finds out (times on the air,
+sizes of the road average's labels, new plans after a stage) is left out.
+"""
+
+import tempfile
+import time
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
+from flcav.network.ledger import Link
+from flcav.network.plan import MessageSizes, StagePlan, price
+from flcav.perception.client import as_shared
+from flcav.perception.outcomes import score_network
+from flcav.perception.tasks import task_named
+from flcav.perception.weights import to_arrays
+from flcav.runs.allocation import PlanRequest, make_plan
+from flcav.runs.arms import Setting, check_federations
+from flcav.runs.frames import Frames, deal_frames, make_recording_recipe, record_frames
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
+from flcav.runs.registry import FORECASTS, load_all
+from flcav.runs.results.training import PrivacySpent
+from flcav.runs.stages.graph import Graph
+from flcav.runs.stages.planning import FirstPlanSettings, frame_plan
+from flcav.runs.tables import parse_history
+from flcav.runs.training.learning import make_clients
+from flcav.runs.training.private_rounds import (
+    PrivateTraining,
+    compose_trainings,
+    find_budget_noise,
+    plan_private_rounds,
+)
+from flcav.runs.training.updates import measure_exchange, model_mb
+from flcav.storage.records import LEFT_OUT, Record
+
+STEPS = 3  # that are timed
+SCENE_SD = 0.1  # of a paired difference of AP50 or accuracy in one test scene: .08 to .14 in reproductions/runs
+TOLD = 1.96 + 0.84  # standard errors of a mean that a test at the level .05 tells with a power of .8, both sides
+
+
+@dataclass(frozen=True)
+class PlannedRounds(Record):
+    """The plan of a task, as far as its budgets, time and privacy afford it."""
+
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    noise: Annotated[float | None, LEFT_OUT] = None  # that a privacy budget alone gives; None: it is given, or none is
+
+
+@dataclass(frozen=True)
+class ArmForecast(Record):
+    """Forecast of an arm: rounds, uplink and privacy."""
+
+    tasks: Mapping[str, PlannedRounds]
+    uplink_mb: Mapping[Link, float]
+    privacy: PrivacySpent | None  # None: no noise
+
+
+@dataclass(frozen=True)
+class Forecast(Record):
+    """Forecast of a run."""
+
+    minutes: float  # of one core
+    arms: Mapping[str, ArmForecast]
+    scenes: int  # of tests, in a region
+    effect: float  # smallest difference of AP50 or accuracy that these tell of one training
+
+    def lines(self) -> list[str]:
+        """Return the forecast in words."""
+        lines = [
+            f"about {self.minutes:.1f} minutes of one core, by one scene and {STEPS} steps of each task just timed"
+        ]
+        for name, arm in self.arms.items():
+            for task, own in arm.tasks.items():
+                counts = {"sample": own.samples, "edge round": own.edge_rounds, "cloud round": own.cloud_rounds}
+                rounds = ", ".join(plural(count, what) for what, count in counts.items())
+                lines.append(f"{name}, {task}: {rounds}")
+            sent = " and ".join(f"{megabytes:.1f} MB {link}" for link, megabytes in arm.uplink_mb.items())
+            lines.append(f"{name}: about {sent} of uplink")
+            if arm.privacy is not None:
+                lines.append(f"{name}: {arm.privacy.describe()}")
+        told = f"tell a difference of {self.effect:.2f} with a power of 0.8"
+        by = f"by a standard deviation of {SCENE_SD:g} between scenes, of AP50 and accuracy in earlier runs"
+        told += f" ({by}); retraining varies besides"
+        lines.append(f"tests: of one training, {plural(self.scenes, 'scene')} of a region {told}")
+        return lines
+
+
+@dataclass(frozen=True)
+class _Measured:
+    """Sizes and times of a task."""
+
+    sample_mb: float
+    exchange_mb: float | None
+    pool: int  # candidates for upload
+    frame_s: float  # to record a frame
+    step_s: float  # of training
+    test_s: float  # to test a frame
+
+
+def forecast_run(
+    recipe: RunRecipe, *, beside: Path | str | None = None, progress: Report = ignore_progress
+) -> Forecast:
+    """Return the forecast of a run; raises `InputError` where the recipe cannot be run, as the run does."""
+    graph = Graph(recipe, Path(beside or "."))
+    check_federations(recipe, graph.settings.values())
+    measured = {}
+    for done, task in enumerate(recipe.tasks, start=1):
+        measured[task] = _measure(graph, task)
+        progress(done, len(recipe.tasks), task)
+    plans = {name: _plan_arm(graph, arm, measured) for name, arm in graph.settings.items()}
+    arms = {name: _forecast_arm(graph, arm, plans, measured) for name, arm in graph.settings.items() if not arm.repeat}
+    scenes = recipe.sized_splits.test.scenes
+    minutes = sum(_list_seconds(graph, plans, measured)) / 60
+    return Forecast(minutes, arms, scenes, TOLD * SCENE_SD / float(np.sqrt(scenes)))
+
+
+def _measure(graph: Graph, task: str) -> _Measured:
+    settings = _plan_settings(graph, MAIN)
+    learning = graph.learning(graph.settings[MAIN], task).resolve()
+    with tempfile.TemporaryDirectory() as folder:
+        split, pool, frame_s = _record_scene(graph, task, Path(folder))
+        packed = as_shared(learning.task).pack_samples(split.data, learning.config, split.vehicles)
+        sample_mb = float(np.mean([len(message) for message in packed])) / 1e6
+        about = (learning.task, learning.config, [split], settings.updates, len(split.vehicles), settings.seed)
+        exchange_mb = measure_exchange(*about)
+        network = learning.build_network()
+        samples = learning.task.samples(split.data, learning.config, split.vehicles)
+        (client,) = make_clients(learning, learning.config, {task: samples}).values()
+        weights = to_arrays(network)
+        client.train(weights, steps=1, learning_rate=1e-4, seed=0)  # compiles
+        score_network(learning.task, network, split.data, split.vehicles)  # compiles
+        began = time.process_time()
+        client.train(weights, steps=STEPS, learning_rate=1e-4, seed=0)
+        trained, frames = time.process_time(), split.vehicles
+        score_network(learning.task, network, split.data, frames)
+        test_s = (time.process_time() - trained) / len(frames)
+    return _Measured(sample_mb, exchange_mb, pool, frame_s, (trained - began) / STEPS, test_s)
+
+
+def _record_scene(graph: Graph, task: str, folder: Path) -> tuple[Frames, int, float]:
+    """Return a scene of the candidates for upload, the number of all candidates, and the time to record a frame [s]."""
+    recipe, pools = graph.recipe, graph.pools(task)
+    region, name = next(iter(pools.items()))
+    own = recipe.regions[region]
+    if own.data is not None:
+        dealt = deal_frames(graph.find_data(own, "pool"), "pool", own.role, recipe.seed, isinstance(own.data, Mapping))
+        dealt.save(folder)
+        split = Frames.open(folder)
+        return split, len(split.vehicles) * len(pools), 0.0
+    asked = make_recording_recipe(recipe, region, "pool", task, name)
+    first = asked.model_copy(update={"scenes": 1, "spins_per_scene": 1, "cavs": 1, "frames": None})
+    with tempfile.TemporaryDirectory() as unused:  # compiles what the recording calls
+        record_frames(first, graph.beside, Path(unused) / "first", ignore_progress)
+    began = time.perf_counter()
+    record_frames(asked.model_copy(update={"scenes": 1}), graph.beside, folder, ignore_progress).save(folder)
+    split = Frames.open(folder)
+    took_s = time.perf_counter() - began
+    return split, len(split.vehicles) * asked.scenes * len(pools), took_s / len(split.data)
+
+
+def _plan_settings(graph: Graph, arm: str) -> FirstPlanSettings:
+    name = graph.names.plan(arm)
+    return next(step.arguments["settings"] for step in graph.steps if step.name == name)
+
+
+def _plan_arm(graph: Graph, arm: Setting, measured: Mapping[str, _Measured]) -> dict[str, PlannedRounds]:
+    """Return the plan of an arm's tasks, with the rounds that its privacy budget affords."""
+    settings, asked = _plan_settings(graph, arm.name), []
+    for name, own in settings.tasks.items():
+        sizes = _size_messages(settings, name, measured[name])
+        history = None if own.history is None else parse_history(name, own.history, name)
+        asked.append(PlanRequest(name, own.weight, sizes, measured[name].pool, history, own.fixed, own.train_s))
+    plan, _ = make_plan(tuple(asked), frame_plan(settings), settings.rule)
+    planned = {}
+    for name, own in plan.tasks.items():
+        further = own.cloud_rounds * (k := arm.federation.edge_rounds_per_cloud_round)
+        vehicles = [graph.vehicles[region] for region in arm.regions]
+        private = plan_private_rounds(
+            arm.federation, vehicles, own.edge_rounds, further if arm.stages[-1] in (CLOUD, MORE_EDGE) else 0, k
+        )
+        found = find_budget_noise(arm.federation, private.rules)
+        planned[name] = PlannedRounds(own.samples, private.edge, private.further // k, found)
+    return planned
+
+
+def _size_messages(settings: FirstPlanSettings, task: str, own: _Measured) -> MessageSizes:
+    network = settings.tasks[task].network
+    return MessageSizes(own.sample_mb, model_mb(task_named(task), network, settings.updates), own.exchange_mb)
+
+
+def _forecast_arm(
+    graph: Graph,
+    arm: Setting,
+    plans: Mapping[str, Mapping[str, PlannedRounds]],
+    measured: Mapping[str, _Measured],
+) -> ArmForecast:
+    settings, k = _plan_settings(graph, arm.name), arm.federation.edge_rounds_per_cloud_round
+    groups, uplink_mb = tuple(graph.vehicles[region] for region in arm.regions), np.zeros(2)
+    for task, own in plans[arm.name].items():
+        cloud = own.cloud_rounds if CLOUD in arm.stages else 0
+        edge = 0 if arm.central else own.edge_rounds + (own.cloud_rounds * k if MORE_EDGE in arm.stages else 0)
+        samples = own.samples + (arm.uploads or 0) * len(groups)
+        sent = price(StagePlan(samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
+        uplink_mb += (sent.wireless_mb, sent.wireline_mb)
+    trainings = [
+        PrivateTraining(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, own.noise)
+        for repeat in range(1 + graph.recipe.retrainings)
+        for own in plans[arm.name].values()
+        for region in arm.regions
+    ]
+    spent = None if arm.central else compose_trainings(arm.federation, trainings)
+    return ArmForecast(plans[arm.name], dict(zip(("wireless", "wireline"), uplink_mb.tolist())), spent)
+
+
+def _list_seconds(
+    graph: Graph, plans: Mapping[str, Mapping[str, PlannedRounds]], measured: Mapping[str, _Measured]
+) -> Iterator[float]:
+    """Yield the time of each recording, training and test [s]; steps that arms share count once."""
+    recipe, names, steps = graph.recipe, graph.names, {step.name for step in graph.steps}
+    size, counted = recipe.sized_splits, set[str]()
+
+    def once(step: str, seconds: float) -> float:
+        new = step in steps and step not in counted
+        counted.add(step)
+        return seconds if new else 0.0
+
+    for task, own in measured.items():
+        for region, about in recipe.regions.items():
+            for split in SPLITS_OF[about.role]:
+                asked = getattr(size, split)
+                frames = asked.scenes * asked.spins * (graph.vehicles[region] if split == EDGE else asked.cavs)
+                yield once(names.recording(region, split, task), 0.0 if about.data else frames * own.frame_s)
+        for arm in graph.settings.values():
+            plan, training = plans[arm.name][task], arm.training[task]
+            yield once(names.pretrain(arm.name, task), training.steps * own.step_s)
+            per_round = {region: graph.vehicles[region] * training.local_steps * own.step_s for region in arm.regions}
+            k = arm.federation.edge_rounds_per_cloud_round
+            rounds = {EDGE: plan.edge_rounds, CENTRAL: plan.edge_rounds, MORE_EDGE: plan.cloud_rounds * k}
+            for stage in arm.stages:
+                if stage == CLOUD:
+                    yield once(names.cloud(arm.name, task), plan.cloud_rounds * k * sum(per_round.values()))
+                    continue
+                for region in arm.regions:
+                    yield once(names.stage(arm.name, stage, region, task), rounds[stage] * per_round[region])
+            frames = size.test.scenes * size.test.spins * size.test.cavs
+            for stage, region, tested in graph.tested(arm):
+                if tested == task:
+                    trained = names.stage(arm.name, stage, region, task)
+                    yield once(names.test(trained, region, None), frames * own.test_s)
+        watched = size.validation.scenes * size.validation.spins * size.validation.cavs
+        main = plans[MAIN][task]
+        for stage, region, tested in graph.watched():
+            if tested == task:
+                rounds_done = {PRETRAIN: 0, EDGE: main.edge_rounds, CLOUD: main.cloud_rounds}.get(stage, 0)
+                trained = names.stage(MAIN, stage, region, task)
+                yield once(names.rounds(trained, region), (1 + rounds_done) * watched * own.test_s)
+        for further in load_all(FORECASTS):
+            yield further(graph, task, plans[MAIN][task].edge_rounds, own.step_s, own.test_s)

@@ -1,0 +1,97 @@
+"""Labels from tracks: each vehicle labels its frames after the drive, from the sweeps that it recorded around them."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from flcav.fusion.average import BoxReport, PoseSource
+from flcav.fusion.labels import label_by_tracks
+from flcav.fusion.road import RoadView
+from flcav.fusion.tracks import LEAST_SCORE, VehicleSweep, track_objects
+from flcav.geometry import Boxes, concatenate, inverse, transform_points
+from flcav.interface.progress import Report, ignore_progress
+from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
+from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.predict import LOWEST_SCORE, detect_in
+from flcav.perception.objects.samples import Sample
+from flcav.perception.objects.truth import asked_of, choose_lidar, detection_labels, in_range
+from flcav.runs.frames import Frames, list_window
+from flcav.runs.labels.pseudo_labels import EXACT, LabelFrame, find_precise_score
+from flcav.runs.labels.sightings import navigate
+from flcav.sensors.frame import Frame
+from flcav.storage.files import write_bytes
+
+TRACKS = "tracks.msgpack"
+PRECISION = 0.95  # least of labels by tracks, on validation frames of the towns of pretraining
+WINDOW_S, WINDOW_EVERY_S = 1.0, 0.2  # of the sweeps that are recorded around a frame
+
+
+def label_tracked(tracks: Mapping[int, Boxes], threshold: float, config: SecondConfig) -> LabelFrame:
+    """Return the labelling of frames by `tracks`, in the frame of their LiDAR, that score `threshold` or more."""
+
+    def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
+        return label_by_tracks(frame, tracks[i], threshold, told, config, choose_lidar(frame))
+
+    return label
+
+
+def track_frame(
+    network: Second, split: Frames, i: int, views: Sequence[RoadView] = (), poses: PoseSource = EXACT
+) -> Boxes:
+    """Return the tracks at frame `i` that score `LEAST_SCORE` or more, in the frame of its LiDAR.
+
+    They are of the detections of `network` in the sweeps that the vehicle recorded within `WINDOW_S` of the frame, by
+    the `poses` of its navigation. views: of the road sensors at the spin, whose boxes join them.
+    """
+    data, sweeps, known = split.data, list[VehicleSweep](), dict[int, NDArray[np.float64]]()
+    for number in list_window(split, (i,), WINDOW_S):
+        frame = data.frame(number)
+        lidar = choose_lidar(frame)
+        world_from_lidar = navigate(data, number, poses)[0] @ frame.assumed.agent_from_sensor[lidar]
+        known[number] = world_from_lidar
+        (found,) = detect_in(network, [frame], score_threshold=LOWEST_SCORE)
+        points = transform_points(world_from_lidar, frame.lidar[lidar][:, :3].astype(np.float64))
+        boxes, origin = found.transform(world_from_lidar), world_from_lidar[:3, 3]
+        sweeps.append(VehicleSweep(data.keys[number].time_s, boxes, points, origin))
+    at_s, told = data.keys[i].time_s, [_classify(view.boxes, network.config) for view in views]
+    others = [BoxReport(f"pole {number}", at_s, boxes) for number, boxes in enumerate(told)]
+    return track_objects(sweeps, at_s, others, LEAST_SCORE).transform(inverse(known[i]))
+
+
+def save_tracks(tracks: Mapping[int, Boxes], folder: Path) -> None:
+    """Write the tracks of frames, by number, into a step's folder."""
+    boxes = concatenate([*tracks.values()])
+    frame = np.repeat(np.array([*tracks], dtype=np.int64), [len(own) for own in tracks.values()])
+    arrays = {"frames": np.array([*tracks], dtype=np.int64), "frame": frame, "boxes": boxes.array()}
+    arrays |= {"score": np.zeros(0) if boxes.score is None else boxes.score, "label": from_names(boxes.label.tolist())}
+    write_bytes(folder / TRACKS, pack_arrays(arrays))
+
+
+def load_tracks(folder: Path) -> dict[int, Boxes]:
+    """Return the tracks of frames, by number, in a step's folder: the inverse of `save_tracks`."""
+    arrays = unpack_arrays((folder / TRACKS).read_bytes())
+    boxes = Boxes.from_array(arrays["boxes"], to_names(arrays["label"]), arrays["score"])
+    return {i: boxes[arrays["frame"] == i] for i in arrays["frames"].tolist()}
+
+
+def fit_track_threshold(network: Second, splits: Sequence[Frames], report: Report = ignore_progress) -> float:
+    """Return the score threshold of labels: the lowest with a precision of `PRECISION` on validation frames, or 1."""
+    frames = [(split, i) for split in splits for i in split.vehicles]
+    truths = [asked_of(split.data.frame(i), network.config) for split, i in frames]
+
+    def found() -> Iterator[Boxes]:
+        for done, (split, i) in enumerate(frames, start=1):
+            tracks = track_frame(network, split, i)
+            yield tracks[in_range(tracks, network.config)]
+            report(done, len(frames), "labels")
+
+    return find_precise_score([*found()], truths, PRECISION)
+
+
+def _classify(boxes: Boxes, config: SecondConfig) -> Boxes:
+    """Return the boxes of road sensors, whose labels are actor categories, that are of the network's classes."""
+    label = detection_labels(boxes.label, config.classes)
+    return replace(boxes, label=label)[label != ""]

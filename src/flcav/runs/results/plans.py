@@ -1,0 +1,105 @@
+"""Records of plans and of placed sensors."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.config import InputError
+from flcav.network.plan import MessageSizes
+from flcav.runs.results.saved import Saved
+from flcav.storage.records import LEFT_OUT
+
+
+@dataclass(frozen=True)
+class TaskPlan:
+    """The plan of one task: its samples and rounds, and their price on both uplinks."""
+
+    samples: int
+    edge_rounds: int
+    cloud_rounds: int
+    wireless_mb: float  # uplink, all stages
+    wireline_mb: float
+    sample_mb: float  # of one sample
+    model_mb: float  # of one model update
+    predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
+    joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
+        None  # by vehicle the rounds of its region that it joins, of 1 … edge rounds + k · cloud rounds; None: all
+    )
+
+    uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
+        None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
+    )
+
+    exchange_mb: Annotated[float | None, LEFT_OUT] = (
+        None  # what a vehicle sends to be combined in a round; None: a model update
+    )
+    labels_mb: Annotated[float | None, LEFT_OUT] = (
+        None  # what it sends to have its samples labelled: before each round of stage II, once before stage III
+    )
+
+    called: Annotated[int | None, LEFT_OUT] = None  # vehicles of a group on request; None: the plan does not decide
+
+    @property
+    def sizes(self) -> MessageSizes:
+        """Sizes of the task's messages."""
+        return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
+
+    def joins_after_edge(self) -> Mapping[str, tuple[int, ...]]:
+        """Return the rounds after stage II that each vehicle joins, numbered from 1; empty: all join all."""
+        over = self.edge_rounds
+        return {name: tuple(each - over for each in own if each > over) for name, own in (self.joins or {}).items()}
+
+
+@dataclass(frozen=True)
+class Plan(Saved):
+    """The allocation of both budgets to tasks and stages."""
+
+    rule: str
+    tasks: Mapping[str, TaskPlan]
+    after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was updated; None: before the run
+    reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
+
+
+@dataclass(frozen=True)
+class ErrorRegistry(Saved):
+    """Number of registered errors of a pretrained network in a region; their table is in the same folder."""
+
+    region: str
+    task: str
+    counts: Mapping[str, int]  # by kind
+    dropped: int  # false positives without a place in the town
+
+
+@dataclass(frozen=True)
+class Pole:
+    """A candidate site of a roadside sensor."""
+
+    pole: int
+    covered: int  # errors within range
+    actors: float  # road users within range on average
+
+
+@dataclass(frozen=True)
+class Placed(Saved):
+    """Placement of a region's roadside sensors."""
+
+    region: str
+    rule: str
+    chosen: tuple[int, ...]  # poles
+    errors: int  # registered
+    covered: int  # errors within range of a chosen pole
+    range_m: float
+    poles: tuple[Pole, ...]  # all candidates
+
+    @property
+    def first(self) -> int:
+        """Return the pole that was chosen first; raises `InputError` where no sensor was placed."""
+        if not self.chosen:
+            found = f"candidate poles: {len(self.poles)}, errors to cover: {self.errors}"
+            raise InputError(f"region {self.region!r}: no sensor was placed ({found})")
+        return self.chosen[0]
+
+    @property
+    def densest(self) -> int:
+        """Return the pole with the most road users within range on average."""
+        return max(self.poles, key=lambda site: site.actors).pole

@@ -1,0 +1,143 @@
+"""Records of tests: of networks on test frames, of differences between them, and what follows from these."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated
+
+from flcav.runs.results.saved import Saved
+from flcav.statistics.estimates import Estimate, Spread
+from flcav.statistics.seeds import MeanOverSeeds
+from flcav.storage.records import LEFT_OUT
+
+
+@dataclass(frozen=True)
+class Tested(Saved):
+    """Test of a network on a region's test frames; the outcome of each frame is in the same folder."""
+
+    region: str
+    task: str
+    measure: str  # name of what is estimated
+    estimate: Estimate
+    numbers: Mapping[str, float | None]  # other numbers of the task, by name
+    frames: int
+    scenes: int
+
+
+@dataclass(frozen=True)
+class Test:
+    """A test with the arm, stage, region and task that it is of."""
+
+    arm: str
+    stage: str
+    region: str
+    task: str
+    step: str  # its folder holds the outcomes
+    result: Tested  # its interval is over scenes alone
+    estimate: Estimate  # of `over_trainings`; else of one training, with the spread of retraining where it is known
+    spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
+    retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
+    over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # the run's own trainings, on these scenes
+    retrained_steps: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # their folders, in the order of `retrained`
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """Return arm, stage, region and task."""
+        return self.arm, self.stage, self.region, self.task
+
+    @property
+    def steps(self) -> tuple[str, ...]:
+        """Return the folders of the tests of all trainings whose outcomes are known, the first training's first."""
+        return (self.step, *(self.retrained_steps or ()))
+
+    @property
+    def trainings(self) -> tuple[float, ...]:
+        """Return the measure of each training, the first training's first."""
+        return (self.result.estimate.mean, *self.retrained)
+
+
+@dataclass(frozen=True)
+class RegionalTest:
+    """A test of the model that a region keeps for itself, by `federation.personal`."""
+
+    model: str  # region whose model it is
+    region: str  # whose test frames
+    task: str
+    measure: str
+    estimate: Estimate  # the interval is over scenes
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Paired difference of a measure on the same test frames: `arm` at `stage` minus `before_arm` at its stage."""
+
+    name: str
+    arm: str
+    stage: str
+    before_arm: str
+    before_stage: str
+    region: str
+    task: str
+    estimate: Estimate  # as in `Test`
+    over_scenes: Estimate  # of the first training; the interval is over scenes alone
+    spread: Spread | None  # as in `Test`
+    retrained: tuple[float, ...] = ()  # the difference in each retraining
+    over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # as in `Test`
+    regions: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose mean it is; None: `region` alone
+
+    @property
+    def places(self) -> tuple[str, ...]:
+        """Return the regions that it is of."""
+        return self.regions or (self.region,)
+
+    @property
+    def trainings(self) -> tuple[float, ...]:
+        """Return the difference in each training, the first training's first."""
+        return (self.over_scenes.mean, *self.retrained)
+
+
+@dataclass(frozen=True)
+class HomeCost:
+    """The cost of federated learning in a town of pretraining: a measure there before it and after it, same frames."""
+
+    region: str
+    task: str
+    measure: str
+    before: float  # mean over the run's trainings
+    after: float
+    difference: Estimate  # after - before, paired over scenes; over trainings too, where there are several
+    trainings: int  # of the run itself
+
+
+@dataclass(frozen=True)
+class RunFinding:
+    """The verdict of a run on one claim, or its estimate of a loss."""
+
+    place: str  # region and task
+    question: str
+    verdict: str  # held | did not hold | undecided | estimate
+    sentence: str  # with the numbers behind it
+    kind: Annotated[str | None, LEFT_OUT] = None  # primary | secondary; None: the recipe names no primary claims
+
+    @property
+    def decision(self) -> str:
+        """Return the verdict, with the kind of the claim where it is known."""
+        return self.verdict if self.kind is None else f"{self.verdict}, {self.kind} claim"
+
+
+@dataclass(frozen=True)
+class SweepDetections:
+    """Detections of one network in a sweep, matched to the targets; boxes are in the LiDAR frame."""
+
+    boxes: tuple[tuple[float, ...], ...]  # x y z length width height yaw [m, rad]; without those of neutral objects
+    hit: tuple[bool, ...]  # whether each box matches a target
+    found: tuple[bool, ...]  # whether each target is matched
+
+
+@dataclass(frozen=True)
+class SweepComparison(Saved):
+    """Detections of two networks in the same test sweep."""
+
+    frame: int  # number in its dataset
+    targets: tuple[tuple[float, ...], ...]  # boxes as in `SweepDetections`
+    before: SweepDetections
+    after: SweepDetections

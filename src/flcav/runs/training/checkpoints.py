@@ -1,0 +1,344 @@
+"""Checkpoints of a federation: what it writes after each round, to go on from, and the network that it comes to.
+
+A record has the SHA-256 of each file that belongs to it. The last two are kept, so that one damaged file costs one
+round.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import re
+import tempfile
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.numpy import load_file, save
+
+from flcav.config import InputError, Json, read_json
+from flcav.federation.privacy import Privacy, Secret
+from flcav.federation.state import FederationState, RoundRecord, describe_empty, describe_failures
+from flcav.federation.strategies.fedavg import average
+from flcav.federation.trainable import Weights
+from flcav.interface.progress import DAMAGED, Report
+from flcav.network.ledger import BudgetExceeded, Ledger
+from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
+from flcav.perception.weights import from_arrays, save_network, to_arrays
+from flcav.runs.results.saved import LEDGER, WEIGHTS
+from flcav.runs.results.training import PrivacySpent, diverges
+from flcav.storage.files import flush_all, sha256, write_bytes, write_in_pieces, write_json
+from flcav.storage.records import Record
+
+LOSS = "loss"  # begins the note of a round
+
+
+@dataclass
+class FederationCheckpoints:
+    """Checkpoints of a federation: weights, loss, ledger and states after each round, to resume from."""
+
+    task: Task
+    folder: Path
+    book: Ledger
+    report: Report
+    states: Mapping[str, FederationState]  # what federations keep, by name, restored in place; also of edge servers
+    identity: str  # what the federation is by: a checkpoint of another one is refused
+    rounds: int = 0  # of the federation, told with each
+    privacy: Privacy | None = None  # of the updates, whose delta is told with epsilon
+    score: Callable[[int], Mapping[str, float]] | None = None  # on validation frames after a round, by region
+    losses: list[float | None] = field(default_factory=list)  # of each round
+    scores: list[Mapping[str, float]] = field(default_factory=list)
+    _hashes: dict[str, str] = field(default_factory=dict)  # of the files of weights, by name
+    _told: dict[str, int] = field(default_factory=dict)  # of how many records failures were told, by state
+    _goes_on: bool = False  # after rounds that were carried out before, to an end that it has not reached
+
+    def resume(self, weights: Weights) -> tuple[Weights, int]:
+        """Return the last round's weights, in the order of `weights`, and number, restoring ledger, losses and states.
+
+        Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
+        the checkpoint of another strategy, and where the last two are damaged.
+        """
+        found, damage = find_checkpoint(self.folder)
+        number = 0 if found is None else found.round
+        if damage:
+            self.report(number, max(number, 1), damage)
+        self._goes_on = bool(damage) or (found is not None and not (self.folder / LEDGER).exists())
+        if found is None:
+            return weights, 0
+        if found.by != self.identity:
+            raise InputError(f"{self.folder}: a checkpoint of {found.by}, which {self.identity} cannot go on with")
+        kept = Ledger.load(self.folder / _ledger_name(number)).entries[: found.entries]
+        for entry in kept[len(self.book.entries) :]:
+            self.book.enter(entry)
+        self.losses, self.scores = [*found.losses], [*found.scores]
+        state, names = _state_name(number), [round_path(self.folder, each).name for each in range(1, number + 1)]
+        self._hashes = {name: found.sha256[name] for name in names}
+        arrays = load_file(self.folder / state) if state in found.sha256 else {}
+        for name, own in self.states.items():
+            begins = f"{name}|"
+            mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
+            own.restore(mine, found.records[name])
+            self._told[name] = len(own.records)
+        last = load_file(round_path(self.folder, number))
+        return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
+
+    def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
+        """Restore the secrets of the parties of each state, by its name, or draw them before the first round.
+
+        To be called after `resume`. They are kept in a file, so that a round that is repeated has the same noise;
+        `finish` removes it. Raises `InputError` where it is damaged, or missing though secrets were drawn.
+        """
+        asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
+        if not asked:
+            return
+        kept = read_secrets(self.folder, asked, self._goes_on)
+        for key, (name, party) in asked.items():
+            if key in kept:
+                self.states[name].secrets[party] = kept[key]
+        drawn = {key: self.states[name].keep_secret(party) for key, (name, party) in asked.items()}
+        write_secrets(self.folder, drawn)
+
+    @contextlib.contextmanager
+    def refusals(self) -> Iterator[None]:
+        """Remove the secrets where the federation is refused within the context, so that it never goes on.
+
+        That is before it has sent an update; later only where it would exceed a budget, since damaged data can be made
+        good.
+        """
+        begun = len(self.book.entries)
+        try:
+            yield
+        except InputError as error:
+            used = bool(self.losses) or any(entry.direction == "up" for entry in self.book.entries[begun:])
+            if not used or isinstance(error, BudgetExceeded):
+                remove_secrets(self.folder, used=used)
+            raise
+
+    def save(self, round_: int, weights: Weights, loss: float | None) -> None:
+        """Save the checkpoint after a round, and report its loss, privacy, scores and failures."""
+        self.losses.append(loss)
+        self._write(round_path(self.folder, round_).name, save(dict(weights)), self._hashes)
+        self.scores += [self.score(round_)] if self.score is not None else []
+        arrays = {f"{name}|{key}": array for name, own in self.states.items() for key, array in own.to_arrays().items()}
+        hashes = dict(self._hashes)
+        if arrays:
+            self._write(_state_name(round_), save(arrays), hashes)
+        self.book.save(self.folder / _ledger_name(round_))
+        hashes[_ledger_name(round_)] = sha256(self.folder / _ledger_name(round_))
+        records = {name: tuple(own.records) for name, own in self.states.items()}
+        done = (round_, len(self.book.entries), tuple(self.losses), self.identity, hashes, records)
+        Checkpoint(*done, tuple(self.scores)).keep(self.folder)
+        for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
+            (self.folder / name).unlink(missing_ok=True)
+        note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
+        note += ["the training diverges"] if diverges(self.losses) else []
+        note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self.score else {}).items()]
+        self.report(round_, self.rounds, ", ".join([*note, *self._tell_failures()]))
+
+    def _tell_privacy(self) -> list[str]:
+        """Return the largest epsilon after the last round, in words, with its delta and limit; none without noise."""
+        spent = [own.records[-1].epsilon for own in self.states.values() if own.records]
+        private = [epsilon for epsilon in spent if epsilon is not None]
+        if self.privacy is None or not private:
+            return []
+        return [PrivacySpent(max(private), self.privacy.delta, self.privacy.seeded).describe()]
+
+    def _tell_failures(self) -> list[str]:
+        """Return which rounds since the last note are empty, and who failed or was lost, in words.
+
+        Those of stage III are all rounds of edge servers.
+        """
+        records = [record for name, own in self.states.items() for record in own.records[self._told.get(name, 0) :]]
+        self._told = {name: len(own.records) for name, own in self.states.items()}
+        told = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
+        return [each for each in told if each]
+
+    def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
+        write_bytes(self.folder / name, data)
+        hashes[name] = hashlib.sha256(data).hexdigest()
+
+    def finish(self, start: Any, averaged: int, start_share: float = 0.0) -> tuple[float | None, ...]:
+        """Write the ledger and the final weights, see `load_round_network`; return the loss of each round.
+
+        Without rounds the weights are those of `start`. Secrets are removed.
+        """
+        network, rounds = start, len(self.losses)
+        if rounds:
+            network = load_round_network(self.task, start, self.folder, rounds, averaged, start_share)
+        save_network(self.task, network, self.folder / WEIGHTS)
+        self.book.save(self.folder / LEDGER)
+        remove_secrets(self.folder)
+        return tuple(self.losses)
+
+
+def _state_name(round_: int) -> str:
+    return f"state{round_}.safetensors"
+
+
+def _ledger_name(round_: int) -> str:
+    return f"ledger{round_}.parquet"
+
+
+def round_path(folder: Path, round_: int) -> Path:
+    """Return the file of a federation's weights after a round."""
+    return folder / f"round{round_}.safetensors"
+
+
+def load_round_network(
+    task: Task[ConfigT, NetworkT, SampleT],
+    start: NetworkT,
+    folder: Path,
+    round_: int,
+    averaged: int,
+    start_share: float = 0.0,
+) -> NetworkT:
+    """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights.
+
+    `start_share` of it are the weights of the network `start` that the federation began with, as in Wortsman et al.,
+    Robust fine-tuning of zero-shot models, CVPR 2022, equation 1.
+    """
+    last = range(max(round_ - averaged, 0) + 1, round_ + 1)
+    first, rounds = to_arrays(start), [load_file(round_path(folder, number)) for number in last]
+    parts = [first, *({name: own[name] for name in first} for own in rounds)]  # files order names otherwise
+    config: Any = start.config
+    network = task.build(config)
+    from_arrays(network, average(parts, [start_share, *((1 - start_share) / len(last) for _ in last)]))
+    return network.eval()
+
+
+LAST, BEFORE = "round.json", "round-before.json"  # the last checkpoint, and the one before
+OWN = "own_sha256"  # of all other fields of the record
+
+
+@dataclass(frozen=True)
+class Checkpoint(Record):
+    """The checkpoint of a federation after a round."""
+
+    round: int
+    entries: int  # of the ledger then
+    losses: tuple[float | None, ...]  # of each round
+    by: str  # what the federation is by: strategy and rules
+    sha256: Mapping[str, str]  # of each file, by name: weights of all rounds, ledger, and state where there is any
+    records: Mapping[str, tuple[RoundRecord, ...]] = field(default_factory=dict)  # of the rounds, by federation
+    scores: tuple[Mapping[str, float], ...] = ()  # on validation frames after each round, by region
+
+    def find_damage(self, folder: Path) -> str | None:
+        """Return the name of a file that is missing or not what was written; None where all are whole."""
+        for name, known in self.sha256.items():
+            if not (folder / name).exists() or sha256(folder / name) != known:
+                return name
+        return None
+
+    def keep(self, folder: Path) -> None:
+        """Write the checkpoint; the last one becomes the one before."""
+        if (folder / LAST).exists():
+            write_bytes(folder / BEFORE, (folder / LAST).read_bytes())
+        values = self.as_json()
+        write_json(folder / LAST, values | {OWN: hash_json(values)}, sort=False)
+
+    @classmethod
+    def read(cls, folder: Path, name: str) -> "Checkpoint":
+        """Return the checkpoint that `keep` wrote; raises `InputError` where it is another now."""
+        values = read_json(folder / name)
+        known = values.pop(OWN, None) if isinstance(values, dict) else None
+        if known != hash_json(values):
+            raise InputError(f"{folder / name} {DAMAGED}")
+        return cls.from_json(values, str(folder / name))
+
+
+def hash_json(values: Json) -> str:
+    """Return the SHA-256 of a JSON value, whatever the order of its keys."""
+    return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
+
+
+def find_checkpoint(folder: Path) -> tuple[Checkpoint | None, str]:
+    """Return the last checkpoint of which nothing is damaged, and a sentence about those that are; "" where none is.
+
+    None means the beginning: there is no checkpoint, or the first is damaged. Raises `InputError` where the last two
+    are.
+    """
+    told = []
+    for name in (LAST, BEFORE):
+        if not (folder / name).exists():
+            continue
+        try:
+            found = Checkpoint.read(folder, name)
+            damaged = found.find_damage(folder)
+        except InputError:
+            damaged = name
+        else:
+            if damaged is None:
+                return found, "; ".join(told)
+        told.append(f"{folder / damaged} {DAMAGED}, the checkpoint before it is used")
+    if len(told) == 2:
+        raise InputError(f"{folder}: the last two checkpoints are damaged; remove the folder to begin anew")
+    return None, "; ".join(told)
+
+
+SECRETS, SECRETS_HASH, PART = "secrets.safetensors", "secrets.sha256", ".secrets."
+HASH = re.compile(rb"[0-9a-f]{64}")
+
+
+def read_secrets(folder: Path, names: Collection[str], begun: bool) -> dict[str, Secret]:
+    """Return the secrets of a federation, by name: none before they are drawn.
+
+    `names` are those that it needs; `begun` says that it has sent messages, which the hash says, too. Raises
+    `InputError` where the file or its hash is not what was written, or lacks secrets although they were drawn.
+    """
+    path, known = folder / SECRETS, folder / SECRETS_HASH
+    written = known.read_bytes() if known.exists() else None
+    if written is not None and not HASH.fullmatch(written):
+        raise _lost(known, "is damaged")
+    if written is not None and path.exists() and written != sha256(path).encode():
+        raise _lost(path, f"is damaged, or {SECRETS_HASH} beside it")
+    try:
+        kept = load_file(path) if path.exists() else {}
+    except SafetensorError:
+        raise _lost(path, "is damaged") from None
+    if (begun or written is not None) and not kept.keys() >= {*names}:
+        raise _lost(path, "is missing or not complete")
+    return {name: np.asarray(array, np.uint8) for name, array in kept.items()}
+
+
+def _lost(path: Path, why: str) -> InputError:
+    return InputError(f"{path} {why}: a round that is repeated would have other noise; remove the folder to begin anew")
+
+
+def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
+    """Write the secrets of a federation, by name, to a file that only its owner may read; then the file's hash.
+
+    Where there is a hash, both were written before, and stay as they are: `read_secrets` has compared them. Raises
+    `InputError` where somebody else has written others since.
+    """
+    if (folder / SECRETS_HASH).exists():
+        return
+    folder.mkdir(parents=True, exist_ok=True)
+    file, name = tempfile.mkstemp(prefix=PART, dir=folder)  # that nobody else may read
+    os.close(file)
+    try:
+        write_in_pieces(Path(name), save(dict(secrets)))
+        flush_all([Path(name)])
+        with contextlib.suppress(FileExistsError):
+            os.link(name, folder / SECRETS)  # where a rename would replace the file of another process
+    finally:
+        Path(name).unlink()
+    flush_all([folder])
+    kept = load_file(folder / SECRETS)
+    if kept.keys() != secrets.keys() or not all(np.array_equal(kept[each], secrets[each]) for each in kept):
+        raise InputError(f"{folder / SECRETS}: of another process, which federates here at the same time")
+    write_bytes(folder / SECRETS_HASH, sha256(folder / SECRETS).encode())
+
+
+def remove_secrets(folder: Path, *, used: bool = False) -> None:
+    """Remove the secrets of a federation that has ended, or was refused.
+
+    Where they are `used`, and the federation is not at its end, their hash stays: alone it means that they are gone, so
+    that no round is repeated with others.
+    """
+    if not used:
+        (folder / SECRETS_HASH).unlink(missing_ok=True)
+    for path in (folder / SECRETS, *folder.glob(f"{PART}*")):  # the latter of processes that were killed
+        path.unlink(missing_ok=True)

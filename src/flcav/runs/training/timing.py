@@ -1,0 +1,91 @@
+"""Time that clients train in a round, measured where they train and kept beside the checkpoints of their federation.
+
+It is CPU time: that of a machine on which nothing else runs. No result depends on it.
+"""
+
+import contextlib
+import os
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from flcav.federation.trainable import Trainable, Update, Weights, count_samples
+from flcav.runs.results.saved import Saved
+
+TIMES = "train_s.csv"  # in the folder of a federation
+
+
+@dataclass(frozen=True)
+class TrainTimes(Saved):
+    """Times of local training, and the speeds of vehicles, as a run recipe has them."""
+
+    train_s: Mapping[str, float]  # by task: median of all trainings of all vehicles [s]
+    vehicle_train_s: Mapping[str, Mapping[str, float]]  # by task and "region/vehicle": median of its own trainings [s]
+    speed: Mapping[str, Mapping[str, float]]  # by region and vehicle: train_s over its own, each summed over its tasks
+
+
+@dataclass(frozen=True)
+class TimedClient:
+    """A client that appends the CPU time of each of its trainings [s] to a file."""
+
+    name: str
+    client: Trainable
+    path: Path
+
+    def train(self, weights: Weights, **how: Any) -> Update:
+        """Return the client's update."""
+        begun = time.process_time()
+        update = self.client.train(weights, **how)
+        spent = time.process_time() - begun
+        with contextlib.suppress(OSError), self.path.open("a") as file:  # a full disk is the checkpoint's to tell
+            file.write(f"{self.name},{spent:.6f}\n")
+        return update
+
+    def count_samples(self, steps: int) -> int:
+        """Return the client's number of samples; raises TypeError of a client that does not count them."""
+        return count_samples(self.client, steps)
+
+
+def time_clients(clients: Mapping[str, Trainable], folder: Path) -> dict[str, TimedClient]:
+    """Return clients whose times of training are kept in `folder`; a line there that was cut off is removed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = (folder / TIMES).resolve()  # actors may have another working directory
+    if path.exists():
+        os.truncate(path, path.read_bytes().rfind(b"\n") + 1)
+    return {name: TimedClient(name, client, path) for name, client in clients.items()}
+
+
+def read_times(folder: Path) -> dict[str, list[float]]:
+    """Return the times of all trainings of a federation by client [s]; none where they were not measured."""
+    if not (folder / TIMES).exists():
+        return {}
+    times: dict[str, list[float]] = {}
+    *whole, _ = (folder / TIMES).read_text().split("\n")  # a line that is cut off was being written at a kill
+    for line in whole:
+        name, _, spent = line.rpartition(",")
+        times.setdefault(name, []).append(float(spent))
+    return times
+
+
+def summarise_times(measured: Mapping[str, Mapping[str, Sequence[float]]]) -> TrainTimes:
+    """Return medians and speeds of the times of trainings [s] by task and client, "region/vehicle".
+
+    A vehicle of speed 0.5 takes twice the `train_s` for a round. Tasks without a training are left out.
+    """
+    own = {
+        task: {name: float(np.median(times)) for name, times in sorted(clients.items())}
+        for task, clients in measured.items()
+        if clients
+    }
+    typical = {task: float(np.median([spent for times in measured[task].values() for spent in times])) for task in own}
+    speed: dict[str, dict[str, float]] = {}
+    for client in sorted({name for clients in own.values() for name in clients}):
+        tasks = [task for task in own if client in own[task]]
+        region, _, vehicle = client.rpartition("/")
+        taken = sum(own[task][client] for task in tasks)
+        speed.setdefault(region, {})[vehicle] = sum(typical[task] for task in tasks) / taken
+    return TrainTimes(typical, own, speed)

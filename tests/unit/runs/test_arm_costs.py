@@ -1,0 +1,86 @@
+"""What arms cost and gain, against the committed results of the demo, read as plain JSON."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from matplotlib.text import Annotation
+
+from flcav.report import style
+from flcav.report.charts import figures
+from flcav.report.pages import html
+from flcav.report.pages.run_page import page
+from flcav.runs.analysis.costs import list_arm_costs
+from flcav.runs.results.run import Run
+
+DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
+
+
+@pytest.fixture(scope="module")
+def run() -> Run:
+    return Run.load(DEMO, "results.json")
+
+
+def test_costs_are_those_of_ledgers_and_tests(run: Run):
+    raw = json.loads((DEMO / "results.json").read_text())
+    rows = {row.arm: row for row in list_arm_costs(run)}
+    assert [*rows] == [*raw["arms"]] == ["main", "densest", "ideal"]
+    for name, row in rows.items():
+        regions = ["grid", "ring"] if name == "main" else ["grid"]
+        last = "cloud" if name == "main" else "edge"
+        after = [
+            each["estimate"]
+            for each in raw["tested"]
+            if each["arm"] == name and each["stage"] == last and each["region"] in regions
+        ]
+        before = [
+            each["estimate"]["mean"]
+            for each in raw["tested"]
+            if each["stage"] == "pretrain" and each["region"] in regions
+        ]
+        sent = {"wireless": 0.0, "wireline": 0.0}
+        for each in raw["arms"][name]["spent"]:
+            sent[each["link"]] += each["mb"] * (each["stage"] != "pretrain")
+        gain = np.mean([each["mean"] for each in after]) - np.mean(before)
+        assert (row.regions, row.stage, row.epsilon) == (tuple(regions), last, None)
+        assert (row.wireless_mb, row.wireline_mb) == pytest.approx((sent["wireless"], sent["wireline"]))
+        assert row.gain == pytest.approx(gain)
+        assert row.gain_per_mb == pytest.approx(gain / (sent["wireless"] + sent["wireline"]))
+        assert row.after.low is not None
+        half = np.sqrt(np.sum([(each["mean"] - each["low"]) ** 2 for each in after])) / len(after)
+        assert row.after.low == pytest.approx(row.after.mean - half)
+    assert (rows["main"].edge_rounds, rows["main"].cloud_rounds, rows["ideal"].cloud_rounds) == (5, 1, 0)
+
+
+def test_the_report_has_a_table_of_arms_and_one_of_many_undecided_claims(run: Run):
+    shown = html.render(page(run), {"gain": b""})
+    assert "Cost and gain of each arm" in shown
+    assert f"<td>{list_arm_costs(run)[0].gain:+.3f}</td>" in shown
+    undecided = [each for each in run.findings if each.verdict == "undecided"]
+    assert len(undecided) > 3
+    assert "Claims that this run leaves undecided" in shown
+    assert shown.count('class="badge undecided"') == 0
+    assert shown.count('<li><span class="badge') == len(run.findings) - len(undecided)
+
+
+def test_names_of_arms_keep_apart():
+    rows = [
+        {
+            "arm": name,
+            "measure": "AP50",
+            "mb": mb,
+            "before": 0.5,
+            "score": score,
+            "low": score - 0.1,
+            "high": score + 0.1,
+        }
+        for name, mb, score in (("main", 30.0, 0.6), ("other", 30.0, 0.6), ("third", 12.0, 0.6), ("bare", 30.2, 0.61))
+    ]
+    figure = figures.gains({"objects": rows})
+    assert style.png(figure)[:4] == b"\x89PNG"
+    names = {text.get_text(): text.xy for text in figure.axes[0].texts if isinstance(text, Annotation)}
+    assert names.keys() == {"main", "other", "third", "bare"}
+    heights = sorted(names[name][1] for name in ("main", "other", "bare"))
+    low, high = figure.axes[0].get_ylim()
+    assert min(np.diff(heights)) > 0.06 * (high - low)

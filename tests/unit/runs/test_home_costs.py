@@ -1,0 +1,77 @@
+"""What federated learning costs in the town of pretraining, from outcomes per frame."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from flcav.perception.metrics import Matches
+from flcav.perception.objects.evaluate import CLASSES, HIDDEN, KEPT
+from flcav.perception.outcomes import Outcomes, as_measurable, count_once, difference, further_measures
+from flcav.perception.tasks import TASKS, task_named
+from flcav.runs.analysis.costs import list_home_costs, tell_gain
+from flcav.runs.results.run import Run
+from flcav.runs.results.tests import HomeCost
+from flcav.runs.running import RESULTS
+from flcav.statistics.estimates import Estimate
+
+RUNS = Path(__file__).parents[3] / "reproductions" / "runs"
+OBJECTS = task_named("objects")
+
+
+def outcomes(found: dict[str, float]) -> Outcomes:
+    """Return outcomes of 24 frames of 8 scenes with two cars each, a share of which is found by kind of overlap."""
+    rng = np.random.default_rng(5)
+    arrays = {CLASSES: np.array(["Car"]), HIDDEN: np.zeros(1, dtype=np.int64)}
+    chance, score = rng.random(48), np.sort(rng.random(48))[::-1]
+    for key in KEPT:
+        hit = chance < found[key]
+        columns = {"frame": np.repeat(np.arange(24), 2), "score": score, "hit": hit, "targets": np.full(24, 2)}
+        fields = {name: columns.get(name, np.zeros(48)) for name in Matches.__dataclass_fields__}
+        arrays |= {f"Car/{key}/{name}": value for name, value in fields.items()}
+    return Outcomes(np.repeat([f"scene {n}" for n in range(8)], 3), arrays)
+
+
+def test_the_further_measure_of_objects_is_their_ap70_with_a_paired_interval() -> None:
+    before, after = (outcomes({"3d50": 0.9, "bev50": 0.9, "3d70": share}) for share in (0.8, 0.3))
+    ((name, measure),) = further_measures(OBJECTS).items()
+    assert count_once(measure, before) == as_measurable(OBJECTS).numbers(before)[name]
+    mean, low, high = difference(OBJECTS, before, after, 1, measure)
+    assert mean == pytest.approx(count_once(measure, after) - count_once(measure, before))
+    assert low is not None
+    assert high is not None
+    assert low < mean < high < 0
+    assert difference(OBJECTS, before, after, 1)[0] == 0  # the task's own measure
+
+
+def test_tasks_without_further_measures_have_none() -> None:
+    assert {name for name in TASKS if further_measures(task_named(name))} == {"objects"}
+
+
+def test_results_tell_the_cost_of_every_measure_at_home() -> None:
+    run = Run.load(RUNS / "demo_road", RESULTS)
+    own, further = list_home_costs(replace(run, home=None))
+    assert (own.region, own.measure, own.trainings) == ("suburb", "AP50", 1)
+    assert own.difference == next(each.estimate for each in run.differences if each.region == "suburb")
+    assert (further.measure, further.difference.low) == ("AP70", None)
+    assert further.difference.mean == pytest.approx(further.after - further.before)
+    assert further.difference.mean < -0.4
+    kept = HomeCost("suburb", "objects", "AP70", 0.5, 0.1, Estimate(-0.4, -0.5, -0.3), 3)
+    assert list_home_costs(replace(run, home=(kept,))) == [own, kept]
+    again = Run.from_json(replace(run, home=(kept,)).as_json(), "again")
+    assert again.home == (kept,)
+
+
+def test_two_sentences_tell_the_gain_its_megabytes_and_its_cost_at_home() -> None:
+    run = Run.load(RUNS / "demo_road", RESULTS)
+    gain, cost = tell_gain(run)
+    tests = {(test.stage, test.region): test.estimate.mean for test in run.tested if test.arm == "main"}
+    for number in (
+        *(np.mean([tests[stage, region] for region in ("grid", "ring")]) for stage in ("pretrain", "cloud")),
+    ):
+        assert f"{number:.3f}" in gain
+    links = run.arms["main"].links
+    assert all(f"{use.used_mb:.1f} MB of {link} uplink" in gain for link, use in links.items())
+    assert f"AP50 from {tests['pretrain', 'suburb']:.3f} to {tests['cloud', 'suburb']:.3f}" in cost
+    assert "AP70 from" in cost
