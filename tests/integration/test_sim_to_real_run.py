@@ -6,9 +6,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from reproduction_pages import TABLES
 
 from flcav.cli.main import run
+from flcav.experiments.experiment import load_experiment
 from flcav.reproductions.sim_to_real import run as sim_to_real
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "kitti_frame"
@@ -63,7 +63,7 @@ def test_it_runs_with_the_shipped_weights(
     returns = len(np.fromfile(kitti / "training" / "velodyne" / f"{name}.bin", np.float32)) / 4
     assert all(clouds[each]["returns"] > 0 for each in clouds)
     assert clouds["KITTI"]["returns"] <= returns
-    assert set(TABLES["sim-to-real"](results, "result.json")) == {"detections", "cars", "clouds"}
+    assert set(load_experiment("sim-to-real").tabulate(results, "result.json")) == {"detections", "cars", "clouds"}
     assert (tmp_path / "clouds.png").read_bytes()[:4] == (tmp_path / f"{name}.png").read_bytes()[:4] == b"\x89PNG"
     if made == "real":
         assert scores["Car", "3d", 0.5]["found"] >= labels.count("Car") / 2

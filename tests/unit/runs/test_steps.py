@@ -313,7 +313,7 @@ def test_steps_of_a_module_that_has_moved_are_named_and_kept_where_asked(own, tm
     told(chain(own)[:2], out)
     for path in out.glob("*/*.json"):  # as an earlier version wrote them
         values = json.loads(path.read_text())
-        code = {name.replace("own_steps", "flcav.runs.stages.own"): own for name, own in values["code"].items()}
+        code = {name.replace("own_steps", "flcav.pipeline.steps.own"): own for name, own in values["code"].items()}
         path.write_text(json.dumps(values | {"code": code, "fingerprint": "of pipeline", "lineage": "of pipeline"}))
     with pytest.raises(InputError, match="did apart, learn by an earlier flcav, whose steps have moved since; choose"):
         told(chain(own), out)
