@@ -56,7 +56,7 @@ class MeteredGrid(LinkGrid):
     """Grid that meters another one, holds its nodes to the budget, and loses those that the network loses.
 
     Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget
-    stays with its node: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost in a round
+    is neither handed on nor entered: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost in a round
     are answered for, with the reason as an error. Nothing reaches a node that is not there; the bytes of an update that
     broke off are entered as far as they came; what comes before training, such as keys, arrives. A node whose update
     will break off gets a note of it with the message, in the place of the acknowledgement that it would miss later.
@@ -107,6 +107,7 @@ class MeteredGrid(LinkGrid):
             counts = reply.has_content() and self.names[node] not in self._account.within
             if counts:
                 number, size = _round(asked[node]), wire_bytes(reply.content)
+                # refused before the downlink that waits is entered; `_enter` checks again
                 self._account.ledger.check(self._account.describe("up", number, self.names[node], size))
             open_.remove(node)
             if node in waiting:

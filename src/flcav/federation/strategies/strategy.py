@@ -25,7 +25,11 @@ class Strategy(Protocol):
 
 @runtime_checkable
 class Stateful(Protocol):
-    """A strategy with state between rounds: arrays by name, which the server keeps and which are checkpointed."""
+    """A strategy with state between rounds: a flat mapping of finite arrays by name, kept and checkpointed by the server.
+
+    Rounds call `step` in place of `combine`, which such a strategy has as well. Keep nothing on `self`: it is in no
+    checkpoint, and outlives the federation.
+    """
 
     def step(
         self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
