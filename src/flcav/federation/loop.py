@@ -129,11 +129,12 @@ def federate(
     In each round every client trains, unless `rules` say otherwise, and `strategy` combines their updates (McMahan et
     al., AISTATS 2017, algorithm 1). To resume, pass the same clients, strategy, rules and schedule (its `rounds` are
     those of the whole federation, on which a decaying learning rate depends), the weights and the number of the last
-    round that `on_round` was given, and the state after it; a `Stateful` strategy begins anew without it. Noise that is not seeded is drawn by secrets, which are
-    kept in `state`: without it a federation cannot be repeated, nor resumed to the same weights. Under a privacy
-    budget the last rounds are those that it affords; without noise it is that for all of them. Where epsilon rests on
-    secret draws of clients, records and ledger do not name them. A round in which no client has samples leaves the
-    weights as they are and is marked `empty`; `rules.empty_rounds` of them in a row are the last.
+    round that `on_round` was given, and the state after it; a `Stateful` strategy begins anew without it. Noise that is
+    not seeded is drawn by secrets, which are kept in `state`: without it a federation cannot be repeated, nor resumed
+    to the same weights. Under a privacy budget the last rounds are those that it affords; without noise it is that for
+    all of them. Where epsilon rests on secret draws of clients, records and ledger do not name them. A round in which
+    no client has samples leaves the weights as they are and is marked `empty`; `rules.empty_rounds` of them in a row
+    are the last.
 
     Args:
         clients: by name; a client is asked for when it is to train, and of updates no more are in memory than the

@@ -55,11 +55,12 @@ def open_account() -> Account:
 class MeteredGrid(LinkGrid):
     """Grid that meters another one, holds its nodes to the budget, and loses those that the network loses.
 
-    Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget
-    is neither handed on nor entered: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost in a round
-    are answered for, with the reason as an error. Nothing reaches a node that is not there; the bytes of an update that
-    broke off are entered as far as they came; what comes before training, such as keys, arrives. A node whose update
-    will break off gets a note of it with the message, in the place of the acknowledgement that it would miss later.
+    Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget is
+    neither handed on nor entered: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost
+    in a round are answered for, with the reason as an error. Nothing reaches a node that is not there; the bytes of an
+    update that broke off are entered as far as they came; what comes before training, such as keys, arrives. A node
+    whose update will break off gets a note of it with the message, in the place of the acknowledgement that it would
+    miss later.
     """
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:

@@ -25,7 +25,7 @@ class Strategy(Protocol):
 
 @runtime_checkable
 class Stateful(Protocol):
-    """A strategy with state between rounds: a flat mapping of finite arrays by name, kept and checkpointed by the server.
+    """A strategy with state between rounds: finite arrays by name, which the server keeps and which are checkpointed.
 
     Rounds call `step` in place of `combine`, which such a strategy has as well. Keep nothing on `self`: it is in no
     checkpoint, and outlives the federation.
