@@ -116,7 +116,10 @@ def load_experiment(name: str) -> Experiment:
         raise InputError(
             f"reproduce '{name}': neither a folder with a run.py nor one of {', '.join(known)}{suggest(name, known)}"
         )
-    loaded = _import_own(folder) if (place := _place(folder)) is None else importlib.import_module(place)
+    try:
+        loaded = _import_own(folder) if (place := _place(folder)) is None else importlib.import_module(place)
+    except ModuleNotFoundError as error:
+        raise InputError(f"{folder / 'run.py'}: needs {error.name}, which is not there") from None
     found = getattr(loaded, "EXPERIMENT", None)
     if not isinstance(found, Experiment):
         raise InputError(f"{folder / 'run.py'}: has no EXPERIMENT, an Experiment of flcav.experiments.experiment")

@@ -1,4 +1,5 @@
-"""The extras of a run, registered here alone: to take one out, delete its folder in `extras` and its lines below.
+"""The extras of a run, registered here alone: to take one out, delete its folder in `extras` and its lines below
+(what else goes with it: CONTRIBUTING.md).
 
 An extra adds fields to the recipe and to the results (the bases of the four classes), and functions where a run calls
 them: `load_all` returns those of a table. They are named as `module:NAME`, since their modules import the stages that
