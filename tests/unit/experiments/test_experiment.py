@@ -34,7 +34,7 @@ def _run(out: Path, options: Options) -> Outcome[Squares]:
     steps = [Step(f"seed{seed}", square, {"seed": seed}) for seed in range(1, options.seeds + 1)]
     with options.show_steps(options.title) as notify:
         values = run_steps(steps, out, **options.how(notify))
-    return Outcome(Squares(tuple(values.values())), {"dot.png": b"PNG"}, ["squared"])
+    return Outcome(Squares(tuple(values[step.name] for step in steps)), {"dot.png": b"PNG"}, ["squared"])
 
 
 def tables(results: Squares) -> dict[str, str]:
