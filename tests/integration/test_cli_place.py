@@ -13,7 +13,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from flcav.cli.main import run
-from flcav.cli.planning import place
+from flcav.cli.planning import place_inputs
 from flcav.optimization.placement import solve
 from flcav.report.charts import figures
 from flcav.world.map.town import Town, load_town
@@ -128,7 +128,7 @@ def test_traffic_of_another_town_is_refused(files, monkeypatch, capsys):
         def town(self) -> Town:
             return load_town("grid")
 
-    monkeypatch.setattr(place.Dataset, "open", lambda folder: OfGrid())
+    monkeypatch.setattr(place_inputs.Dataset, "open", lambda folder: OfGrid())
     assert asked(files, "--data", "drive", "--town", "ring") == 2
     assert capsys.readouterr().err == "flcav: --town ring: the traffic of drive is that of grid\n"
     assert asked(files, "--data", "drive", "--town", "grid") == 0

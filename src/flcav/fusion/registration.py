@@ -25,7 +25,7 @@ from flcav.sensors.frame import Frame
 from flcav.sources.source import Source
 
 PAIR_M = (3.0, 0.8)  # farthest pair of points, in each pass
-MAP_CELL_M = 0.3  # clouds are thinned to a point in each cell of this edge
+CELL_M = 0.3  # clouds are thinned to a point in each cell of this edge
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ def register_clouds(target: NDArray, source: NDArray, target_from_source: Array)
             *clouds,
             init_T_target_source=found,
             registration_type="GICP",
-            downsampling_resolution=MAP_CELL_M,
+            downsampling_resolution=CELL_M,
             max_correspondence_distance=far_m,
             num_threads=1,
         )

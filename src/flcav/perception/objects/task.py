@@ -82,10 +82,12 @@ def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfi
         matched[own[target >= 0]] = True
         missed[objects[target[target >= 0]]] = False
     matched |= on_neutral(found, truth.boxes)
-    rows = zip(annotations.boxes.center, label, truth.returns, annotations.occlusion, annotations.track, missed)
+    rows = zip(
+        annotations.boxes.center.tolist(), label, truth.returns, annotations.occlusion, annotations.track, missed
+    )
     return [
-        PerceptionError(*at.tolist(), 1.0, MISS, str(name), int(returns), float(hidden), frame.scene, str(track))
-        for at, name, returns, hidden, track, lost in rows
+        PerceptionError(x, y, z, 1.0, MISS, str(name), int(returns), float(hidden), frame.scene, str(track))
+        for (x, y, z), name, returns, hidden, track, lost in rows
         if lost
     ]
 
@@ -96,8 +98,8 @@ def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[P
     returns = points_in_boxes(frame.lidar[name], found).sum(1)
     world = transform_points(frame.world_from_sensor(name), found.center)
     return [
-        PerceptionError(*at.tolist(), 1.0, FALSE_POSITIVE, str(label), int(count), float("nan"), frame.scene, "")
-        for at, label, count in zip(world, found.label, returns, strict=True)
+        PerceptionError(x, y, z, 1.0, FALSE_POSITIVE, str(label), int(count), float("nan"), frame.scene, "")
+        for (x, y, z), label, count in zip(world.tolist(), found.label, returns, strict=True)
         if count >= 1
     ]
 

@@ -108,9 +108,9 @@ class _SparseConvolution(torch.autograd.Function):
         return out
 
     @staticmethod
-    def backward(ctx: Any, *convolution_gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, Tensor, None]:
         features, weight = ctx.saved_tensors
-        gradient = convolution_gradients[0].contiguous()
+        gradient = gradients[0].contiguous()
         wants_features = ctx.needs_input_grad[0]
         if ctx.rules.by_target is not None:
             return *_grouped_gradients(features, weight, gradient, ctx.rules, wants_features), None

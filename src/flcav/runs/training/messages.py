@@ -63,7 +63,7 @@ class SharedFrames:
     messages: tuple[bytes, ...]
     samples: SharedSamples
 
-    def send_message(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
+    def send(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
         """Send the frames to a region's vehicles, and the network that they begin with to those who lack it."""
         have = {entry.client for entry in book.entries if (entry.stage, entry.direction) == (EDGE, "down")}
         if lacking := [client for client in clients if client not in have]:

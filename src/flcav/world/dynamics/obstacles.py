@@ -99,7 +99,7 @@ class TownGround:
     def __init__(self, town: Town) -> None:
         """Prepare the sidewalks and decks for queries."""
         self._town = town
-        self._pavement = shapely.union_all([Polygon(outline_actors) for outline_actors in town.sidewalks])
+        self._pavement = shapely.union_all([Polygon(outline) for outline in town.sidewalks])
         shapely.prepare(self._pavement)
         decks = () if town.relief is None else town.relief.decks
         self._decks = [(deck, deck.outline.buffer(EDGE_M)) for deck in decks]
