@@ -360,7 +360,7 @@ def test_the_mesh_of_an_imported_map_is_kept_for_the_next_server(maps, tmp_path,
     (tmp_path / "crossing.xodr").write_text("a")
 
     def start():
-        monkeypatch.setattr(static, "_WORLDS", {})
+        monkeypatch.setattr(static, "_WORLDS", static.TownCache())
         served = Maps(tmp_path).load("crossing")
         world = static.build_static_world(town)
         served.keep()

@@ -54,7 +54,7 @@ def test_units_learn_what_their_own_detector_finds(monkeypatch: pytest.MonkeyPat
     keys = [SimpleNamespace(scene="s", index=number, agent="pole7") for number in (0, 1)]
     split = Frames(cast(Any, SimpleNamespace(frame=lambda _: frame, keys=keys)), (), {7: (0, 1), 8: ()})
     monkeypatch.setattr(roadside, "road_detector", lambda _: lambda _: car)
-    monkeypatch.setattr(roadside, "Ground", lambda _: SimpleNamespace(relief=None, below=lambda _: GROUND_M))
+    monkeypatch.setattr(roadside, "DatasetGround", lambda _: SimpleNamespace(relief=None, below=lambda _: GROUND_M))
     found = label_roadside(split, (7, 8), {("s", 0)}, CONFIG, "grid")
     assert [*found] == ["grid/pole7"]
     (sample,) = found["grid/pole7"]
