@@ -5,6 +5,7 @@ from importlib import import_module
 from pathlib import Path
 
 import numpy as np
+import pytest
 from waiting import read_all_traffic
 
 from flcav.federation.links.flower import start_fleet
@@ -16,6 +17,7 @@ from flcav.network.ledger import Ledger, LinkMegabytes
 CLIENTS = Path(__file__).parents[1] / "deployed"  # `make test-deployed` has the other tests of a fleet
 
 
+@pytest.mark.slow
 def test_a_deployed_round_ends_with_the_embedded_weights(monkeypatch):
     monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(CLIENTS), os.environ.get("PYTHONPATH", "")]).rstrip(":"))
     monkeypatch.syspath_prepend(str(CLIENTS))

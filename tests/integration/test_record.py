@@ -61,6 +61,7 @@ def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
+@pytest.mark.slow
 def test_two_processes_record_the_same_bytes_as_one(recipe: Path, reference: Path, tmp_path: Path):
     command = [*FLCAV, "record", recipe, "--out", tmp_path / "data", "--jobs", "2"]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
@@ -238,6 +239,7 @@ def test_birdseye_draws_the_frame_asked_for(reference: Path, tmp_path: Path, cap
     assert not (tmp_path / "no.png").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["suburb", "grid", "ring", "kitti", "weather", "signs", "signs_suburb", "cooperative"])
 def test_the_recipes_we_ship_run_at_toy_scale(name: str, tmp_path: Path):
     recipe = read_config(Recipe, RECIPES / f"{name}.yaml")

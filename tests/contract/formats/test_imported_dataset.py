@@ -33,6 +33,7 @@ def flcav(capsys: pytest.CaptureFixture[str]) -> Callable[..., str]:
     return call
 
 
+@pytest.mark.slow
 def test_an_imported_dataset_goes_through_all_commands(tmp_path: Path, flcav: Callable[..., str]) -> None:
     record(PaintedSource(SCENES, spins=1, tilted=(1,)), tmp_path / "painted")
     painted = Dataset.open(tmp_path / "painted")
