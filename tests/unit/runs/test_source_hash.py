@@ -154,7 +154,7 @@ STEPS = {
     "frames": recording.record_step,
     "pretraining": centralised.pretrain_step,
     "evaluation": testing.test_step,
-    "stage II": federating.federate_step,
+    "stages II and III": federating.federate_step,
 } | {f"{name}, {part}": getattr(study, part) for name, study in STUDIES.items() for part in ("learn", "test")}
 
 OF_STUDIES = ("objects", "weather")  # modules with what a study trains, or measures beyond its task
@@ -195,7 +195,7 @@ def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
         path.write_text(text)
         return {name for name in STEPS if before[name] != after[name]}
 
-    assert {"pretraining", "stage II", "stage III", "objects, learn"} <= (
+    assert {"pretraining", "stages II and III", "objects, learn"} <= (
         by_loss := changed("perception/objects/loss.py")
     )
     assert by_loss.isdisjoint({"recording", "frames", "weather, learn", "signs, test"})
@@ -213,7 +213,7 @@ def test_everything_that_a_step_loads_of_flcav_and_runs_is_among_what_it_reaches
         from pathlib import Path
         from flcav.experiments.study import record_split
         from flcav.runs.engine import Work
-        from flcav.experiments.splits import record_split
+        from flcav.experiments.study import record_split
         from flcav.runs.engine import Work
         ran = set()
         def trace(frame, event, argument):
