@@ -257,7 +257,7 @@ def test_any_size_of_picture_is_looked_at():
 
 @pytest.mark.slow
 class WithoutAugmentation(SignsTask):
-    def draw_mosaic(self, samples, index, config, rng):
+    def draw(self, samples, index, config, rng):
         return samples[index]
 
 

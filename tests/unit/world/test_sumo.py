@@ -23,8 +23,8 @@ ASK = """
 import sys
 from pathlib import Path
 from flcav.world.traffic.client import Sumo
-from flcav.world.traffic.simulation import Job
-sumo = Sumo(Job(sys.argv[1], 1, {}))
+from flcav.world.traffic.simulation import TrafficJob
+sumo = Sumo(TrafficJob(sys.argv[1], 1, {}))
 print(sumo._process.pid, flush=True)
 sumo.record([int(sys.argv[2])], Path(sys.argv[1]) / "out.npz")
 sumo.close()
