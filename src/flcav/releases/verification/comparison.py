@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import Matches, weighted_precision
-from flcav.perception.metrics.detection import lies_on, on_neutral
+from flcav.perception.metrics.detection import lies_on, match_greedily, on_neutral
 from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.evaluate import BORDER_M, OCCLUSIONS
 from flcav.perception.objects.truth import FrameTruth, select_class
@@ -90,14 +90,7 @@ def match_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[n
 
     least: IoU from which a detection finds a target. inside (T,): targets that can be found. rows (R,), rising.
     """
-    found = np.full(len(rows), -1)
-    free = np.where(inside, each.iou, -1.0)
-    for place, row in enumerate(rows if inside.any() else ()):
-        best = int(free[row].argmax())
-        if free[row, best] >= least:
-            found[place] = best
-            free[:, best] = -1.0
-    return found
+    return match_greedily(np.where(inside, each.iou, -1.0), least, rows)[rows]
 
 
 def _match_frame(
