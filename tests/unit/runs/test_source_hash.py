@@ -195,9 +195,7 @@ def test_an_edit_of_flcav_makes_stale_what_it_should(tmp_path):
         path.write_text(text)
         return {name for name in STEPS if before[name] != after[name]}
 
-    assert {"pretraining", "stages II and III", "objects, learn"} <= (
-        by_loss := changed("perception/objects/loss.py")
-    )
+    assert {"pretraining", "stages II and III", "objects, learn"} <= (by_loss := changed("perception/objects/loss.py"))
     assert by_loss.isdisjoint({"recording", "frames", "weather, learn", "signs, test"})
     assert {"recording", "frames"} <= changed("sensors/lidar/lidar.py")
     for drawing in (copy / "report").glob("*.py"):
