@@ -7,39 +7,42 @@ unexport PYTHONDONTWRITEBYTECODE # each of many processes would compile all modu
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: demo test test-runs test-carla test-deployed test-peers test-ray lint docs check bench bench-peers format clean
-demo: $(STAMP)
+.PHONY: help demo test test-runs test-carla test-deployed test-peers test-ray lint docs check bench bench-peers format clean
+help: # Print the targets with what they do
+	@sed -n 's/^\([a-z-]*\):[^#]*# /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
+
+demo: $(STAMP) # Run the demo, 15 minutes: out/demo/report.html
 	$(BIN)/flcav demo --out out/demo
 
-test: $(STAMP)
+test: $(STAMP) # Run the tests, 8 minutes on 2 cores
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m "not slow"
 
 # Whole pipelines at toy scale: runs of all recipes and examples, stopped and killed ones, the installed wheel, studies; and
 # the tests that take longest of others: coverage of intervals, optima against all plans, full disks.
-test-runs: $(STAMP)
+test-runs: $(STAMP) # Run whole pipelines at toy scale
 	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder -m slow
 
 # Exports read by other software, in environments of their own below out/peers: docs/formats.md.
-test-peers: $(STAMP)
+test-peers: $(STAMP) # Read exports by other software
 	$(BIN)/python -m pytest -n 0 -rs tests/peers
 
 # Recordings from `flcav carla serve`, and CARLA's own scripts and those of others against it, in an environment of their
 # own, out/carla; they and the maps are in the folder of FLCAV_REAL_DATA, and without it these tests are skipped: docs/carla.md.
-test-carla: $(STAMP)
+test-carla: $(STAMP) # Run CARLA's scripts against `flcav carla serve`
 	$(BIN)/python -m pytest -n 0 -rs tests/carla_clients
 
 # A fleet that is up: its refusals, its kills, its weights; docs/fleet.md. Tests of several hosts make network namespaces,
 # and are skipped where that is not permitted.
-test-deployed: $(STAMP)
+test-deployed: $(STAMP) # Test a fleet that is up
 	$(BIN)/python -m pytest -n 0 -rs tests/deployed
 
 # What runs on Ray beside what runs without it, in an environment of its own with the extra 'ray', below out/ray.
-test-ray:
+test-ray: # Test what runs on Ray
 	test -x out/ray/bin/python || $(PYTHON) -m venv out/ray
 	out/ray/bin/python -m pip install --quiet --constraint constraints.txt --editable ".[dev,fusion,towns,ray]"
 	out/ray/bin/python -m pytest -n 0 -rs -k "on_ray or ray_cluster" tests/integration
 
-lint: $(STAMP)
+lint: $(STAMP) # Check style, layers and types
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
@@ -47,22 +50,22 @@ lint: $(STAMP)
 
 # The site, out/docs/index.html. Only pages that changed are read anew; whatever Sphinx warns of is an error. It installs
 # only where there is nothing yet: an environment that other checkouts share keeps its install.
-docs:
+docs: # Build the site: out/docs/index.html
 	test -x $(BIN)/sphinx-build || $(MAKE) $(STAMP)
 	rm -rf out/docs
 	$(BIN)/python -m sphinx -b html -c docs -d out/doctrees --fail-on-warning --keep-going --quiet . out/docs
 	$(BIN)/python tools/check_site.py out/docs
 
-check: lint docs test
+check: lint docs test # Lint, build the site, run the tests
 
-bench: $(STAMP)
+bench: $(STAMP) # Run all benchmarks
 	for b in benchmarks/bench_*.py; do $(BIN)/python $$b || exit 1; done
 
 # A federated round of pfl and of Flower's simulation beside ours, in an environment below out/peers.
-bench-peers: $(STAMP)
+bench-peers: $(STAMP) # Compare a federated round with pfl and Flower's simulation
 	$(BIN)/python benchmarks/peers/compare.py
 
-format: $(STAMP)
+format: $(STAMP) # Format the code
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
@@ -72,5 +75,5 @@ $(STAMP): pyproject.toml constraints.txt
 	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[carla,dev,docs,fusion,gym,releases,ros,towns]"
 	touch $(STAMP)
 
-clean:
+clean: # Remove .venv and out
 	rm -rf .venv out
