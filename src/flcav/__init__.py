@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from flcav.interface.fields import lazy_names
 
 if TYPE_CHECKING:
+    from flcav import plot
     from flcav.dataset import Dataset, record, validate
     from flcav.federation import federate
     from flcav.geometry import Boxes
@@ -51,6 +52,7 @@ PLACES = {
     "RunRecipe": "flcav.runs",
     "load_run_recipe": "flcav.runs",
     "run": "flcav.runs",
+    "plot": "flcav.plot",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -7,7 +7,10 @@ import subprocess
 import sys
 from pathlib import Path
 
+import nbclient
+import nbformat
 import pytest
+from jupyter_client.manager import AsyncKernelManager
 from PIL import Image
 
 from flcav.cli.main import run as flcav
@@ -29,7 +32,31 @@ def run(name: str, *arguments: object, monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("path", sorted(EXAMPLES.glob("0*")), ids=lambda path: path.name)
 def test_an_example_is_short(path: Path):
-    assert len(path.read_text().splitlines()) <= 90
+    lines = path.read_text().splitlines()
+    if path.suffix == ".ipynb":
+        lines = [line for cell in nbformat.read(path, as_version=4).cells for line in cell.source.splitlines()]
+    assert len(lines) <= 90
+
+
+@pytest.mark.slow
+def test_a_notebook_shows_pictures_and_tables():
+    notebook = nbformat.read(EXAMPLES / "09_notebook.ipynb", as_version=4)
+    kernel = AsyncKernelManager(kernel_name="python3", transport="ipc")
+    place = {"metadata": {"path": str(EXAMPLES.parent)}}
+    nbclient.NotebookClient(notebook, km=kernel, timeout=300, resources=place).execute()
+    shown = [
+        {kind for out in cell.outputs for kind in out.get("data", {})} for cell in notebook.cells if "outputs" in cell
+    ]
+    assert [("image/png" in each, "text/html" in each) for each in shown] == [
+        *(
+            (True, False),
+            (False, True),
+            (True, False),
+            (False, True),
+            (False, True),
+        ),  # town, data, frame, boxes, errors
+        *((False, True), (True, False), (False, True), (True, False)),  # placement, its map, plan, its chart
+    ]
 
 
 @pytest.mark.slow

@@ -1,9 +1,15 @@
 """What `docs/architecture.md` says of files: they are there, a frame's way is short, and the tasks' names are alike."""
 
 import re
+import sys
 from pathlib import Path
+from types import FrameType
+
+import numpy as np
 
 import flcav
+from flcav.federation import LocalUpdate, Schedule, federate
+from flcav.federation.trainable import Weights
 from flcav.perception.tasks import TASKS
 
 PACKAGE = Path(flcav.__file__).parent
@@ -11,10 +17,42 @@ PAGE = (PACKAGE.parents[1] / "docs" / "architecture.md").read_text(encoding="utf
 MOST = 30  # files on the way of a frame
 
 
+def files_of(section: str) -> list[str]:
+    text = PAGE.partition(f"\n## {section}\n")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| \d+ \| (.*?) \|", text, re.MULTILINE)
+    return [name for row in rows for name in re.findall(r"`([\w/]+\.py)`", row)]
+
+
 def test_the_way_of_a_frame_leads_through_few_files_that_are_there():
-    files = re.findall(r"^\| \d+ \| `([\w/.]+)` \|", PAGE, re.MULTILINE)
+    files = files_of("From traffic to the report")
     assert 20 < len(files) <= MOST
     assert [name for name in files if not (PACKAGE / name).is_file()] == []
+
+
+class Vehicle:
+    samples = 1
+
+    def train(self, weights: Weights, **_: object) -> LocalUpdate:
+        return LocalUpdate({name: array + 1 for name, array in weights.items()}, self.samples, 0.0)
+
+
+def test_the_way_of_a_round_is_that_of_a_trace():
+    """A first round imports and compiles what it needs; the second one is traced."""
+    schedule = Schedule(rounds=1, steps=1, learning_rate=0.1, final_learning_rate=0.1, seed=0)
+    entered: set[str] = set()
+
+    def note(frame: FrameType, event: str, _: object) -> None:
+        entered.add(frame.f_code.co_filename)
+
+    before = sys.getprofile()
+    for profile in (before, note):
+        sys.setprofile(profile)
+        try:
+            federate({"cav0": Vehicle(), "cav1": Vehicle()}, {"w": np.zeros(2)}, schedule)
+        finally:
+            sys.setprofile(before)
+    here = {Path(name).relative_to(PACKAGE).as_posix() for name in entered if Path(name).is_relative_to(PACKAGE)}
+    assert here == {*files_of("A round, in the order of a trace")}
 
 
 def test_files_to_start_reading_at_are_there():

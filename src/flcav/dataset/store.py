@@ -41,6 +41,7 @@ from flcav.dataset.payloads import INFRARED, PICTURES, PLANES, POINTS, RADAR, TI
 from flcav.dataset.rows import decode_annotations, decode_vectors, decode_weather
 from flcav.dataset.tables import GNSS_COLUMNS, IMU_COLUMNS, SCHEMAS, TILTS, read_table
 from flcav.geometry import Array
+from flcav.interface.notebook import Displayed
 from flcav.sensors.frame import LONGEST_NAME, CameraImage, Frame, format_key
 from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.map.town import PACKAGED, Town, load_town
@@ -52,7 +53,7 @@ NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")  # of 
 Value = TypeVar("Value")
 
 
-class Dataset:
+class Dataset(Displayed):
     """A recorded dataset: its tables in memory, its measurements read from disk on demand.
 
     >>> from flcav import Dataset
@@ -124,6 +125,9 @@ class Dataset:
 
     def __len__(self) -> int:
         return len(self.keys)
+
+    def __repr__(self) -> str:
+        return f"Dataset({str(self.folder)!r}, {len(self)} frames, {len(self.manifest.scenes)} scenes)"
 
     def numbers(self, frames: Sequence[int] | None) -> Sequence[int]:
         """Return `frames`, or the numbers of all frames for None."""

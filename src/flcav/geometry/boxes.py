@@ -19,13 +19,14 @@ from flcav.geometry.poses import (
     wrap_angle,
     yaw_of,
 )
+from flcav.interface.notebook import Displayed
 
 REACH_SLACK_M = 0.01  # for rounding of points in single precision
 LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
 
 
 @dataclass(frozen=True)
-class Boxes:
+class Boxes(Displayed):
     """N oriented 3D boxes, upright (yaw only) or tilted, in one frame that the owner of the record states.
 
     Raises ValueError where the lengths or shapes of the arrays do not match.

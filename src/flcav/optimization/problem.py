@@ -8,6 +8,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from flcav.config import Config
+from flcav.interface.notebook import Displayed
 from flcav.network.plan import MessageSizes
 from flcav.optimization.curves.curves import (
     STAGES,
@@ -229,7 +230,7 @@ class Budgets(Quantities):
     wireline: Positive  # from edge servers to the cloud
 
 
-class Problem(Quantities):
+class Problem(Displayed, Quantities):
     """An allocation problem: how to split the budgets of both links over tasks and stages.
 
     Construction checks the fields and raises pydantic's ValidationError, which names the field.

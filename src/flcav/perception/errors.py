@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from flcav.arrays import Array, Words
 from flcav.dataset.store import Dataset
+from flcav.interface.notebook import Displayed
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
 from flcav.storage.records import write_any_table
@@ -49,7 +50,7 @@ class PerceptionError:
 
 
 @dataclass(frozen=True)
-class Registry:
+class Registry(Displayed):
     """All registered mistakes of a network on a dataset."""
 
     errors: tuple[PerceptionError, ...]

@@ -15,6 +15,7 @@ from torch import nn
 from flcav.config import DamagedFile, InputError, Json
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
+from flcav.interface.notebook import resumable
 from flcav.interface.progress import Report, print_progress
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import FrameSelection, choose_frames
@@ -71,6 +72,7 @@ class Inference:
         return self.findings
 
 
+@resumable
 def train(
     task: Named,
     data: Data | Sequence[Data],

@@ -14,6 +14,7 @@ from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.links.ros_names import ROS_NAMESPACE
 from flcav.federation.rules import Rules
 from flcav.fusion.average import NavigationErrors, PoseSource
+from flcav.interface.notebook import Displayed
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
 from flcav.runs.registry import RECIPE_CHECKS, ArmFields, FederationFields, LabelFields, RecipeFields, load_all
@@ -373,7 +374,7 @@ class _Drive(Config):
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
 
-class RunRecipe(RecipeFields, _Drive, LabelFields, _Scene):
+class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
     """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
     The seed determines traffic, sensor noise and initial weights. docs/runs.md describes every field. Raises pydantic's

@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.config import InputError
+from flcav.interface.notebook import resumable
 from flcav.runs.analysis.collect import collect_results
 from flcav.runs.analysis.histories import make_history_points
 from flcav.runs.analysis.summary import summarise
@@ -23,6 +24,7 @@ WORK, HISTORY, SPREAD = "work", "history.csv", "spread.csv"
 RESULTS = Run.file
 
 
+@resumable
 def run(
     recipe: RunRecipe | Path | str,
     out: Path | str,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from flcav.arrays import Array, Array32, Bytes, Ints, Words
 from flcav.geometry import Boxes
+from flcav.interface.notebook import Displayed
 from flcav.world.weather import Weather
 
 UNKNOWN_PIXELS = -1  # in `Views.pixels`
@@ -132,7 +133,7 @@ class Annotations:
 
 
 @dataclass(frozen=True)
-class Frame:
+class Frame(Displayed):
     """The sensor data, poses, calibration and ground truth of one agent at one LiDAR spin.
 
     >>> from flcav import Dataset, Frame
@@ -165,6 +166,10 @@ class Frame:
     weather: Weather | None = None
     agent_at_trigger: Mapping[str, Array] = field(default_factory=dict)
     # sensor -> (4, 4) world_from_agent at its trigger time; only of vehicles' sensors that trigger off the spin
+
+    def __repr__(self) -> str:
+        sensors = [*self.lidar, *self.images, *self.infrared, *self.radar, *self.gnss, *self.imu]
+        return f"{type(self).__name__}({self.key!r}, {', '.join(sensors)}, {len(self.annotations.boxes)} boxes)"
 
     @property
     def key(self) -> str:

@@ -11,6 +11,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
 from flcav.config import Config, InputError, Json, parse_config, read_yaml, shorten
 from flcav.geometry import Array
+from flcav.interface.notebook import Displayed
 from flcav.interface.wording import suggest
 from flcav.sensors.frame import LONGEST_NAME, format_key
 from flcav.sensors.lens import Lens
@@ -61,7 +62,7 @@ Warmup = Annotated[float | tuple[float, float], BeforeValidator(_warmup)]
 NamedRig = Annotated[Rig, BeforeValidator(_rig)]
 
 
-class Recipe(Config):
+class Recipe(Displayed, Config):
     """A recording recipe: a town, its traffic runs, and the agents that observe them.
 
     A scene is one traffic run with its own parked cars. After a warm-up of `warmup_s`, in which the town fills, every

@@ -49,6 +49,7 @@ from flcav.dataset.recording.jobs import (
     start_processes,
 )
 from flcav.dataset.tables import FILES_SCHEMA, SCHEMAS, TILTS, join_tables, list_files, read_table, write_rows
+from flcav.interface.notebook import resumable
 from flcav.interface.progress import DAMAGED, Report, print_progress
 from flcav.machine.locks import LOCK, only_writer
 from flcav.sources.embedded import EmbeddedSource
@@ -61,6 +62,7 @@ Header = Mapping[str, Mapping[str, Json]]  # "recipe" -> description of the sour
 ENGINES = {"processes": start_processes, "ray": start_actors}
 
 
+@resumable
 def record(
     source: Source | Recipe | Path | str,
     out: Path | str,

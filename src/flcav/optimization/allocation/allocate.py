@@ -12,6 +12,7 @@ import numpy as np
 
 from flcav.config import InputError
 from flcav.geometry.arrays import Array
+from flcav.interface.notebook import Displayed
 from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
@@ -65,7 +66,7 @@ class Dual:
 
 
 @dataclass(frozen=True)
-class Allocation:
+class Allocation(Displayed):
     """A plan for all tasks and its certificate."""
 
     status: str  # optimal: within the gap asked for; feasible: the gap is wider, or there is none

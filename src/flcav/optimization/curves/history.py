@@ -23,6 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from flcav.config import InputError, shorten
 from flcav.geometry.arrays import Array
+from flcav.interface.notebook import Displayed
 from flcav.interface.wording import describe_number, hint_share
 from flcav.optimization.curves.curves import STAGES
 from flcav.storage.records import read_csv
@@ -37,7 +38,7 @@ ROUNDED = 1.01e-3  # largest deviation from 1 of accuracy + error, both rounded 
 
 
 @dataclass(frozen=True)
-class History:
+class History(Displayed):
     """The points of one task's learning curve."""
 
     resources: Array  # (n, 3) samples, edge rounds, cloud rounds

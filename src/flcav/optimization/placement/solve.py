@@ -18,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array, diags_array
 
 from flcav.config import InputError
+from flcav.interface.notebook import Displayed
 from flcav.optimization.placement.enumeration import improve_exactly
 from flcav.optimization.placement.greedy import choose_greedily, exchange, extend_greedily
 from flcav.optimization.placement.instance import (
@@ -61,7 +62,7 @@ class Certificate:
 
 
 @dataclass(frozen=True)
-class Placement:
+class Placement(Displayed):
     """The chosen poles and their sensors, the errors they cover, and a certificate of optimality."""
 
     chosen: tuple[int, ...]  # indices into the poles, ascending

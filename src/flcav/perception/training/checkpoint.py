@@ -137,7 +137,10 @@ def find_finished_card(path: Path, asked: TrainingSettings) -> Card | None:
         return None
     card = read_card(path)
     if different := asked.differences(settings_of(card)):
-        raise InputError(f"{path}: weights of a training with other settings ({different}); choose another folder")
+        anew = ", where it begins anew: the learning rate's schedule spans all epochs" if "epochs" in different else ""
+        raise InputError(
+            f"{path}: weights of a training with other settings ({different}); choose another folder{anew}"
+        )
     return card
 
 

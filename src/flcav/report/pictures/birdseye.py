@@ -45,15 +45,21 @@ class BirdseyeView:
     tracks: Sequence[NDArray] = ()  # (T, 2) x, y of an actor over the scene, for each actor that moved
 
 
-def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool = False) -> BirdseyeView:
-    """Return the view of a frame of `dataset`, `range_m` [m] to each side; with `tracks` its actors' paths as well."""
+def view_frame(dataset: Dataset | None, frame: Frame, *, range_m: float, tracks: bool = False) -> BirdseyeView:
+    """Return the view of a frame of `dataset`, `range_m` [m] to each side; with `tracks` its actors' paths as well.
+
+    Without a dataset the ground is at the world's z = 0, and there are no paths.
+    """
     agent_from_world = inverse(frame.world_from_agent)
     clouds = [transform_points(frame.agent_from_sensor[name], cloud[:, :3]) for name, cloud in frame.lidar.items()]
-    points, ground = np.concatenate([np.zeros((0, 3)), *clouds]), DatasetGround(dataset)
-    if ground.relief is None:
-        points[:, 2] += ground.height_of(dataset.number(frame.key))
+    points = np.concatenate([np.zeros((0, 3)), *clouds])
+    relief = None if dataset is None else DatasetGround(dataset).relief
+    if relief is not None:
+        points[:, 2] = relief.above(transform_points(frame.world_from_agent, points))
+    elif dataset is not None:
+        points[:, 2] += DatasetGround(dataset).height_of(dataset.number(frame.key))
     else:
-        points[:, 2] = ground.relief.above(transform_points(frame.world_from_agent, points))
+        points[:, 2] = transform_points(frame.world_from_agent, points)[:, 2]
     return BirdseyeView(
         points=points,
         truth=frame.annotations.boxes.transform(agent_from_world),
@@ -62,7 +68,7 @@ def view_frame(dataset: Dataset, frame: Frame, *, range_m: float, tracks: bool =
         range_m=range_m,
         agent_size=None if kind_of(frame.agent) == POLE else (SEDAN.length, SEDAN.width),
         echoes=_locate_echoes(frame),
-        tracks=_collect_paths(dataset, frame, agent_from_world) if tracks else (),
+        tracks=_collect_paths(dataset, frame, agent_from_world) if tracks and dataset is not None else (),
     )
 
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Annotated, ClassVar
 
+from flcav.interface.notebook import Displayed
 from flcav.runs.arms import Names, name_steps
 from flcav.runs.provenance import Provenance
 from flcav.runs.recipe import RunRecipe
@@ -103,7 +104,7 @@ class _RunFigures(Saved):
 
 
 @dataclass(frozen=True)
-class Run(RunRows, _RunFigures):
+class Run(Displayed, RunRows, _RunFigures):
     """Results of a finished run; `Run.load(folder)` reads them back."""
 
     file: ClassVar[str] = "results.json"

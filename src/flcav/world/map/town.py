@@ -14,6 +14,7 @@ import shapely
 
 from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError, read_config, read_file, shorten
+from flcav.interface.notebook import Displayed
 from flcav.interface.wording import suggest
 from flcav.statistics.streams import stream
 from flcav.world.map import street_furniture
@@ -57,7 +58,7 @@ Placed = TypeVar("Placed", Poles, Signs, Signals)
 
 
 @dataclass(frozen=True)
-class Town:
+class Town(Displayed):
     """The static content of a town. World frame: ENU, metres, z = 0 at the surface of a level road.
 
     >>> from flcav import Town, load_town
@@ -83,6 +84,11 @@ class Town:
     signals: Signals = field(default_factory=Signals.none)
     posts: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (K, 3) poles of a map: x, y of foot, height [m]
     relief: Relief | None = None  # heights of the ground; None: it is level, at z = 0
+
+    def __repr__(self) -> str:
+        return (
+            f"Town({self.name!r}, {len(self.roads)} roads, {len(self.buildings)} buildings, {len(self.poles.id)} poles)"
+        )
 
     def grounds(self, x: Array, y: Array) -> Array:
         """Return the height (...) [m] of the road, or of the land beside it, at `x`, `y` (...) [m]."""

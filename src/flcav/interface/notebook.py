@@ -1,0 +1,38 @@
+"""What notebooks show: records as `flcav.plot` draws them, and an interrupted call as one sentence."""
+
+import functools
+from collections.abc import Callable
+from importlib import import_module
+from typing import ParamSpec, TypeVar
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+
+class Displayed:
+    """A record that a notebook displays as a picture or as a table; `flcav.plot` is imported when one is displayed."""
+
+    __slots__ = ()
+
+    def _repr_html_(self) -> str | None:
+        """Return a table as HTML; None for a record that is displayed as a picture."""
+        return import_module("flcav.plot").tabulate(self)
+
+    def _repr_png_(self) -> bytes | None:
+        """Return a picture as a PNG file; None for a record that is displayed as a table."""
+        return import_module("flcav.plot").picture(self)
+
+
+def resumable(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Decorate a function that resumes what an earlier call left: Ctrl-C ends it in a sentence that says so."""
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        try:
+            return function(*args, **kwargs)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(
+                "interrupted; finished parts are kept, and the same call goes on from them"
+            ) from None
+
+    return call
