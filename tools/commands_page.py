@@ -19,13 +19,13 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
 import flcav
+from flcav.cli.help import SHOWN
 from flcav.cli.main import app
 from flcav.storage.markdown import format_table
 
 ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "docs" / "commands.md"
 GROUPS = INDEX.with_suffix("")  # the folder of the groups' pages
-SHOWN = Path(__file__).with_name("commands.yaml")
 WIDEST = 1000  # pixels of a picture
 INTRO = """\
 # Commands
@@ -36,9 +36,9 @@ with its output. `flcav COMMAND --help` prints the same descriptions. The exit c
 and nothing else. Terms are in the [glossary](glossary.md).
 """
 MADE = """\
-These pages are made by `python tools/commands_page.py`, which runs the examples of `tools/commands.yaml` in the order
-of the pages in one folder, with a copy of the repository's `recipes/` in it: an example may read files of an earlier
-one. In their output `...` stands for the folder that flcav is installed in.
+These pages are made by `python tools/commands_page.py`, which runs the examples of `src/flcav/cli/commands.yaml` in the
+order of the pages in one folder, with a copy of the repository's `recipes/` in it: an example may read files of an
+earlier one. In their output `...` stands for the folder that flcav is installed in.
 """
 
 

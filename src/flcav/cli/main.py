@@ -20,6 +20,7 @@ from flcav.cli.domains.sampling import sample
 from flcav.cli.drive import drive
 from flcav.cli.federate import federate
 from flcav.cli.fleet import fleet
+from flcav.cli.help import add_examples
 from flcav.cli.network import radio, rounds
 from flcav.cli.options import escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
@@ -45,7 +46,6 @@ app = typer.Typer(
     help="Design and verify federated learning for connected autonomous vehicle perception.\n\n"
     "Exit codes: 0 done, 2 bad input (one sentence on stderr), 130 interrupted (Ctrl-C), 1 anything else.",
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
 )
 
@@ -82,7 +82,11 @@ def run(arguments: list[str] | None = None) -> None:
     if arguments is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a process of its own
         signal.signal(signal.SIGINT, _interrupt)
     try:
-        code = escape_markup(typer.main.get_command(app))(args=arguments, standalone_mode=False)
+        command = escape_markup(typer.main.get_command(app))
+        typed = sys.argv[1:] if arguments is None else arguments
+        if isinstance(command, click.Group) and (not typed or "--help" in typed):
+            add_examples(command)
+        code = command(args=arguments, standalone_mode=False)
         if code == INTERRUPTED:  # typer's exit code for Ctrl-C
             raise KeyboardInterrupt
     except Interrupted as kept:

@@ -1,11 +1,15 @@
 """The help of every command, as it is shown."""
 
 import inspect
+import os
 import re
+import subprocess
+import sys
 from collections.abc import Collection, Iterator
 from pathlib import Path
 
 import click
+import commands_page
 import pytest
 import typer
 
@@ -45,6 +49,24 @@ def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
 
 def words(text: str) -> str:
     return " ".join(text.split())
+
+
+def test_commands_are_in_groups_each_with_an_example(shown):
+    overview = shown((), WIDE)
+    listed = [line.split()[1] for line in overview.splitlines() if re.match(r"│ \w", line)]
+    assert {*listed} == {path[0] for path in EVERY if path}
+    titles = [section.title for section in commands_page.sections()]
+    assert [title for title in re.findall(r"^╭─ (.*?) ─", overview, re.M) if title != "Options"] == titles
+    for path, command in EVERY.items():
+        if not getattr(command, "commands", {}):
+            assert f"Example: flcav {' '.join(path)}" in shown(path, WIDE), path
+
+
+def test_a_shell_completes_commands():
+    asked = {"_FLCAV_COMPLETE": "complete_bash", "COMP_WORDS": "flcav re", "COMP_CWORD": "1"}
+    program = Path(sys.executable).with_name("flcav")
+    done = subprocess.run([program], env=os.environ | asked, capture_output=True, text=True, check=True)
+    assert {*done.stdout.split()} == {"record", "replan", "reproduce", "release"}
 
 
 @each_command
