@@ -23,7 +23,7 @@ def add_examples(app: click.Group) -> None:
                 listed[first].rich_help_panel = section["title"]  # type: ignore[attr-defined]
             if name in named:
                 lines = (*example.get("run", ()), *example.get("shown", ()))
-                typed = next(line.split(" | ")[0] for line in lines if line.startswith(f"flcav {name} "))
+                typed = next(line.split(" | ")[0] for line in lines if f"{line} ".startswith(f"flcav {name} "))
                 named[name].epilog = f"Example: [bold]{escape(typed)}[/bold]"
     app.commands = {**listed, **app.commands}
 
