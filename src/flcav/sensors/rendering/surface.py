@@ -1,9 +1,8 @@
 """Surface shading: diffuse colour under sun, sky and lamps, emission, mirror reflection, and aerial perspective.
 
-Diffuse light is Lambertian, on procedural textures. Mirror reflection grows towards grazing incidence after Schlick's
-approximation of the Fresnel term. The air blends radiance into its own by exp(-extinction * distance).
-
-Radiance of the sky with sun and clouds, and an environment map of a street for mirror reflections.
+Diffuse light is Lambertian, on procedural textures. Mirror reflection grows towards grazing incidence by Schlick's
+approximation of the Fresnel term, and shows a procedural environment map of a street: sky, sun, clouds and houses. The
+air attenuates radiance by exp(-extinction * distance), and adds airlight.
 """
 
 import numpy as np
@@ -31,7 +30,7 @@ ROAD_LINE = 0.5  # painted share of a pixel above which its class is road markin
 
 @kernel
 def mark_paint(survey, appearance, pixel_angle, painted):
-    """Write whether each of the N hits of a G-buffer is `painted` (N,) road, as `shade` does."""
+    """Write whether the N hits of a G-buffer are on road markings to `painted` (N,), as `shade` does."""
     for ray in range(len(painted)):
         row = survey.row[ray]
         painted[ray] = False
@@ -49,10 +48,10 @@ def mark_paint(survey, appearance, pixel_angle, painted):
 
 @kernel
 def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
-    """Shade the N hits of a G-buffer: write their `radiance` (N, 3), and whether they are `painted` (N,) road.
+    """Shade the N hits of a G-buffer: write `radiance` (N, 3), and whether they are on road markings, `painted` (N,).
 
-    `lit` (N,) is the share of the sun that is not in shadow, `lamplight` (N, 3) the irradiance of lamps ((0, 3) where
-    none is on), `open_sky` (N,) the ambient occlusion (1: open), `pixel_angle` [rad] the angle that a pixel covers.
+    `lit` (N,) is the visible share of the sun, `lamplight` (N, 3) the irradiance of lamps ((0, 3) if none is on),
+    `open_sky` (N,) the ambient occlusion (1: open), `pixel_angle` [rad] the angle of view of a pixel.
     """
     lamps_on = len(lamplight) > 0
     table = appearance.noise
@@ -70,8 +69,12 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         facing = max(-(dx * nx + dy * ny + dz * nz), np.float32(0.02))
         across = np.float32(survey.distance[ray] * pixel_angle)
         slant = across / facing
-        own = appearance.colour
-        red, green, blue = own[instance, material, 0], own[instance, material, 1], own[instance, material, 2]
+        colours = appearance.colour
+        red, green, blue = (
+            colours[instance, material, 0],
+            colours[instance, material, 1],
+            colours[instance, material, 2],
+        )
         mirror, gloss = appearance.mirror[material], appearance.gloss[material]
         shine_r, shine_g, shine_b = np.float32(0), np.float32(0), np.float32(0)
         sunny = lit[ray]
@@ -220,13 +223,13 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         radiance[ray, 2] = light.air[2] + kept * (blue - light.air[2])
 
 
-SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky, in reflections
-TOP_OF_FOG_M = 500.0  # height of the layer of fog
+SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky in reflections
+TOP_OF_FOG_M = 500.0  # height of the fog layer
 
 
 @inlined
 def compute_clear_sky(x, y, z, light):
-    """Return red, green, blue of the sky without clouds or sun's disc, in the unit direction x, y, z, world frame."""
+    """Return red, green, blue of the sky without clouds and solar disc in the unit direction x, y, z, world frame."""
     low = 1 - max(z, np.float32(0))
     low = low * low * low
     low *= low * np.float32(0.55) + np.float32(0.45)
@@ -244,7 +247,7 @@ def compute_clear_sky(x, y, z, light):
 
 @inlined
 def compute_sky(x, y, z, light, table):
-    """Return red, green, blue of a ray that hits nothing: sky, sun, clouds, and the air in between."""
+    """Return red, green, blue of a ray that hits nothing, in the unit direction x, y, z: sky, sun, clouds and air."""
     red, green, blue = compute_clear_sky(x, y, z, light)
     beside = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
     sun = min(max((beside - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
@@ -277,7 +280,7 @@ def compute_sky(x, y, z, light, table):
 
 @inlined
 def compute_environment(x, y, z, light, table):
-    """Return red, green, blue of the environment of a mirror in the unit direction x, y, z: sky, dim houses, ground."""
+    """Return red, green, blue of the environment map in the unit direction x, y, z: sky, dim houses, ground."""
     red, green, blue = compute_clear_sky(x, y, abs(z), light)
     height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * sample_noise(table, x * 9.0, y * 9.0))
     above = min(max((z - height) * np.float32(25), np.float32(0)), np.float32(1))
