@@ -226,7 +226,8 @@ def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> Mas
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (-half - local) / along, (half - local) / along
     # A segment parallel to a slab gives 0/0 or an infinity above: it is in the slab for its whole length, or never.
-    parallel, within = along == 0, np.abs(local) <= half
+    parallel = along == 0
+    within = np.abs(local) <= half
     near = np.where(parallel, np.where(within, -np.inf, np.inf), np.minimum(first, second))
     far = np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(first, second))
     enters = near.max(axis=-1, initial=0.0)

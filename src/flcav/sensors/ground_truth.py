@@ -57,7 +57,8 @@ def annotate_frame(
     `sweeps` are by LiDAR, `sights` by camera; `echoes` are the numbers (A,) of detections of the actors, by radar. This
     moves `scene` to the cameras' trigger times, and back to the spin.
     """
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     regions = {name: find_actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
     labelled = np.logical_or.reduce([within, *(region.pixels > 0 for region in regions.values())])
     labelled &= trace.category != "prop"
@@ -65,7 +66,8 @@ def annotate_frame(
         labelled[own] = False
     actors = np.flatnonzero(labelled)
 
-    views, signs = {}, {}
+    views = {}
+    signs = {}
     for name, sight in sights.items():
         scene.move_to(index, sight.offset_s)
         views[name] = view_actors(scene, sight.world_from_camera, sight.lens, sight.instance, regions[name], actors)
@@ -130,7 +132,8 @@ def count_occluded_rays(
     group = np.repeat(np.arange(len(actors)), counts)
     if lidar.rolling:  # an actor may have been hit at another place than that at the scene's instant
         others = instance[rays] != actors[group] + 1
-        rays, group = rays[others], group[others]
+        rays = rays[others]
+        group = group[others]
     directions = pattern[rays]
 
     def trace(rays: Ints | slice, *, near_m: Array32 | None = None) -> Hits:

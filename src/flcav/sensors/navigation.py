@@ -138,7 +138,8 @@ def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]
     """Return acceleration [m/s^2] and angular rate [rad/s] (3,) of the carrier at a point (3,) [m], world frame."""
     if carrier is None:
         return np.zeros(3), np.zeros(3)
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     rate = np.array((0.0, 0.0, trace.yaw_rate[index, carrier]))
     arm = at - scene.world_from_actor(carrier)[:3, 3]
     return trace.acceleration[index, carrier] + np.cross(rate, np.cross(rate, arm)), rate

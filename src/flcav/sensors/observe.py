@@ -140,7 +140,8 @@ class _Carrier:
         """Return the (3,) velocity of a sensor at the scene's time, world frame [m/s]."""
         if self.own is None:
             return np.zeros(3)
-        trace, offset_s = self.scene.trace, self.scene.offset_s
+        trace = self.scene.trace
+        offset_s = self.scene.offset_s
         arm = world_from_sensor[:3, 3] - self.pose()[:3, 3]
         spin = np.array((0.0, 0.0, trace.yaw_rate[self.index, self.own]))
         velocity = trace.velocity[self.index, self.own] + offset_s * trace.acceleration[self.index, self.own]
@@ -184,7 +185,8 @@ def _sweep(
     carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
 ) -> tuple[Array32, LidarSweep]:
     """Return the points (N, 4) of a LiDAR, sensor frame, and its sweep for the ground truth."""
-    scene, world_from_sensor = carrier.scene, carrier.go_to(name)
+    scene = carrier.scene
+    world_from_sensor = carrier.go_to(name)
     points, actor, passes, hits = scan(scene, world_from_sensor, lidar, rng, carrier.own, weather)
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
@@ -203,7 +205,8 @@ def _within_range(carrier: _Carrier, rig: Rig) -> Mask:
 
     Without LiDARs, within CAMERA_RANGE_M of a camera.
     """
-    scene, world_from_agent = carrier.scene, carrier.pose()
+    scene = carrier.scene
+    world_from_agent = carrier.pose()
     trace = scene.trace
     center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
     ranges = {name: mounted.settings.range_m for name, mounted in rig.lidars.items()}

@@ -269,7 +269,8 @@ def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hi
     seen, which = np.unique(hits.instance[moving] - 1, return_inverse=True)
     x, y, _, yaw = scene.poses()[seen].T
     aspect = np.arctan2(world_from_radar[1, 3] - y, world_from_radar[0, 3] - x) - yaw
-    category, size = scene.trace.category[seen], scene.trace.size[seen]
+    category = scene.trace.category[seen]
+    size = scene.trace.size[seen]
     per_area[moving] = (compute_actor_rcs(category, aspect) / silhouette(size, aspect))[which]
     return per_area * solid_angle * hits.distance.astype(np.float64) ** 2
 
@@ -278,7 +279,8 @@ def _range_rates(
     scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, velocity: Array, rng: np.random.Generator
 ) -> Array:
     """Return (N,) range rates [m/s] of the surface points that N rays hit, positive for receding."""
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     limbs = np.array([LIMBS_M_S.get(str(category), 0.0) for category in trace.category])
     line = ahead @ world_from_radar[:3, :3].T
     moving = np.flatnonzero(hits.instance > 0)

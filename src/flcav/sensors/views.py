@@ -175,7 +175,8 @@ def _area(boxes: Array) -> Array:
 
 def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: Ints) -> Mask:
     """Return (M,) whether the actors' bounding spheres touch the camera's viewing frustum (frustum culling)."""
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     size = trace.size[actors]
     drift = abs(scene.offset_s) * np.linalg.norm(np.nan_to_num(trace.velocity[index, actors]), axis=1)
     radius = np.linalg.norm(size, axis=1) / 2 + 2 * drift

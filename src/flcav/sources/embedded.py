@@ -92,7 +92,8 @@ class EmbeddedSource(DividedSource):
         """Yield the scene's frames with the given `numbers`, observed in the traffic `trace`: see `Replayable`."""
         if self._last_scene is None or self._last_scene[0] != scene:
             self._last_scene = scene, Scene(self.town, trace)
-        world, recipe = self._last_scene[1], self.recipe
+        world = self._last_scene[1]
+        recipe = self.recipe
         weather = recipe.weather.draw(stream(recipe.seed, scene, "weather"))
         for number in numbers:
             index, agent = divmod(number, len(self.agents))
@@ -111,7 +112,8 @@ class EmbeddedSource(DividedSource):
 
     def _records(self, trace: Trace, index: int, agent: int) -> bool:
         """Return whether an agent records the spin `index`; with `window_range_m`, windows only near a pole."""
-        near_m, middles = self.recipe.window_range_m, self.recipe.find_middles(index)
+        near_m = self.recipe.window_range_m
+        middles = self.recipe.find_middles(index)
         if near_m is None or not self.poles or index in middles:
             return True
         if agent >= self.recipe.cavs:

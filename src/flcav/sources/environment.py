@@ -136,8 +136,10 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Return the observation in the ego frame, and update the distance along the route [m]."""
         assert self._world is not None
         assert self._route is not None
-        trace, row = snapshot.trace, snapshot.row(EGO)
-        position, yaw = trace.position[0, :, :2], trace.yaw[0]
+        trace = snapshot.trace
+        row = snapshot.row(EGO)
+        position = trace.position[0, :, :2]
+        yaw = trace.yaw[0]
         x, y, heading = *position[row].tolist(), float(yaw[row])
         self._along, offset = self._route.project(x, y, self._along)
         velocity = np.stack(rotate(trace.velocity[0, :, 0], trace.velocity[0, :, 1], -heading), axis=1)

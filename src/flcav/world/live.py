@@ -133,7 +133,8 @@ class LiveWorld:
             if self.bodies.find(name).controls != wanted:
                 self.apply(commands.Drive(name, wanted))
         self._note(LiveStep(dt_s))
-        begins, velocity = self._time_s, self.bodies.velocity.copy()
+        begins = self._time_s
+        velocity = self.bodies.velocity.copy()
         collisions: dict[tuple[str, str], Collision] = {}
         fastest = float(np.abs(velocity).max(initial=0.0))
         parts = math.ceil(max(dt_s / SUBSTEP_S, dt_s * fastest / SUBSTEP_M) - 1e-9)
@@ -215,7 +216,8 @@ class LiveWorld:
             self.history.append(entry)
 
     def _spawn(self, command: commands.Spawn) -> None:
-        name, made = command.name, make_blueprint(command.category, command.shape, command.size)
+        name = command.name
+        made = make_blueprint(command.category, command.shape, command.size)
         if not name or name.startswith(RESERVED):
             raise InputError(f"name {shorten(name)}: must not be empty, nor begin with {', '.join(RESERVED)}")
         if any(body.name == name for body in self.bodies.members):

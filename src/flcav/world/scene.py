@@ -100,7 +100,8 @@ class Scene:
     def poses(self) -> Array:
         """Return x, y, z [m] and yaw [rad] of the actors at the scene's time (A, 4), world frame; NaN where absent."""
         trace, i, dt = self.trace, self.index, self.offset_s
-        position, yaw = trace.position[i], trace.yaw[i]
+        position = trace.position[i]
+        yaw = trace.yaw[i]
         if dt:
             position = position + dt * trace.velocity[i] + dt**2 / 2 * trace.acceleration[i]
             yaw = yaw + dt * trace.yaw_rate[i]

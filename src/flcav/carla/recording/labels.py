@@ -64,7 +64,8 @@ def annotate_bodies(
     order = np.zeros(count + 1, np.uint16)
     order[rows + 1] = np.arange(1, len(rows) + 1)
     images = {name: order[image] for name, image in instances.items()}
-    boxes, bodies = state.boxes[rows], [state.bodies[row] for row in rows]
+    boxes = state.boxes[rows]
+    bodies = [state.bodies[row] for row in rows]
     numbers = np.array([body.number for body in bodies], np.int64)
     points = {name: _count_returns(boxes, numbers, sweep) for name, sweep in sweeps.items()}
     annotations = Annotations(
@@ -102,7 +103,8 @@ def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) 
         return np.zeros(len(boxes), np.int64)
     away, nearest = (np.asarray(found) for found in KDTree(sweep.met.points).query(sweep.points[:, :3]))
     same = away <= SAME_M + SIGMAS * sweep.lidar.noise_m
-    actor, vehicle = sweep.met.actor[nearest[same]], np.isin(sweep.met.tag[nearest[same]], VEHICLES)
+    actor = sweep.met.actor[nearest[same]]
+    vehicle = np.isin(sweep.met.tag[nearest[same]], VEHICLES)
     counts = np.array([np.count_nonzero(actor == number) for number in numbers], np.int64)
     parked = np.flatnonzero(numbers == 0)
     ours = sweep.points[same][vehicle & (actor == 0)]
@@ -147,7 +149,8 @@ def _towards(lines: Array, turn: Array, origin: Array, half: Array) -> NDArray[n
 
 def _find_instances(boxes: Boxes, sight: CameraSight) -> NDArray[np.int32]:
     """Return the instance image (H, W): row + 1 of the nearest box of its class around the pixel's point, or 0."""
-    lens, instance = sight.lens, np.zeros(sight.depth_m.shape, np.int32)
+    lens = sight.lens
+    instance = np.zeros(sight.depth_m.shape, np.int32)
     outlines, _ = outline_boxes(boxes.corners(), lens, sight.world_from_camera)
     rectangles = clip_boxes(outlines, lens)
     known = np.flatnonzero(~np.isnan(rectangles).any(axis=1))

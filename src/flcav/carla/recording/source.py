@@ -125,7 +125,8 @@ class CarlaSource(DividedSource):
         Raises `InputError` where the server has another version or lacks what the recipe needs, and `OSError` where
         the connection or a sensor is lost.
         """
-        recipe, left = self.recipe, self.frame_count(scene)
+        recipe = self.recipe
+        left = self.frame_count(scene)
         warmup = int(stream(recipe.seed, scene, "warmup").integers(*recipe.warmup_steps, endpoint=True))
         times_s = recipe.times_s(warmup)
         weather = recipe.weather.draw(stream(recipe.seed, scene, "weather"))
@@ -134,7 +135,8 @@ class CarlaSource(DividedSource):
             session.world.set_weather(make_weather(weather.at(0.0)))
             rng = stream(recipe.seed, scene, "spawn")
             spawned = spawn_vehicles(session, recipe, rng) | spawn_walkers(session, recipe, rng)
-            ticks, snapshot = SETTLED, session.tick()
+            ticks = SETTLED
+            snapshot = session.tick()
             bodies = list_bodies(session, spawned, self.frame)
             agents: list[Agent] = []
             for spin, step in enumerate(steps):
@@ -180,7 +182,8 @@ class CarlaSource(DividedSource):
     ) -> Frame:
         """Return the frame of an agent at the last tick; `at` is scene, spin, time [s] and weather."""
         (scene, spin, time_s, weather), seed = at, self.recipe.seed
-        vehicle, world_from_agent = None, agent.base
+        vehicle = None
+        world_from_agent = agent.base
         if agent.number is not None:
             vehicle = snapshot.find(agent.number)
             if vehicle is None:

@@ -161,7 +161,8 @@ def read_state(snapshot: "carla.WorldSnapshot", bodies: list[TrackedBody], frame
 
 def read_pose(transform: "carla.Transform", frame: MapFrame) -> Array:
     """Convert a CARLA transform to a (4, 4) pose of the world frame [m]."""
-    at, turn = transform.location, transform.rotation
+    at = transform.location
+    turn = transform.rotation
     return frame.from_transform((at.x, at.y, at.z), (turn.pitch, turn.yaw, turn.roll))
 
 

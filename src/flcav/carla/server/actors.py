@@ -174,7 +174,8 @@ def find_grip(box: ServedActor, point: Array) -> float | None:
 def list_grips(actors: Collection[ServedActor], bodies: Iterable[ControlledBody]) -> list[Grip]:
     """Return the changed grips of vehicles; a vehicle has that of the last friction trigger that contains it."""
     known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
-    boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []
+    boxes = [actor for actor in actors if actor.description.id == TRIGGER]
+    changed = []
     for body in bodies:
         if (actor := known.get(body.name)) is not None:
             shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]

@@ -253,7 +253,8 @@ class Episode:
         if not actor.name or self.is_own(actor):
             return
         snapshot = self.world.snapshot
-        trace, row = snapshot.trace, snapshot.row(actor.name)
+        trace = snapshot.trace
+        row = snapshot.row(actor.name)
         (x, y, z), velocity = trace.position[0, row].tolist(), trace.velocity[0, row]
         yaw, (length, width, height) = float(trace.yaw[0, row]), trace.size[row].tolist()
         shape, size = int(trace.shape[row]), (length, width, height)
@@ -446,7 +447,8 @@ class Episode:
             return wire.pack_sign(actor.sign)
         if (row := actor.light) is not None:
             green, yellow, red = self.lights.times_s[row]
-            sign, elapsed = self.lights.approaches[row].sign, self.lights.elapsed_s[row]
+            sign = self.lights.approaches[row].sign
+            elapsed = self.lights.elapsed_s[row]
             return wire.pack_light(sign, (green, yellow, red), elapsed, 0, self.lights.frozen, self.lights.state[row])
         return b""
 

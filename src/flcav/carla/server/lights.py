@@ -100,7 +100,8 @@ def find_approaches(served: ServedMap, signals: Sequence[MapSignal]) -> list[App
     """Return the approaches to all traffic lights of a map, in the net's order; `signals` are those of the map."""
     imported = served.town.parameters.source is not None  # towns of flcav name their lights by their links
     mapped = [each for each in signals if imported and each.row.get("type") == TRAFFIC_LIGHT]
-    net, lights = served.net, served.town.signals
+    net = served.net
+    lights = served.town.signals
     place = {link: row for row, link in reversed(list(enumerate(lights.link)))}
     approaches = []
     for name, link in list_approaches(net).items():

@@ -33,7 +33,8 @@ class Recorder:
 
     def stop(self) -> None:
         """Write the recording, if there is one."""
-        path, snapshots = self._path, self._snapshots
+        path = self._path
+        snapshots = self._snapshots
         self._path, self._snapshots = None, []
         if path is None or not snapshots:
             return

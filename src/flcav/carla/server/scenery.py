@@ -34,7 +34,8 @@ def list_objects(episode: "Episode", tag: int) -> list[list[Any]]:
 
 def _list_things(episode: "Episode") -> list[tuple[int, BoundingBox, str]]:
     """Return tag, box and name of all buildings, trees, lamps, signs, poles, traffic lights and parked vehicles."""
-    town, objects = episode.served.town, []
+    town = episode.served.town
+    objects = []
 
     def add(kind: str, x: float, y: float, z: float, size: tuple[float, float, float], yaw: float = 0.0) -> None:
         place = to_vector(episode.served.frame.to_location(np.array((x, y, z + size[2] / 2))))

@@ -330,7 +330,8 @@ def _sweep_actors(sight: TownSight, sensor: Sensor) -> tuple[float, str] | None:
     moves = (sight.actors > 0) & (trace.category != "prop") & (trace.actor != sensor.carrier) & trace.present[0]
     for row in np.flatnonzero(moves).tolist():
         to_box = inverse(sight.scene.world_from_actor(row)) @ sensor.pose
-        start, way = to_box[:3, 3], to_box[:3, 0]
+        start = to_box[:3, 3]
+        way = to_box[:3, 0]
         length, width, height = trace.size[row]
         low = np.array((-length / 2, -width / 2, 0.0)) - radius
         high = np.array((length / 2, width / 2, height)) + radius

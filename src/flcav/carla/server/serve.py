@@ -204,7 +204,8 @@ class CarlaServer:
 
     async def _await_listeners(self) -> None:
         """Wait for clients that are about to subscribe to streams, so that they miss no tick."""
-        expected, until = self._calls.expected, time.monotonic() + LISTENER_S
+        expected = self._calls.expected
+        until = time.monotonic() + LISTENER_S
         while expected and time.monotonic() < until:
             await asyncio.sleep(0.001)
         expected.clear()

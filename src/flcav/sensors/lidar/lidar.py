@@ -214,7 +214,8 @@ def cast(scene: Scene, world_from_sensor: Array, lidar: Lidar, passes: Mask, hid
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))
     # The sensor and the traffic move during a rolling spin: sectors are cast one by one, at their own times.
-    steps, count = lidar.azimuth_steps, len(pattern)
+    steps = lidar.azimuth_steps
+    count = len(pattern)
     numbers, kinds = np.empty((2, count), np.int32), np.empty((2, count), np.uint8)
     whole = Returns(np.empty(count, np.float32), numbers[0], numbers[1], kinds[0], kinds[1])
     for columns, pose in step_sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
@@ -250,7 +251,8 @@ def measure_points(
     bright = compute_brightness(
         echoes, build_ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness, lidar.roughness_rad
     )
-    distance, least_power = echoes.distance, 0.9 / lidar.sensitivity_m**2
+    distance = echoes.distance
+    least_power = 0.9 / lidar.sensitivity_m**2
     air = compute_air(weather, lidar.divergence_rad, 0.7 * least_power)
     if air is not None:
         distance, bright, aerial = add_air_returns(distance, bright, air, rng)

@@ -30,7 +30,8 @@ def step_sectors(
     [m] is the pose at the scene's instant, `steps` the columns of a spin of `spin_s` [s], `carrier` the actor that
     carries the sensor (None: it is stationary).
     """
-    index, instant_s = scene.index, scene.offset_s
+    index = scene.index
+    instant_s = scene.offset_s
 
     def pose_now() -> Array:
         return world_from_sensor if carrier is None else scene.world_from_actor(carrier) @ carrier_from_sensor

@@ -55,7 +55,8 @@ def facades_of(name: str, buildings: Array) -> Facades:
     count = len(buildings)
     kind = rng.integers(len(WALLS), size=count)
     tint = 1 + 0.10 * rng.standard_normal((count, 1)) + 0.03 * rng.standard_normal((count, 3))
-    yaw, height = buildings[:, 2], buildings[:, 5]
+    yaw = buildings[:, 2]
+    height = buildings[:, 5]
     gabled = height < GABLED_BELOW_M
     walls = np.where(gabled, 0.68 * height, height - 0.5)
     roof = np.array(ROOFS)[rng.integers(len(ROOFS), size=count)]
@@ -83,7 +84,8 @@ def shade_facade(building, x, y, z, nx, ny, across, slant, facades, table):
     if abs(side) > np.float32(0.7):
         u, v, length, number = v, u, facades.size[building, 1], 1
     else:
-        length, number = facades.size[building, 0], 0
+        length = facades.size[building, 0]
+        number = 0
     if v < 0:
         number += 2
     tone = np.float32(0.90) + np.float32(0.20) * sample_noise(table, u * 0.7 + building * 13.0, z * 0.5)

@@ -237,7 +237,8 @@ def add_sun_glare(
 
 
 def _glowing(scene: Scene, state: LampState, light: Illumination, eye: Array, hidden: int | None) -> list[Glowing]:
-    trace, out = scene.trace, []
+    trace = scene.trace
+    out = []
     for actor in np.flatnonzero((state.head[1:] > 0) | (state.tail[1:] > 0)):
         if actor == hidden or not trace.present[scene.index, actor]:
             continue

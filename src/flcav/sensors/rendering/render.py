@@ -159,11 +159,13 @@ def _further(
     radiance: Array32,
 ) -> Array32:
     """Return the radiance (S, 3) of further rays in the pixels `pixel` (S,), copied from a pixel nearby, or shaded."""
-    scene, appearance = world.scene, world.appearance
+    scene = world.scene
+    appearance = world.appearance
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden, threads=world.threads)
     donor = np.empty(len(rays), np.int32)
     donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
-    out, rest = radiance[donor], np.flatnonzero(donor < 0)
+    out = radiance[donor]
+    rest = np.flatnonzero(donor < 0)
     unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
     unknown_seen = fill_gbuffer(scene, appearance, world_from_camera, rays[rest], unknown)
     finer = world._replace(pixel_angle=world.pixel_angle / ROOKS)
@@ -345,7 +347,8 @@ def average_samples(radiance, further, pixel, ceiling):
     """Replace the `radiance` of pixels by the mean with their `further` samples (S, 3), clamped to `ceiling`."""
     start = 0
     while start < len(pixel):
-        centre, end = pixel[start], start
+        centre = pixel[start]
+        end = start
         while end < len(pixel) and pixel[end] == centre:
             end += 1
         for band in range(3):

@@ -47,7 +47,8 @@ def compute_lamp_state(scene: Scene, lamps_on: float, low_sight: bool) -> LampSt
     `lamps_on` (0 to 1) is the brightness of lamps by the sun's elevation; with `low_sight` (rain or fog), vehicles'
     lamps are also on by day. Lamps of parked vehicles are off.
     """
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     letters = dict(zip(trace.light.tolist(), trace.light_state[index].tolist()))
     lens = [LENSES.get(letters.get(link, ""), 0) for link in scene.things.link]
     parked = np.char.startswith(trace.actor, "parked")
@@ -64,7 +65,8 @@ def collect_lamps(scene: Scene, state: LampState) -> Lamps:
     """Return the lamps that illuminate the scene: all street lamps, then the head lamps that are on."""
     street = scene.town.lamps - (0.0, 0.0, 0.08)
     street[:, 2] += scene.town.grounds(*street[:, :2].T)
-    places, beams = [street], [np.zeros_like(street)]
+    places = [street]
+    beams = [np.zeros_like(street)]
     for actor in np.flatnonzero(state.head[1:] > 0.5):
         body = scene.world_from_actor(int(actor))
         heads, _ = lamp_places(*scene.trace.model(int(actor)))

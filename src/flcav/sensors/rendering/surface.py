@@ -63,7 +63,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             red, green, blue = compute_sky(dx, dy, dz, light, table)
             radiance[ray, 0], radiance[ray, 1], radiance[ray, 2] = red, green, blue
             continue
-        instance, material = survey.instance[ray], appearance.material[row]
+        instance = survey.instance[ray]
+        material = appearance.material[row]
         x, y, z = survey.position[ray, 0], survey.position[ray, 1], survey.position[ray, 2]
         nx, ny, nz = survey.normal[ray, 0], survey.normal[ray, 1], survey.normal[ray, 2]
         facing = max(-(dx * nx + dy * ny + dz * nz), np.float32(0.02))
@@ -135,7 +136,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             tone = np.float32(0.85) + np.float32(0.3) * sample_noise(table, (x + y) * 1.9, z * 1.9)
             red, green, blue = red * tone, green * tone, blue * tone
         elif material == ROOF and appearance.part[row] == BUILDING:
-            colour, building = appearance.facades.roof, appearance.part_row[row]
+            colour = appearance.facades.roof
+            building = appearance.part_row[row]
             tone = np.float32(0.85) + np.float32(0.3) * sample_noise(table, x * 2.3, y * 2.3 + z)
             near = fade(np.float32(0.25), slant)
             if near > 0 and nz > np.float32(0.2) and nz < np.float32(0.97):
@@ -154,7 +156,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             red, green, blue = red * tone * (np.float32(0.75) + autumn * np.float32(0.7)), green * tone, blue * tone
             through = np.float32(0.55)
         elif material == SIGN:
-            place, plate = appearance.plates.place, appearance.part_row[row]
+            place = appearance.plates.place
+            plate = appearance.part_row[row]
             right = (x - place[plate, 0]) * place[plate, 3] + (y - place[plate, 1]) * place[plate, 4]
             red, green, blue = sample_sign(
                 appearance.plates.kind[plate], right, z - place[plate, 2], across, appearance.plates.drawn

@@ -135,7 +135,8 @@ def outline_arrow(arrow: Arrow) -> Array:
 @lru_cache(maxsize=16)
 def _glyph(kind: ArrowKind) -> Array:
     """Return the outline (K, 2) of an arrow centred on the origin, pointing along +x [m]."""
-    back, heads = -ARROW_M / 2, kind.split("_")
+    back = -ARROW_M / 2
+    heads = kind.split("_")
     shaft = LineString([(back, 0.0), (0.9 if "straight" in heads else -0.2, 0.0)])
     pieces: list[BaseGeometry] = [shaft.buffer(SHAFT_M / 2, cap_style="flat")]
     if "straight" in heads:

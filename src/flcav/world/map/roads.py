@@ -220,7 +220,8 @@ class Route:
 
         The search is limited to distances within `WINDOW_M` of `near` [m].
         """
-        start, step = self.points[:-1], np.diff(self.points, axis=0)
+        start = self.points[:-1]
+        step = np.diff(self.points, axis=0)
         length = np.diff(self.along)
         share = np.clip(((np.array((x, y)) - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
         away = np.array((x, y)) - start - share[:, None] * step
@@ -275,7 +276,8 @@ def _join(lanes: list[Lane], stops: tuple[tuple[float, str], ...]) -> Route:
     speed = np.concatenate([np.full(len(lane.shape), lane.speed) for lane in lanes])
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     kept = np.concatenate(([True], steps > 1e-3))
-    points, speed = points[kept], speed[kept]
+    points = points[kept]
+    speed = speed[kept]
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     return Route(points, along, speed, stops)
 

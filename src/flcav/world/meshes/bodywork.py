@@ -100,7 +100,8 @@ class _Lower:
 
 
 def _flank(lower: _Lower) -> Mesh:
-    x, half = lower.x, lower.half
+    x = lower.x
+    half = lower.half
     rows = (
         (0.955 * half, lower.sill),
         (half, lower.sill + 0.55 * (lower.belt - lower.sill)),
@@ -209,7 +210,8 @@ def _interior(profile: Profile, lower: _Lower, length: float, height: float) -> 
 def _driver(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:
     """Return the head and torso of the driver, on the left front seat."""
     _, end, waist = _cabin_frame(profile, lower, length)
-    x, side = end - FRONT_SEAT_M + 0.16, float(lower.half.max()) * 0.45
+    x = end - FRONT_SEAT_M + 0.16
+    side = float(lower.half.max()) * 0.45
     chin = min(0.22, 0.85 * _headroom(profile, length, height, x, waist) - 0.24)
     torso = box((x, side, waist + chin - 0.22), (0.20, 0.40, 0.44), Material.CLOTH)
     return join_meshes((torso, ellipsoid((x + 0.02, side, waist + chin + 0.11), (0.10, 0.08, 0.12), Material.SKIN, 6)))

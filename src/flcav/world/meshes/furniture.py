@@ -106,8 +106,10 @@ def make_motorbike(length: float, width: float, height: float) -> Mesh:
 
 def make_trailer(length: float, width: float, height: float) -> Mesh:
     """Return a parked car trailer of these dimensions [m]: a tarpaulin on boards, one axle, and a drawbar ahead."""
-    bed, rear = 0.72 * length, -length / 2
-    middle, floor = rear + bed / 2, min(0.5, 0.4 * height)
+    bed = 0.72 * length
+    rear = -length / 2
+    middle = rear + bed / 2
+    floor = min(0.5, 0.4 * height)
     parts = [
         box((middle, 0, floor), (bed, 0.84 * width, 0.1), Material.TRIM),
         box((middle, 0, floor + 0.15 * height), (bed, 0.84 * width, 0.3 * height), Material.METAL),

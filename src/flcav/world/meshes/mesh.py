@@ -55,7 +55,8 @@ class Mesh:
         out = np.empty((len(order), 3))
         for first, last in pairwise(starts):
             shared = order[first:last]
-            normal, weight = flat[shared // 3], area[shared // 3]
+            normal = flat[shared // 3]
+            weight = area[shared // 3]
             alike = normal @ normal.T
             share = np.where(np.abs(alike) > np.cos(np.radians(crease_deg)), np.sign(alike) * weight, 0.0)
             out[shared] = share @ normal

@@ -63,7 +63,8 @@ def pedestrian(shape: Shape) -> Mesh:
 def bicycle(shape: Shape, *, ridden: bool = True) -> Mesh:
     """Return the mesh of a bicycle, if `ridden` with its rider, who leans further forward on a sport bike."""
     lean = 0.42 if shape.name == "sport_bike" else 0.22
-    wheel_x, hub = 0.53, 0.34
+    wheel_x = 0.53
+    hub = 0.34
     parts = [_spoked_wheel(x, hub, 0.022) for x in (-wheel_x, wheel_x)]
     saddle, crank, head = (-0.20, 0.0, 0.93), (-0.08, 0.0, 0.30), (0.38, 0.0, 0.86)
     bars = (

@@ -183,7 +183,8 @@ def _trailer_car(shape: Shape) -> Mesh:
     """Return a hatchback with a single-axle box trailer 0.5 m behind it."""
     length, width, height = shape[1:]
     front, rear, bed = 4.05, -length / 2, 2.55
-    middle, wall = rear + bed / 2, width / 2 - 0.20
+    middle = rear + bed / 2
+    wall = width / 2 - 0.20
     parts = [transform_mesh(vehicle_body(PROFILES["hatchback"], front, width, height), length / 2 - front / 2, 0)]
     parts.append(box((middle, 0, 0.52), (bed, 2 * wall, 0.08), Material.TRIM))
     parts.append(add_mirror_image(box((middle, wall, 0.78), (bed, 0.04, 0.45), Material.METAL)))

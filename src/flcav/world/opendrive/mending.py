@@ -229,7 +229,8 @@ def _cut(pieces: list[WidthPiece], length: float) -> tuple[list[WidthPiece], flo
 
     A piece is also split where it is narrowest, if no vehicle fits there.
     """
-    parts, ends = [], [*(piece.s for piece in pieces[1:]), length]
+    parts = []
+    ends = [*(piece.s for piece in pieces[1:]), length]
     for piece, end in zip(pieces, ends):
         flat = not piece.value.coef[1:].any()
         turning = [] if flat else _find_roots(piece.value.deriv(), end - piece.s)

@@ -58,7 +58,8 @@ class ReferenceLine:
         out = np.empty((len(s), 3))
         number = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, None)
         for i in np.unique(number).tolist():
-            rows, piece = number == i, self._pieces[i]
+            rows = number == i
+            piece = self._pieces[i]
             out[rows] = piece.at(s[rows] - piece.s)
         return out
 

@@ -61,7 +61,8 @@ def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, No
     if roles.neighbour is None:
         yield from _pull_out(stage, scenario, roles)
         return
-    vehicle, name = stage.sumo.vehicle, roles.neighbour
+    vehicle = stage.sumo.vehicle
+    name = roles.neighbour
     stage.take(name)
     vehicle.setLaneChangeMode(name, 0)
     lane = int(roles.spot.lane.id.rpartition("_")[2])
@@ -149,7 +150,8 @@ def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
 
 def run_the_light(stage: Stage, scenario: Scenario, runner: Runner) -> Generator[None, None, None]:
     """Cross the stop line on red; one second later, obey lights and right of way again."""
-    vehicle, name = stage.sumo.vehicle, runner.name
+    vehicle = stage.sumo.vehicle
+    name = runner.name
     stage.take(name)
     vehicle.setSpeedMode(name, IGNORES_LIGHTS)
     vehicle.setSpeed(name, max(RUNS_AT, stage.state(name)[3]))

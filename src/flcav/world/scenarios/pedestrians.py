@@ -50,13 +50,15 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
 
     The pedestrian starts so that the ego can just stop. Van and pedestrian are there from the start of the traffic run.
     """
-    lane, vehicle = roles.spot.lane, stage.sumo.vehicle
+    lane = roles.spot.lane
+    vehicle = stage.sumo.vehicle
     van, pedestrian = (stage.cast(kind) for kind in roles.kinds)
     hidden = kerb_offset(lane, roles.kinds[0])
     stands = stage.point(lane, roles.along - BEFORE_VAN_M, hidden)
     stage.place_from_start(van, *stands)
     stage.place_from_start(pedestrian, *_walker(stage, roles, hidden))
-    at, far = hidden, _far_kerb(stage, roles.spot.edge, lane.width) + WALK_ON_M
+    at = hidden
+    far = _far_kerb(stage, roles.spot.edge, lane.width) + WALK_ON_M
     running = False
     while True:
         yield

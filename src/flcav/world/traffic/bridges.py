@@ -65,7 +65,8 @@ def _find_on(deck: Deck, net: RoadNet, centre: Array, yaw: Array) -> Mask:
     over, below = split_lanes(deck, net, zone)
     if not len(over.start):
         return np.zeros_like(out)
-    place, ahead = centre[out], heading_vectors(yaw[out])
+    place = centre[out]
+    ahead = heading_vectors(yaw[out])
     worse = [
         _misfit(over, place[rows], ahead[rows]) - _misfit(below, place[rows], ahead[rows])
         for rows in np.split(np.arange(len(place)), np.arange(BATCH, len(place), BATCH))

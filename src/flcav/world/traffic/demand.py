@@ -183,7 +183,8 @@ def write_demand(
         if tour[-1] not in exits:
             trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour)))
             continue
-        name, rest = f"veh{i}", until_s - depart
+        name = f"veh{i}"
+        rest = until_s - depart
         rows = passages.draw(traffic, random, least_s=0.0, most_s=rest)
         trips.append((depart, _vehicle(name, kind, depart, [driven[row].id for row in rows])))
         while (rest := rest - max(float(passages.time_s[rows].sum()), HEADWAY_S)) > 0:
@@ -250,7 +251,8 @@ def draw_tour(
     going_on = weight * (reach & (weight > 0)).any(axis=1)
     share = going_on / going_on.sum() if going_on.any() else weight / weight.sum()
     at = int(random.choice(len(edges), p=share))
-    out, done = [edges[at].id], 0.0
+    out = [edges[at].id]
+    done = 0.0
     while done < length_m:
         steps = np.hypot(*(middle - middle[at]).T)
         share = weight * reach[at]

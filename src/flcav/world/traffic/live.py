@@ -135,13 +135,16 @@ class SumoTraffic:
         kinds = [self._kinds[self._after[name][0]] for name in names]
         size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], np.float64).reshape(-1, 3)
         count = len(names)
-        front, turned = self._ends[0][:, :2], np.pi / 2 - np.radians(self._ends[0][:, 2])
+        front = self._ends[0][:, :2]
+        turned = np.pi / 2 - np.radians(self._ends[0][:, 2])
         position = np.column_stack((front - size[:, :1] / 2 * heading_vectors(turned), np.full(count, np.nan)))
         known = dict(zip(self._actors.name, self._actors.position[:, 2].tolist()))
         position[:, 2] = [known.get(name, np.nan) for name in names]
-        relief, new = self._town.relief, np.flatnonzero(np.isnan(position[:, 2]))
+        relief = self._town.relief
+        new = np.flatnonzero(np.isnan(position[:, 2]))
         if relief is not None and relief.decks and len(new):
-            centre, yaw = position[None, new, :2], turned[None, new]
+            centre = position[None, new, :2]
+            yaw = turned[None, new]
             footing = find_footing(relief, self._town.net, centre, yaw)
             position[new, 2] = footing(centre[..., 0], centre[..., 1])[0]
         self._actors = Actors(
@@ -277,7 +280,8 @@ def read_light_programs(net: Path) -> tuple[LightProgram, ...]:
     programs: dict[str, LightProgram] = {}
     try:
         for row in read_xml(net, "a SUMO net").iterfind("tlLogic"):
-            name, phases = row.attrib["id"], row.findall("phase")
+            name = row.attrib["id"]
+            phases = row.findall("phase")
             durations = tuple(float(phase.attrib["duration"]) for phase in phases)
             states = tuple(phase.attrib["state"] for phase in phases)
             if not 0 < sum(durations) < 1e6 or len({len(state) for state in states}) != 1:

@@ -70,7 +70,8 @@ class Passages:
                 "or fewer vehicles"
             )
         at = int(random.choice(len(self.edges), p=share / share.sum()))
-        route, driven_s = [at], self.time_s[at]
+        route = [at]
+        driven_s = self.time_s[at]
         while self.onward[at] and driven_s < most:
             far = [row for row in self.onward[at] if self.left_s[row] >= left - driven_s]
             at = far[int(random.integers(len(far)))]

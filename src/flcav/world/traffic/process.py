@@ -84,7 +84,8 @@ class RecordedTraffic(NamedTuple):
 
 def record_traffic(simulation: Simulation, steps: Sequence[int], out: Path) -> None:
     """Simulate up to the last of `steps` (T,), ascending, and write the `RecordedTraffic` at these steps to `out`."""
-    lights, director = simulation.sumo.trafficlight, simulation.director
+    lights = simulation.sumo.trafficlight
+    director = simulation.director
     junctions, now = lights.getIDList(), 0
     seen: list[States] = []
     letters: list[list[str]] = []

@@ -43,7 +43,8 @@ class Crosswalk:
 
 def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[Crosswalk]:
     """Find the crosswalks of the map below `root`; a place in the town is that in the map + `offset_m` (x, y) [m]."""
-    found, left = [], Counter[str]()
+    found = []
+    left = Counter[str]()
     for row in root.iterfind("road"):
         named = [thing for thing in row.iterfind("objects/object") if thing.get("type") == "crosswalk"]
         painted = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_CROSSWALK]
@@ -257,7 +258,8 @@ class _Streets:
 
     def _cut(self, part: _Part, place: Array, node: str) -> str:
         """Cut a part at the node; return the id of the second piece, from which the connections onward start."""
-        before, along = part.row.attrib["id"], part.at(place)
+        before = part.row.attrib["id"]
+        along = part.at(place)
         after = f"{before}.{node}"
         second = copy.deepcopy(part.row)
         second.attrib |= {"id": after, "from": node}

@@ -49,7 +49,8 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
         for row in controller
     }
     ways = _Ways(net, offset_m)
-    found, left = [], Counter[str]()
+    found = []
+    left = Counter[str]()
     for row in roads.values():
         for signal in row.iterfind("signals/signal"):
             if signal.get("dynamic") != "yes":

@@ -71,7 +71,8 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Mapp
 
 def find_map_poles(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[PostParameters]:
     """Find the poles with a height of the map below `root`; a place in the town is that in the map + `offset_m` [m]."""
-    found, left = [], Counter[str]()
+    found = []
+    left = Counter[str]()
     for road, thing in list_objects(root, lambda thing: thing.get("type") == "pole"):
         height = read_number(thing, "height")
         for one in repeat_object(thing):

@@ -57,7 +57,8 @@ def find_standing_objects(
     ways = cover_lanes(net, ("driving", "bicycle", "sidewalk", "walkingarea", "crossing"))
     shapely.prepare(ways)
     found: list[ObjectParameters] = []
-    taken, left = 0, Counter[str]()
+    taken = 0
+    left = Counter[str]()
     for road, thing in list_objects(root, lambda thing: thing.get("type") in KINDS):
         for pieces in _list_copies(road, thing, np.array(offset_m)):
             free = [piece for piece in pieces if not _stands_on(piece, ways)]

@@ -55,7 +55,8 @@ def find_stop_lines(
     A place in the town is that in the map + `offset_m` (x, y) [m].
     """
     found: dict[str, float] = {}
-    taken, left = 0, Counter[str]()
+    taken = 0
+    left = Counter[str]()
     ends = [
         (edge.id, lane, _go_on(lane))
         for edge in net.streets
