@@ -260,12 +260,12 @@ class LiveWorld:
         self._report(contacts, names, found)
         self._hit.update(names[row] for row in contacts.second.tolist() if flow.start <= row < flow.stop)
 
-    def _list_boxes(self, own: Actors, low: Array, high: Array) -> tuple[Footprints, list[str]]:
+    def _list_boxes(self, actors: Actors, low: Array, high: Array) -> tuple[Footprints, list[str]]:
         """Return the boxes of the bodies, of SUMO's actors and of obstacles near rectangles, and their names."""
         near = self.obstacles.near(low - NEAR_M, high + NEAR_M)
         obstacles = Footprints(*(array[near] for array in self.obstacles.boxes))
-        boxes = join_footprints(outline_actors(own), outline_actors(self._flow), obstacles)
-        return boxes, [*own.name, *self._flow.name, *(self.obstacles.name[row] for row in near.tolist())]
+        boxes = join_footprints(outline_actors(actors), outline_actors(self._flow), obstacles)
+        return boxes, [*actors.name, *self._flow.name, *(self.obstacles.name[row] for row in near.tolist())]
 
     def _report(self, contacts: Contacts, names: Sequence[str], found: dict[tuple[str, str], Collision]) -> None:
         """Add the contacts to the collisions `found` during a step: impulses of the same pair are summed."""

@@ -167,7 +167,7 @@ class Trace:
 
     def _check(self) -> None:
         """Raise `ValueError` where fields are inconsistent, a number is not finite, or times do not ascend."""
-        if {len(each) for each in (self.actor, self.category, self.shape, self.size)} != {
+        if {len(names) for names in (self.actor, self.category, self.shape, self.size)} != {
             len(set(self.actor.tolist()))
         }:
             raise ValueError("its actors are not told one by one")
@@ -177,7 +177,7 @@ class Trace:
         motion = (self.position, self.velocity, self.acceleration, self.yaw[..., None], self.yaw_rate[..., None])
         tilts = np.zeros(0) if self.tilt is None else self.tilt[self.present]
         numbers = (np.concatenate(motion, axis=2)[self.present], self.time_s, self.size, tilts)
-        if not all(np.isfinite(each).all() for each in numbers):
+        if not all(np.isfinite(values).all() for values in numbers):
             raise ValueError("a number is not finite")
         if self.bow is not None and not (
             self.bow.shape == self.actor.shape and ((self.bow >= 0) & (self.bow < 1)).all()

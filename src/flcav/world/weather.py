@@ -161,7 +161,7 @@ class WeatherSchedule(Config):
     @classmethod
     def _from_short_forms(cls, value: Any) -> Any:
         if isinstance(value, list | tuple):
-            if names := [each for each in value if isinstance(each, str)]:
+            if names := [entry for entry in value if isinstance(entry, str)]:
                 raise ValueError(
                     f"a list is of keyframes, such as {{at_s: 0, weather: {names[0]}}}; for scenes that each draw one "
                     f"of several weathers write {{classes: [{', '.join(names)}]}}"

@@ -102,7 +102,7 @@ def spawn_feeds(
         specifications[semantic_name(name)] = "sensor.camera.semantic_segmentation", attributes, mount
     for kind, sensors in (("gnss", rig.gnss), ("imu", rig.imus)):
         specifications |= {
-            name: (f"sensor.other.{kind}", {}, each.mount.agent_from_sensor()) for name, each in sensors.items()
+            name: (f"sensor.other.{kind}", {}, sensor.mount.agent_from_sensor()) for name, sensor in sensors.items()
         }
     library, feeds = session.world.get_blueprint_library(), dict[str, Feed]()
     for name, (kind, attributes, mount) in specifications.items():
@@ -162,7 +162,7 @@ def read_fix(data: "carla.GnssMeasurement") -> Array:
 
 def read_inertia(data: "carla.IMUMeasurement") -> Array:
     """Return an IMU measurement (6,): specific force [m/s^2] and angular rate [rad/s], IMU frame."""
-    force, rate = (np.array((each.x, each.y, each.z)) for each in (data.accelerometer, data.gyroscope))
+    force, rate = (np.array((vector.x, vector.y, vector.z)) for vector in (data.accelerometer, data.gyroscope))
     return np.concatenate((mirror(force), mirror_spin(rate)))
 
 

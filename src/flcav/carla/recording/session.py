@@ -110,7 +110,7 @@ def _check_version(client: "carla.Client", address: str) -> None:
 def _load_map(client: "carla.Client", address: str, name: str) -> "carla.World":
     """Return the world of the map in its initial state."""
     known = {path.rsplit("/", 1)[-1] for path in client.get_available_maps()}
-    path_name = next((each for each in (name, f"{name}{LAYERED}") if each in known), None)
+    path_name = next((candidate for candidate in (name, f"{name}{LAYERED}") if candidate in known), None)
     if path_name is None:
         others = ", ".join(sorted(known)) or "none"
         raise InputError(f"CARLA at {address} has no map {shorten(name)}; it has {others}{suggest(name, known)}")

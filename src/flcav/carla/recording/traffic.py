@@ -54,8 +54,11 @@ def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generat
     Raises `InputError` where the map has too few spawn points for the recording vehicles.
     """
     library, points = session.world.get_blueprint_library(), session.world.get_map().get_spawn_points()
-    every = sorted((each for each in library.filter("vehicle.*") if _category(each)), key=lambda each: each.id)
-    ego_blueprint = next((each for each in every if each.id == ALONE), None)
+    every = sorted(
+        (blueprint for blueprint in library.filter("vehicle.*") if _category(blueprint)),
+        key=lambda blueprint: blueprint.id,
+    )
+    ego_blueprint = next((blueprint for blueprint in every if blueprint.id == ALONE), None)
     if ego_blueprint is None:
         raise InputError(f"CARLA at {session.address} has no blueprint {ALONE}, which records")
     places = [points[i] for i in rng.permutation(len(points))]
@@ -84,7 +87,7 @@ def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generato
     import carla
 
     library = session.world.get_blueprint_library()
-    kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda each: each.id)
+    kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda blueprint: blueprint.id)
     control = library.find("controller.ai.walker")
     walkers: dict[str, carla.Actor] = {}
     drivers = []
@@ -128,7 +131,7 @@ def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: M
         things = session.world.get_environment_objects(getattr(carla.CityObjectLabel, category.capitalize()))
         for middle, size in (_read_box(thing.bounding_box, frame, category) for thing in things):
             parked.append((tuple(middle[:3, 3].tolist()), category, (middle, size)))
-    parked.sort(key=lambda each: each[:2])  # their numbers may differ when the map is loaded anew
+    parked.sort(key=lambda vehicle: vehicle[:2])  # their numbers may differ when the map is loaded anew
     bodies += [TrackedBody(0, f"parked{i}", kind, size, middle) for i, (_, kind, (middle, size)) in enumerate(parked)]
     return bodies
 

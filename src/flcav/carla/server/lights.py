@@ -99,7 +99,7 @@ def _box_before(line: Array, half_width: float, pose: Array) -> BoundingBox:
 def find_approaches(served: ServedMap, signals: Sequence[MapSignal]) -> list[Approach]:
     """Return the approaches to all traffic lights of a map, in the net's order; `signals` are those of the map."""
     imported = served.town.parameters.source is not None  # towns of flcav name their lights by their links
-    mapped = [each for each in signals if imported and each.row.get("type") == TRAFFIC_LIGHT]
+    mapped = [signal for signal in signals if imported and signal.row.get("type") == TRAFFIC_LIGHT]
     net = served.net
     lights = served.town.signals
     place = {link: row for row, link in reversed(list(enumerate(lights.link)))}
@@ -117,7 +117,7 @@ def find_approaches(served: ServedMap, signals: Sequence[MapSignal]) -> list[App
             Approach(
                 junction=link.rpartition(":")[0],
                 link=link,
-                links=tuple(sorted(int(each.rpartition(":")[2]) for each in ruled)),
+                links=tuple(sorted(int(controlled.rpartition(":")[2]) for controlled in ruled)),
                 sign=sign,
                 pose=pose(float(foot[0]), float(foot[1]), ground, heading - np.pi / 2),
                 stop=np.array((x, y, heading)),

@@ -92,7 +92,10 @@ class ServedMap:
         places = list(self._places(every_m))
         poses = np.array([self.frame.from_transform(*place) for place in places]).reshape(-1, 4, 4)
         length, width, height = (
-            max(sides) for sides in zip(*(each.size for each in list_blueprints().values() if each.kind == "vehicle"))
+            max(sides)
+            for sides in zip(
+                *(blueprint.size for blueprint in list_blueprints().values() if blueprint.kind == "vehicle")
+            )
         )
         bottom = poses[:, 2, 3] - ABOVE_M + CLEARANCE_M
         boxes = Footprints(
@@ -131,7 +134,7 @@ def _find_cache() -> Path:
 
 def _hash_import(path: Path) -> str:
     """Return a cache name for the town of a map: a hash of the map, its name and the code that imports it."""
-    code = b"".join(each.read_bytes() for each in sorted(Path(world.__file__).parent.rglob("*.py")))
+    code = b"".join(module.read_bytes() for module in sorted(Path(world.__file__).parent.rglob("*.py")))
     return f"map-{sha256(sha256(code).digest() + path.name.encode() + path.read_bytes()).hexdigest()[:24]}"
 
 
@@ -202,8 +205,8 @@ class Maps:
             town = import_town(path, made).town
             with suppress(OSError):  # no place for a cache, or another server was faster
                 cache.mkdir(parents=True, exist_ok=True)
-                with tempfile.TemporaryDirectory(dir=cache) as beside:
-                    shutil.copytree(made, Path(beside) / path.stem).rename(folder)
+                with tempfile.TemporaryDirectory(dir=cache) as staging:
+                    shutil.copytree(made, Path(staging) / path.stem).rename(folder)
         lacking = mesh if folder.exists() else None
         with suppress(OSError, ValueError):  # not there yet, or damaged
             recall_static_world(town, mesh)
@@ -321,5 +324,5 @@ def pack_mesh(points: NDArray, triangles: NDArray, areas: NDArray) -> bytes:
     body = (places, polygons, np.zeros(links * LINK_BYTES, np.uint8), details, faces)
     tile = head + b"".join(part.tobytes() for part in body)
     size = (high - low)[[0, 2]].tolist()
-    told = (int.from_bytes(b"MSET", "big"), 1, 1)
-    return SET.pack(*told, *low.tolist(), *size, 1, 1 << bits, 1 << bits, len(tile)) + tile
+    header = (int.from_bytes(b"MSET", "big"), 1, 1)
+    return SET.pack(*header, *low.tolist(), *size, 1, 1 << bits, 1 << bits, len(tile)) + tile

@@ -77,7 +77,9 @@ class CarlaServer:
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
         """Serve until cancelled: calls at the first of two bound sockets, streams at the second."""
         connected = self._serve_calls, self._serve_stream
-        servers = [await asyncio.start_server(each, sock=door) for each, door in zip(connected, doors, strict=True)]
+        servers = [
+            await asyncio.start_server(callback, sock=door) for callback, door in zip(connected, doors, strict=True)
+        ]
         await asyncio.wait({self._prepare()}, timeout=PREPARING_S)
         ready()
         try:
@@ -142,16 +144,16 @@ class CarlaServer:
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
         measurements = list(episode.measure(dt_s, self._links.is_heard))
-        for each in measurements:
-            if not each.late:
-                await self._measure(each, episode)
+        for measurement in measurements:
+            if not measurement.late:
+                await self._measure(measurement, episode)
         if episode is not self._calls.episode:  # another map was loaded meanwhile
             return
         if self._calls.managed:
             await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
         await self._publish_state(episode)
         self._published_s = time.monotonic()
-        if images := [each for each in measurements if each.late]:
+        if images := [measurement for measurement in measurements if measurement.late]:
             synchronous = self._calls.settings.synchronous
             unprepared = synchronous and self._preparing is not None and not self._preparing.done()
             if self._drawing is not None and not (unprepared and self._undrawn < MOST_UNDRAWN):
@@ -168,9 +170,9 @@ class CarlaServer:
         try:
             if before is not None:
                 await before
-            for each in images:
+            for measurement in images:
                 if episode is self._calls.episode:
-                    await self._measure(each, episode)
+                    await self._measure(measurement, episode)
             await self._links.await_readers()
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
@@ -184,13 +186,13 @@ class CarlaServer:
             write(writer, reply)
         self._room.set()
 
-    async def _measure(self, each: Measurement, episode: Episode) -> None:
+    async def _measure(self, measurement: Measurement, episode: Episode) -> None:
         """Measure and send, in another thread if rays are cast, so that calls are answered meanwhile."""
-        body = each.body
+        body = measurement.body
         if not isinstance(body, bytes):
-            body = await asyncio.to_thread(body) if each.rays else body()
+            body = await asyncio.to_thread(body) if measurement.rays else body()
         if episode is self._calls.episode:
-            await self._links.publish(each.stream, each.header + body)
+            await self._links.publish(measurement.stream, measurement.header + body)
 
     async def _publish_state(self, episode: Episode) -> None:
         """Send the world state; after a map is loaded, at first only to clients that have subscribed to the new world.
@@ -265,7 +267,7 @@ class CarlaServer:
 
     def _is_full(self, writer: asyncio.StreamWriter) -> bool:
         """Return whether a connection's next call has to wait until cues are served."""
-        waiting = sum(each is writer for each, _ in self._cued)
+        waiting = sum(cue_writer is writer for cue_writer, _ in self._cued)
         return waiting >= MOST_CUES or len(self._cued) >= MOST_CUES_IN_ALL
 
     def _tell_loaded(self, writer: asyncio.StreamWriter, reply: bytes | None = None) -> None:

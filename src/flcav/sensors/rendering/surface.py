@@ -94,9 +94,9 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                 green += share * (colour[piece, 1] * tone - green)
                 blue += share * (colour[piece, 2] * tone - blue)
             if light.to_sun[2] < np.float32(LOW_SUN) and nz > np.float32(0.9):
-                beside = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
+                toward_sun = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
                 flat = 1 - facing
-                sheen = sunny * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
+                sheen = sunny * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (toward_sun - 1))
                 shine_r, shine_g, shine_b = sheen * light.sun[0], sheen * light.sun[1], sheen * light.sun[2]
         elif material == SIDEWALK:
             if nz > np.float32(0.5):
@@ -208,9 +208,9 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
             env_r, env_g, env_b = compute_environment(rx, ry, rz, light, table)
             if gloss > 0 and sunny > 0:
-                beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
-                if beside > np.float32(0.6):
-                    flash = np.exp(gloss * (beside - 1)) * sunny * gloss * np.float32(0.02)
+                toward_sun = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
+                if toward_sun > np.float32(0.6):
+                    flash = np.exp(gloss * (toward_sun - 1)) * sunny * gloss * np.float32(0.02)
                     env_r += flash * light.sun[0]
                     env_g += flash * light.sun[1]
                     env_b += flash * light.sun[2]
@@ -239,9 +239,9 @@ def compute_clear_sky(x, y, z, light):
     red = light.zenith[0] * (1 - low) + light.horizon[0] * low
     green = light.zenith[1] * (1 - low) + light.horizon[1] * low
     blue = light.zenith[2] * (1 - low) + light.horizon[2] * low
-    beside = 1 - (x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2])
-    if beside < np.float32(0.6):
-        halo = np.float32(0.012) / (beside + np.float32(0.012)) * np.float32(0.16) * (1 - beside / np.float32(0.6))
+    off_sun = 1 - (x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2])
+    if off_sun < np.float32(0.6):
+        halo = np.float32(0.012) / (off_sun + np.float32(0.012)) * np.float32(0.16) * (1 - off_sun / np.float32(0.6))
         red += halo * light.sun[0]
         green += halo * light.sun[1]
         blue += halo * light.sun[2]
@@ -252,8 +252,8 @@ def compute_clear_sky(x, y, z, light):
 def compute_sky(x, y, z, light, table):
     """Return red, green, blue of a ray that hits nothing, in the unit direction x, y, z: sky, sun, clouds and air."""
     red, green, blue = compute_clear_sky(x, y, z, light)
-    beside = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
-    sun = min(max((beside - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
+    cosine = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
+    sun = min(max((cosine - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
     if z > np.float32(0.01) and light.cover > 0.02:
         far = 1 / (z + np.float32(0.06))
         u, v = x * far * np.float32(16), y * far * np.float32(16)

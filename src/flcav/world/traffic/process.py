@@ -98,11 +98,13 @@ def record_traffic(simulation: Simulation, steps: Sequence[int], out: Path) -> N
     if director:
         for states, step in zip(seen, steps):  # only now, since a script may place a prop at earlier steps
             states |= {name: (kind, *state) for name, kind, state in director.props(step)}
-    kinds = {name: each[0] for states in seen for name, each in states.items()}
+    kinds = {name: actor_state[0] for states in seen for name, actor_state in states.items()}
     column = {name: i for i, name in enumerate(kinds)}
     state = np.full((len(steps), len(kinds), 4), np.nan)
     for row, states in zip(state, seen):
-        row[[column[name] for name in states]] = np.array([each[1:] for each in states.values()]).reshape(-1, 4)
+        row[[column[name] for name in states]] = np.array([actor_state[1:] for actor_state in states.values()]).reshape(
+            -1, 4
+        )
     recorded = RecordedTraffic(
         id=np.array(list(kinds), dtype=np.str_),
         type=np.array(list(kinds.values()), dtype=np.str_),

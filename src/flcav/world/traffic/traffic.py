@@ -80,7 +80,7 @@ def simulate_drives(
     read = np.unique(np.concatenate((*windows, *drive_windows)))
     raw = _run(town.net, demand, derive_seed(seed, "sumo"), read, scenarios)
     parked = _drop_obstructing(raw, park(net, town.parameters, stream(seed, "parked")))
-    rows, drive_rows = (tuple(np.searchsorted(read, each) for each in spans) for spans in (windows, drive_windows))
+    rows, drive_rows = (tuple(np.searchsorted(read, window) for window in spans) for spans in (windows, drive_windows))
     trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
@@ -104,7 +104,9 @@ def _windows(steps: Ints) -> Ints:
 def _run(net: Path, demand: Demand, seed: int, steps: Ints, scenarios: Sequence[Scenario]) -> RecordedTraffic:
     """Run SUMO without controlled vehicles; return its states at these steps. Raises `RuntimeError` where it fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
-        job = write_job(Path(name), net, demand, seed)._replace(scenarios=[each.model_dump() for each in scenarios])
+        job = write_job(Path(name), net, demand, seed)._replace(
+            scenarios=[scenario.model_dump() for scenario in scenarios]
+        )
         with contextlib.closing(Sumo(job, f"SUMO failed on {net}")) as sumo:
             sumo.record(steps.tolist(), out := Path(name) / "out.npz")
         with np.load(out) as arrays:

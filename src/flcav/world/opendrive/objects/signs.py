@@ -49,7 +49,7 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Mapp
             kind = SIGNS.get(name) or _limit_kind(limit)
             place = locate_thing(road, signal, offset_m)
             if kind is None:
-                left[f"of the type {shorten(name)}" if name != LIMIT_SIGN else _tell_limit(limit)] += 1
+                left[f"of the type {shorten(name)}" if name != LIMIT_SIGN else _explain_limit(limit)] += 1
                 continue
             if place is None:
                 left["no place on the road"] += 1
@@ -100,6 +100,6 @@ def _limit_kind(limit: float | None) -> Literal["speed_30", "speed_60", "speed_9
     return None if limit is None else SPEED_SIGNS.get(round(3.6 * limit))
 
 
-def _tell_limit(limit: float | None) -> str:
+def _explain_limit(limit: float | None) -> str:
     """Write the reason why the sign of a limit [m/s] is left out."""
     return "a limit without a number" if limit is None else f"a limit of {3.6 * limit:.0f} km/h, which no sign shows"

@@ -145,13 +145,13 @@ def _choose(line: _Line, crossed: list[_Crossed], net: RoadNet) -> list[_Crossed
     if not crossed:
         return []
 
-    def rate(each: _Crossed) -> tuple[float, bool, float]:
-        aside = 0.0 if line.ahead is None else round(each.aside_m, 1)
-        return aside, each.before_end_m < -0.5, abs(each.before_end_m)
+    def rate(lane: _Crossed) -> tuple[float, bool, float]:
+        aside = 0.0 if line.ahead is None else round(lane.aside_m, 1)
+        return aside, lane.before_end_m < -0.5, abs(lane.before_end_m)
 
     edge = net.edges[min(crossed, key=rate).edge]
     order = [lane.id for lane in edge.lanes]
-    return sorted((each for each in crossed if each.edge == edge.id), key=lambda each: order.index(each.lane))
+    return sorted((lane for lane in crossed if lane.edge == edge.id), key=lambda lane: order.index(lane.lane))
 
 
 def add_crossing_lines(net: RoadNet, known: tuple[StopLineParameters, ...]) -> tuple[StopLineParameters, ...]:
