@@ -1,7 +1,8 @@
-"""Conversion between the town's frame and CARLA's: the only place that knows a left-handed frame.
+"""Conversion between the world frame of a town and CARLA's left-handed frame.
 
-CARLA's x is that of the map, its y is mirrored, its yaw turns clockwise seen from above, and a positive pitch is
-upwards (Unreal Engine). The town may be moved from the map by an offset. Angular velocities are in degrees per second.
+CARLA's x is that of the map, its y is mirrored, its yaw is clockwise seen from above, and a positive pitch turns the
+nose up (Unreal Engine). The town may be translated from the map by an offset. CARLA's angular velocities are in degrees
+per second.
 """
 
 from dataclasses import dataclass
@@ -17,23 +18,23 @@ MIRROR = np.array((1.0, -1.0, 1.0))
 
 
 def to_vector(values: Array) -> Vector:
-    """Return three numbers (3,) as a tuple."""
+    """Convert an array (3,) to a tuple."""
     x, y, z = values.tolist()
     return x, y, z
 
 
 def mirror(vectors: NDArray[np.floating]) -> Array:
-    """Return vectors (..., 3), directions or points, of one frame in the other."""
+    """Convert vectors (..., 3), directions or points, between a right-handed frame and its mirror image in y."""
     return np.asarray(vectors, np.float64) * MIRROR
 
 
 def mirror_spin(rates: Array) -> Array:
-    """Return angular velocities (..., 3) [rad/s], an axial vector, of one frame in the other."""
-    return -rates * MIRROR
+    """Convert angular velocities (..., 3) [rad/s], axial vectors, between a frame and its mirror image in y."""
+    return -rates * MIRROR  # an axial vector changes its sign under reflection, unlike a polar one
 
 
 def to_rotation(angles: Array) -> Array:
-    """Return CARLA's pitch, yaw and roll (..., 3) [deg] of yaw, pitch and roll (..., 3) [rad] as in `geometry.pose`.
+    """Convert yaw, pitch, roll (..., 3) [rad] of `geometry.pose` to CARLA's pitch, yaw, roll (..., 3) [deg].
 
     Yaws are within -180 and 180.
     """
@@ -43,30 +44,30 @@ def to_rotation(angles: Array) -> Array:
 
 @dataclass(frozen=True)
 class MapFrame:
-    """The frame of a map that clients see, beside that of its town: town = map + offset."""
+    """The frame of CARLA's map relative to the world frame of its town: town = map + offset."""
 
-    offset_m: tuple[float, float] = (0.0, 0.0)
+    offset_m: tuple[float, float] = (0.0, 0.0)  # x, y of the translation [m]
 
     def to_location(self, points: Array) -> Array:
-        """Return CARLA's locations (..., 3) of points (..., 3) of the town."""
+        """Convert points (..., 3) [m] of the world frame to CARLA's locations (..., 3) [m]."""
         return mirror(points - (*self.offset_m, 0.0))
 
     def from_location(self, location: Vector) -> Array:
-        """Return the point (3,) of the town at CARLA's location."""
+        """Convert CARLA's location [m] to a point (3,) [m] of the world frame."""
         return np.array((location[0] + self.offset_m[0], self.offset_m[1] - location[1], location[2]))
 
     def to_transform(self, world_from_body: Array) -> tuple[Vector, Vector]:
-        """Return CARLA's location and rotation of a pose (4, 4) in the town."""
+        """Convert a pose (4, 4) [m] of the world frame to CARLA's location [m] and rotation [deg]."""
         rotation = to_rotation(np.stack(angles_of(world_from_body[:3, :3])))
         return to_vector(self.to_location(world_from_body[:3, 3])), to_vector(rotation)
 
     def from_transform(self, location: Vector, rotation: Vector) -> Array:
-        """Return the pose (4, 4) in the town of CARLA's location and rotation."""
+        """Convert CARLA's location [m] and rotation [deg] to a pose (4, 4) [m] of the world frame."""
         return _pose(self.from_location(location), rotation)
 
 
 def from_mount(location: Vector, rotation: Vector) -> Array:
-    """Return the pose (4, 4) of an attached actor in its parent's frame."""
+    """Convert the relative location [m] and rotation [deg] of an attached actor to its (4, 4) pose, parent frame."""
     return _pose(mirror(np.array(location)), rotation)
 
 

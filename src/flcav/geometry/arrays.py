@@ -3,4 +3,4 @@
 import numpy as np
 from numpy.typing import NDArray
 
-Array = NDArray[np.float64]  # numbers in double precision; shapes and units are told where it is used
+Array = NDArray[np.float64]  # double precision; shape, unit and frame are stated at each use

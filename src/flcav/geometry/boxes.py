@@ -1,4 +1,4 @@
-"""Oriented 3D boxes: transforms, corners, points in boxes."""
+"""Oriented 3D bounding boxes: transforms, corners, point-in-box and segment-box tests."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ LEVEL_RAD = 1e-6  # pitch and roll of a box that is upright
 
 @dataclass(frozen=True)
 class Boxes(Displayed):
-    """N oriented 3D boxes, upright (yaw only) or tilted, in one frame that the owner of the record states.
+    """N oriented 3D bounding boxes, upright (yaw only) or tilted, in one frame, which the containing record states.
 
     Raises ValueError where the lengths or shapes of the arrays do not match.
 
@@ -38,7 +38,7 @@ class Boxes(Displayed):
     """
 
     center: Array  # (N, 3) geometric centre x, y, z [m]
-    size: Array  # (N, 3) length along x, width along y, height along z of the box's own frame [m]
+    size: Array  # (N, 3) length, width and height: extents along x, y and z of the box frame [m]
     yaw: Array  # (N,) heading, counter-clockwise from the frame's x axis [rad]
     label: Words  # (N,) class name
     score: Array | None = None  # (N,) confidence in [0, 1]
@@ -97,8 +97,8 @@ class Boxes(Displayed):
     def columns(self) -> dict[str, NDArray]:
         """Return each quantity as a column (N,), with the scores if known, for `pandas.DataFrame`."""
         names = ("x", "y", "z", "length", "width", "height", "yaw")
-        found: dict[str, NDArray] = {"label": self.label, **dict(zip(names, self.array().T))}
-        return found if self.score is None else found | {"score": self.score}
+        columns: dict[str, NDArray] = {"label": self.label, **dict(zip(names, self.array().T))}
+        return columns if self.score is None else columns | {"score": self.score}
 
     def transform(self, target_from_source: Array) -> "Boxes":
         """Return the boxes in the target frame of a rigid (4, 4) transform.
@@ -119,11 +119,11 @@ class Boxes(Displayed):
         return replace(self, center=center, yaw=yaw, variance=variance, tilt=tilt)
 
     def rotations(self) -> Array:
-        """Return (N, 3, 3) rotations of the boxes' own frames."""
+        """Return (N, 3, 3) rotation matrices from the box frames to the frame of the centres."""
         return rotations_about_z(self.yaw) if self.tilt is None else rotations(self.yaw, *self.tilt.T)
 
     def pose(self, i: int) -> Array:
-        """Return the (4, 4) pose of the centre of box `i`."""
+        """Return the (4, 4) pose of box `i`: the transform from its frame, with the origin at its centre."""
         pitch, roll = (0.0, 0.0) if self.tilt is None else self.tilt[i]
         x, y, z = self.center[i]
         return pose(x, y, z, self.yaw[i], pitch, roll)
@@ -142,12 +142,12 @@ class Boxes(Displayed):
 
 
 def turned_boxes(center: Array, size: Array, rotation: Array, label: Words) -> Boxes:
-    """Return boxes by their rotations: upright where none leans by more than `LEVEL_RAD`.
+    """Return boxes with the given rotation matrices, as upright boxes if none leans by more than `LEVEL_RAD`.
 
     Args:
         center: (M, 3) centres [m].
         size: (M, 3) length, width, height [m].
-        rotation: (M, 3, 3) from the boxes' own frames.
+        rotation: (M, 3, 3) rotation matrices from the box frames.
         label: (M,) class names.
     """
     yaw, *tilts = angles_of(rotation)
@@ -156,7 +156,7 @@ def turned_boxes(center: Array, size: Array, rotation: Array, label: Words) -> B
 
 
 def spread_over_footprints(boxes: Boxes, along: int, across: int) -> Array:
-    """Return (N, along * across, 2) x, y [m] of the centres of so many equal parts of the footprint of each box."""
+    """Return (N, along * across, 2) cell centres x, y [m] of an even grid on the footprint of each box."""
     parts = (np.arange(along) + 0.5) / along - 0.5, (np.arange(across) + 0.5) / across - 0.5
     part = np.stack(np.meshgrid(*parts, indexing="ij"), axis=-1).reshape(-1, 2)
     reach = part[None] * boxes.size[:, None, :2]
@@ -183,9 +183,10 @@ def points_in_boxes(points: ArrayLike, boxes: Boxes, margin_m: float = 0.0) -> M
 
 
 def count_points_in_boxes(points: Array32, boxes: Boxes, boxes_from_points: Array) -> Ints:
-    """Return (N,) the number of P points (P, >= 3), x, y, z [m], in each of N boxes; faces count as inside.
+    """Count the points (P, >= 3), x, y, z [m], in each of N boxes: (N,); faces count as inside.
 
-    `boxes_from_points` is (4, 4). As `points_in_boxes`, for large clouds: only points near a box are transformed.
+    `boxes_from_points` is the (4, 4) transform between the frames. For large clouds: the points are sorted by x, and
+    only those near a box are transformed.
     """
     x, y = np.ascontiguousarray(points[:, :2].T)
     order = np.argsort(x)
@@ -197,7 +198,7 @@ def count_points_in_boxes(points: Array32, boxes: Boxes, boxes_from_points: Arra
         order[low:high][np.abs(y[low:high] - aside) <= far]
         for low, high, aside, far in zip(first, end, center[:, 1], reach, strict=True)
     ]
-    box = np.repeat(np.arange(len(boxes)), [len(own) for own in near])
+    box = np.repeat(np.arange(len(boxes)), [len(rows_near) for rows_near in near])
     rows = np.concatenate(near) if near else np.zeros(0, np.int64)
     moved = transform_points(boxes_from_points, points[rows, :3].astype(np.float64))
     offset = moved - boxes.center[box]
@@ -207,14 +208,14 @@ def count_points_in_boxes(points: Array32, boxes: Boxes, boxes_from_points: Arra
 
 
 def _turn_back(offset: Array, yaw: ArrayLike) -> Array:
-    """Return offsets (P, 3) from centres in the frames of boxes with this yaw, one or (P,)."""
+    """Rotate offsets (P, 3) [m] from box centres into the box frames, whose `yaw` [rad] is a number or (P,)."""
     cos, sin = np.cos(yaw), np.sin(yaw)
     dx, dy, dz = offset.T
     return np.stack((dx * cos + dy * sin, dy * cos - dx * sin, dz), axis=1)
 
 
 def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> Mask:
-    """Return (S, N) whether each of S segments meets each of N boxes, by slabs (Kay and Kajiya, SIGGRAPH 1986).
+    """Return (S, N) whether each of S segments meets each of N boxes, by the slab method (Kay and Kajiya, 1986).
 
     `starts` and `ends` are (S, 3), x, y, z [m] in the frame of the boxes. Faces belong to the box.
     """
@@ -225,7 +226,9 @@ def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> Mas
     half = boxes.size / 2
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (-half - local) / along, (half - local) / along
-    parallel, within = along == 0, np.abs(local) <= half
+    # A segment parallel to a slab gives 0/0 or an infinity above: it is in the slab for its whole length, or never.
+    parallel = along == 0
+    within = np.abs(local) <= half
     near = np.where(parallel, np.where(within, -np.inf, np.inf), np.minimum(first, second))
     far = np.where(parallel, np.where(within, np.inf, -np.inf), np.maximum(first, second))
     enters = near.max(axis=-1, initial=0.0)
@@ -234,9 +237,9 @@ def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> Mas
 
 
 def concatenate(parts: Sequence[Boxes]) -> Boxes:
-    """Return the boxes of all `parts` in order, with scores and variances if every non-empty part has them.
+    """Concatenate `parts` in order; the result has scores and variances if every non-empty part has them.
 
-    Where all are empty, it is the first: no boxes, which have scores or not.
+    If all parts are empty, the first one is returned, with or without (empty) scores; without parts, `Boxes.empty()`.
     """
     parts = [part for part in parts if len(part)] or parts[:1]
     if not parts:

@@ -107,9 +107,9 @@ def angles_of(rotation: Array) -> tuple[Array, Array, Array]:
 
 
 def rotate(x: Coordinate, y: Coordinate, yaw: float) -> tuple[Coordinate, Coordinate]:
-    """Return vectors x, y of the plane rotated by `yaw` [rad]: from a body's frame to the one its heading is given in.
+    """Rotate plane vectors x, y by `yaw` [rad], counter-clockwise: from the body frame to the frame of its heading.
 
-    By -`yaw` they go back: what is (x, y) there, is so far ahead and to the left of the body.
+    Rotating by -`yaw` is the inverse: it gives the components forward and to the left of the body.
     """
     cos, sin = math.cos(yaw), math.sin(yaw)
     return x * cos - y * sin, x * sin + y * cos

@@ -1,6 +1,6 @@
-"""Simulation of a colour camera: rendering, tone mapping, sensor noise; depth, semantic and instance images.
+"""Simulation of a colour camera: rendering, tone mapping and sensor noise; depth, semantic and instance images.
 
-Tone mapping: exposure, a filmic curve and the sRGB transfer function, by one look-up table; sensor noise.
+Tone mapping applies exposure, a filmic curve and the sRGB transfer function by one look-up table.
 """
 
 from functools import lru_cache
@@ -31,10 +31,10 @@ class Camera(Lens):
 
 
 class Exposure(NamedTuple):
-    """A colour image, with depth, semantic and instance ground truth by the rays through the pixels' centres."""
+    """A colour image, with ground truth of depth, semantics and instances at the pixels' centres."""
 
     rgb: Bytes  # (H, W, 3) sRGB
-    depth_m: Array32  # (H, W) z in the optical frame; inf for the sky
+    depth_m: Array32  # (H, W) z in the optical frame [m]; inf for the sky
     semantic: Bytes  # (H, W) one of SEMANTICS
     instance: Ints32  # (H, W) 0 none, a + 1: the trace's actor a, -(t + 1): thing t of `list_signs_and_signals`
 
@@ -49,11 +49,11 @@ def photograph(
     hidden: int | None = None,
     threads: int = 1,
 ) -> Exposure:
-    """Return the image at the scene's instant and its ground truth, without the actor `hidden` (the carrier).
+    """Render the image at the scene's instant and its ground truth, without the actor `hidden` (the carrier).
 
-    `world_from_camera` (4, 4) is the pose of the optical frame (x right, y down, z forward): for a mount with body axes
-    `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments, and the same state of `rng`, give the same bytes, with
-    any number of `threads`.
+    `world_from_camera` (4, 4) [m] is the pose of the optical frame (x right, y down, z forward): for a mount with body
+    axes `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments and state of `rng` give the same bytes, with any
+    number of `threads`.
     """
     picture = render_radiance(scene, world_from_camera, camera, weather, rng, hidden=hidden, threads=threads)
     shape = (camera.height, camera.width)
@@ -76,7 +76,7 @@ def photograph(
 def label(
     scene: Scene, world_from_camera: Array, lens: Lens, *, hidden: int | None = None, threads: int = 1
 ) -> tuple[Bytes, Ints32]:
-    """Return the semantic and the instance image (H, W) of `photograph`, without its colours, which takes longest."""
+    """Return the semantic and the instance image (H, W) of `photograph`, without rendering colours."""
     semantic, instance = _labels(*survey(scene, world_from_camera, lens, hidden=hidden, threads=threads))
     return semantic.reshape(lens.height, lens.width), instance.reshape(lens.height, lens.width)
 
@@ -103,12 +103,12 @@ GRAINS = 65521  # length of the noise table: a prime, so that it does not repeat
 
 
 CONTRAST, SHOULDER = 1.25, 0.977  # a and d of Lottes' curve
-WHITE = 5.0  # exposed light that maps to white: sunlit walls stay below
-MIDDLE, MIDDLE_SHOWN = 0.15, 0.17  # middle grey, and the value it maps to
+WHITE = 5.0  # exposed radiance that maps to white: sunlit walls are below
+MIDDLE, MIDDLE_SHOWN = 0.15, 0.17  # exposed radiance of middle grey, and the value it maps to
 
 
 def _filmic(light: Array) -> Array:
-    """Return the tone-mapped value, 0 to 1, of exposed light: Lottes, Optimization of HDR Color Pipelines, GDC 2016."""
+    """Tone-map exposed radiance to 0..1 (Lottes, Advanced Techniques and Optimization of HDR Color Pipelines, 2016)."""
     low, high = MIDDLE ** (CONTRAST * SHOULDER), WHITE ** (CONTRAST * SHOULDER)
     scale = (WHITE**CONTRAST * MIDDLE_SHOWN - MIDDLE**CONTRAST) / ((high - low) * MIDDLE_SHOWN)
     shift = (high * MIDDLE**CONTRAST - WHITE**CONTRAST * low * MIDDLE_SHOWN) / ((high - low) * MIDDLE_SHOWN)
@@ -126,7 +126,7 @@ TABLE = _table()
 
 @lru_cache(maxsize=1)
 def grain() -> Array32:
-    """Return the noise table: (GRAINS,) standard normal numbers, always the same, read from a random index on."""
+    """Return the noise table: (GRAINS,) fixed standard normal numbers, which are read from a random index on."""
     return stream(0, "grain").standard_normal(GRAINS, np.float32)
 
 
@@ -134,8 +134,8 @@ def grain() -> Array32:
 def develop(radiance, exposure, grain, shift, noise, out):
     """Tone-map `radiance` (N, 3) into sRGB bytes `out` (N, 3).
 
-    `exposure` is a factor of the radiance; `noise` is the standard deviation of the noise in bytes, read from the table
-    `grain` (GRAINS,), from index `shift` on.
+    `exposure` is a factor of the radiance; `noise` is the standard deviation of the noise in byte values, read from the
+    table `grain` (GRAINS,), from index `shift` on.
     """
     number = shift % GRAINS
     for pixel in range(len(radiance)):

@@ -16,7 +16,7 @@ from flcav.interface.notebook import Displayed
 from flcav.world.weather import Weather
 
 UNKNOWN_PIXELS = -1  # in `Views.pixels`
-LONGEST_NAME = 100  # characters of a frame's key, and of the names in it: parts of file names
+LONGEST_NAME = 100  # characters of a frame's key, which is part of file names
 
 # Numbers and names of CARLA's semantic tags (0.9.15)
 SEMANTICS: dict[str, int] = {
@@ -55,18 +55,18 @@ class Calibration:
     y left, z up.
     """
 
-    agent_from_sensor: Mapping[str, Array]  # (4, 4)
-    intrinsics: Mapping[str, Array] = field(default_factory=dict)  # (3, 3) camera matrix of each camera [px]
-    distortion: Mapping[str, Array] = field(default_factory=dict)  # (5,) k1 k2 p1 p2 k3 of each camera, as OpenCV's
+    agent_from_sensor: Mapping[str, Array]  # (4, 4) extrinsics [m]
+    intrinsics: Mapping[str, Array] = field(default_factory=dict)  # (3, 3) camera matrix [px]
+    distortion: Mapping[str, Array] = field(default_factory=dict)  # (5,) k1 k2 p1 p2 k3 as in OpenCV
     offset_ms: Mapping[str, float] = field(default_factory=dict)  # trigger time after the LiDAR spin; 0 where absent
 
 
 @dataclass(frozen=True)
 class CameraImage:
-    """A colour image, with depth, semantic and instance ground truth of each of its (H, W) pixels; None: unknown."""
+    """A colour image, with ground truth of depth, semantics and instances of its (H, W) pixels; None: unknown."""
 
     rgb: Bytes  # (H, W, 3) sRGB
-    depth_m: Array32 | None = None  # (H, W) z in the optical frame; inf for the sky
+    depth_m: Array32 | None = None  # (H, W) z in the optical frame [m]; inf for the sky
     semantic: Bytes | None = None  # (H, W) class: one of SEMANTICS
     instance: NDArray[np.uint16] | None = None
     # (H, W) 1 + row of the frame's annotations, 0 where there is no annotated actor
@@ -76,28 +76,31 @@ class CameraImage:
 class Views:
     """Image annotations of the M annotated actors in one camera [px]; the centre of the first pixel is (0, 0)."""
 
-    amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN where it does not touch it
+    amodal_box: Array  # (M, 4) x1 y1 x2 y2 of the whole actor, not clipped to the image; NaN where it is outside
     visible_box: Array  # (M, 4) around its visible pixels, to their outer edges; NaN where there are none
-    pixels: Ints  # (M,) number of visible pixels; UNKNOWN_PIXELS where an imported dataset does not say
-    truncation: Array  # (M,) share of the amodal box that lies outside the image, 0 to 1
+    pixels: Ints  # (M,) number of visible pixels; UNKNOWN_PIXELS where an imported dataset does not have it
+    truncation: Array  # (M,) share of the amodal box that is outside the image, 0 to 1
     occlusion: Array
     # (M,) 1 - visible pixels / pixels in a world without other objects; 1 where none is visible, NaN where unknown
 
     @property
     def shown_box(self) -> Array:
-        """Return (M, 4) the visible boxes; of actors with UNKNOWN_PIXELS the amodal ones."""
+        """Return (M, 4) the visible boxes [px]; for actors with UNKNOWN_PIXELS the amodal ones."""
         return np.where((self.pixels == UNKNOWN_PIXELS)[:, None], self.amodal_box, self.visible_box)
 
 
 @dataclass(frozen=True)
 class SignViews:
-    """Image annotations of K traffic signs and signal heads whose front one camera shows; pixels as in `Views`."""
+    """Image annotations of K traffic signs and signal heads whose front is visible in one camera.
+
+    Pixels as in `Views`.
+    """
 
     kind: Words  # (K,) class: see `flcav.world.static.SignsAndSignals`
     state: Words  # (K,) of a signal: "red", "red_amber", "amber", "green", "off"; of a sign ""
-    box: Array  # (K, 4) x1 y1 x2 y2 around its visible pixels, to their outer edges
+    box: Array  # (K, 4) x1 y1 x2 y2 around its visible pixels, to their outer edges [px]
     pixels: Ints  # (K,) number of visible pixels
-    distance_m: Array  # (K,) from the camera
+    distance_m: Array  # (K,) distance from the camera [m]
     thing: Ints  # (K,) index into the town's signs and signal heads, the same in all scenes
 
     def __len__(self) -> int:
@@ -105,26 +108,26 @@ class SignViews:
 
     @classmethod
     def none(cls) -> "SignViews":
-        """Return the record of a camera without any."""
+        """Return the record of a camera without visible signs."""
         none, number = np.zeros(0, np.str_), np.zeros(0, np.int64)
         return cls(none, none, np.zeros((0, 4)), number, np.zeros(0), number)
 
 
 @dataclass(frozen=True)
 class Annotations:
-    """Ground truth of one frame: every actor but the agent itself that is within range or shows in a camera.
+    """Ground truth of one frame: all actors, except the agent itself, that are within range or visible in a camera.
 
-    The range is that of the LiDARs; an actor within it is annotated even if it is hidden. Of imported datasets it is
-    what their format labels; velocity, acceleration and occlusion are NaN where it does not say.
+    The range is that of the LiDARs; an actor within it is annotated even if it is occluded. Imported datasets have what
+    their format labels; velocity, acceleration and occlusion are NaN where it does not.
     """
 
     track: Words  # (M,) track ids, the same in all frames of a scene
     boxes: Boxes  # (M,) world frame, at the LiDAR spin; label = actor category (car, van, truck, ...)
-    velocity: Array  # (M, 3) world [m/s]
-    acceleration: Array  # (M, 3) world [m/s^2]
+    velocity: Array  # (M, 3) world frame [m/s]
+    acceleration: Array  # (M, 3) world frame [m/s^2]
     returns: Ints  # (M,) LiDAR returns from the actor in this frame, all LiDARs together
     occlusion: Array  # (M,) for the LiDARs: 1 - visible rays / unoccluded rays; 1 where none is visible
-    points: Mapping[str, Ints] = field(default_factory=dict)  # LiDAR or radar -> (M,) points from it
+    points: Mapping[str, Ints] = field(default_factory=dict)  # LiDAR or radar -> (M,) its points on the actor
     views: Mapping[str, Views] = field(default_factory=dict)  # colour or thermal camera -> actors in it
     signs: Mapping[str, SignViews] = field(default_factory=dict)  # camera -> signs and signal heads in it
 
@@ -144,19 +147,19 @@ class Frame(Displayed):
     True
     """
 
-    scene: str  # one scene is one traffic run; frames of different scenes share no traffic
+    scene: str  # name of the scene, a traffic run; frames of different scenes share no traffic
     index: int  # number of the spin within the scene, common to all agents of the scene
-    time_s: float  # simulation time of the spin
+    time_s: float  # simulation time of the spin [s]
     agent: str  # such as "cav0" (a vehicle) or "pole3"
-    world_from_agent: Array  # (4, 4) at the spin
-    calibration: Calibration  # the true one
-    assumed: Calibration  # the one that the agent works with
+    world_from_agent: Array  # (4, 4) pose at the spin [m]
+    calibration: Calibration  # the true calibration
+    assumed: Calibration  # the calibration that the agent assumes
     lidar: Mapping[str, Array32]  # LiDAR name -> (N, 4) x, y, z [m], intensity [0, 1]; sensor frame
     annotations: Annotations
     point_times: Mapping[str, Array32] = field(default_factory=dict)
-    # LiDAR with a rolling spin -> (N,) time of each point [s] after `time_s`; a point is given in the sensor's frame at
-    # that time: see `flcav.sensors.lidar.rolling`. Of an imported dataset it is in the sensor's frame at `time_s`, its
-    # motion compensated
+    # LiDAR with a rolling spin -> (N,) times of the points [s] after `time_s`; a point is in the sensor frame at its
+    # time: see `flcav.sensors.lidar.rolling`. Points of an imported dataset are motion-compensated, in the sensor frame
+    # at `time_s`
     images: Mapping[str, CameraImage] = field(default_factory=dict)
     infrared: Mapping[str, NDArray[np.uint16]] = field(default_factory=dict)  # (H, W) apparent temperature [0.01 K]
     radar: Mapping[str, Array32] = field(default_factory=dict)
@@ -165,7 +168,7 @@ class Frame(Displayed):
     imu: Mapping[str, Array] = field(default_factory=dict)  # (6,) specific force [m/s^2], angular rate [rad/s]
     weather: Weather | None = None
     agent_at_trigger: Mapping[str, Array] = field(default_factory=dict)
-    # sensor -> (4, 4) world_from_agent at its trigger time; only of vehicles' sensors that trigger off the spin
+    # sensor -> (4, 4) world_from_agent at its trigger time [m]; only for vehicles' sensors that trigger off the spin
 
     def __repr__(self) -> str:
         sensors = [*self.lidar, *self.images, *self.infrared, *self.radar, *self.gnss, *self.imu]
@@ -178,18 +181,18 @@ class Frame(Displayed):
 
     @property
     def agent_from_sensor(self) -> Mapping[str, Array]:
-        """Return the true (4, 4) mounts of the sensors, by name."""
+        """Return the true (4, 4) extrinsics of the sensors, by name."""
         return self.calibration.agent_from_sensor
 
     def world_from_sensor(self, name: str) -> Array:
-        """Return the true (4, 4) pose of sensor `name` in the world at its trigger time; the ground truth refers to it.
+        """Return the true (4, 4) pose of sensor `name` at its trigger time, world frame; the ground truth refers to it.
 
         Raises `KeyError` for an unknown sensor.
         """
         return self.agent_at_trigger.get(name, self.world_from_agent) @ self.calibration.agent_from_sensor[name]
 
     def assumed_world_from_sensor(self, name: str) -> Array:
-        """Return the (4, 4) pose of sensor `name` in the world by the agent's assumed mount, at the true trigger time.
+        """Return the (4, 4) pose of sensor `name` by the assumed extrinsics, at the true trigger time, world frame.
 
         Raises `KeyError` for an unknown sensor.
         """
@@ -198,6 +201,6 @@ class Frame(Displayed):
 
 @dataclass(frozen=True)
 class LinkedFrame(Frame):
-    """A frame some of whose measurements are files in an encoding that datasets have: a recording links to them."""
+    """A frame with measurements that are already files in a dataset's encoding: a recording links to them."""
 
-    files: Mapping[str, Path] = field(default_factory=dict)  # LiDAR or camera -> file of its points or its picture
+    files: Mapping[str, Path] = field(default_factory=dict)  # LiDAR or camera -> file of its points or image

@@ -1,8 +1,7 @@
-"""Ground truth of one frame from the rays of its sensors: boxes, occlusion, and what images show of actors and signs.
+"""Ground truth of one frame from the rays of its sensors: boxes, occlusion, and image annotations of actors and signs.
 
-Occlusion of actors for a LiDAR: occluded rays, counted by casting stopped rays again in an empty world.
-
-Only rays that end before an actor's bounding box and pass through it are cast again, against that actor alone.
+The occlusion of actors for a LiDAR counts occluded rays, by casting stopped rays again in an empty world: only rays
+that would pass through an actor's bounding box but end before it are cast again, against that actor only.
 """
 
 from collections.abc import Mapping
@@ -26,20 +25,20 @@ class LidarSweep(NamedTuple):
     """The rays of one LiDAR sweep, and its returns by actor."""
 
     lidar: Lidar
-    world_from_sensor: Array  # (4, 4)
-    passes: Mask  # (N,) whether a ray goes through glass: see `draw_passes`
-    distance: Array32  # (N,) where the rays ended [m]
-    instance: Ints32  # (N,) what they ended at: a + 1 at the scene's actor a
-    returns: Ints  # (A,) points from each of the scene's actors
-    visible: Ints  # (A,) rays that return from each, detected or not
+    world_from_sensor: Array  # (4, 4) [m]
+    passes: Mask  # (N,) whether a ray passes through glass: see `draw_passes`
+    distance: Array32  # (N,) distance of the rays' ends [m]
+    instance: Ints32  # (N,) instance at the rays' ends: a + 1 for the scene's actor a
+    returns: Ints  # (A,) points on the scene's actors
+    visible: Ints  # (A,) rays that return from the actors, detected or not
 
 
 class InstanceImage(NamedTuple):
     """The instance image of one colour or thermal camera, and its pose."""
 
     lens: Lens
-    world_from_camera: Array  # (4, 4) of the optical frame
-    offset_s: float  # trigger time after the spin
+    world_from_camera: Array  # (4, 4) of the optical frame [m]
+    offset_s: float  # trigger time after the spin [s]
     instance: Ints32  # (H, W) 0 none, a + 1 = the scene's actor a, -(t + 1) = thing t of the town
 
 
@@ -54,11 +53,12 @@ def annotate_frame(
 ) -> tuple[Annotations, Ints]:
     """Return the annotations of M actors, and their indices (M,) in the trace.
 
-    Annotated are all actors but props and `own` (the carrier) that are `within` (A,) range or show in a camera.
-    `sweeps` are by LiDAR, `sights` by camera; `echoes` are by radar the number (A,) of detections of each actor. Moves
-    `scene` to the cameras' trigger times, and back to the spin.
+    An actor is annotated if it is `within` (A,) range or visible in a camera; props and the carrier `own` are not.
+    `sweeps` are by LiDAR, `sights` by camera; `echoes` are the numbers (A,) of detections of the actors, by radar. This
+    moves `scene` to the cameras' trigger times, and back to the spin.
     """
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     regions = {name: find_actor_regions(sight.instance, len(trace.actor)) for name, sight in sights.items()}
     labelled = np.logical_or.reduce([within, *(region.pixels > 0 for region in regions.values())])
     labelled &= trace.category != "prop"
@@ -66,7 +66,8 @@ def annotate_frame(
         labelled[own] = False
     actors = np.flatnonzero(labelled)
 
-    views, signs = {}, {}
+    views = {}
+    signs = {}
     for name, sight in sights.items():
         scene.move_to(index, sight.offset_s)
         views[name] = view_actors(scene, sight.world_from_camera, sight.lens, sight.instance, regions[name], actors)
@@ -94,11 +95,11 @@ def annotate_frame(
 
 
 def _occlusion(scene: Scene, sweeps: list[LidarSweep], actors: Ints) -> Array:
-    """Return (K,) the occluded share of each actor's rays, all LiDARs together; 1 where none is visible."""
+    """Return (K,) the occluded share of the actors' rays, over all LiDARs; 1 where none is visible."""
     visible, occluded = np.zeros((2, len(actors)), np.int64)
     for sweep in sweeps:
         visible += sweep.visible[actors]
-    seen = np.flatnonzero(visible)  # the occlusion of the others is 1, whatever the number of occluded rays
+    seen = np.flatnonzero(visible)  # the occlusion of the others is 1 for any number of occluded rays
     for sweep in sweeps:
         occluded[seen] += count_occluded_rays(
             scene, sweep.world_from_sensor, sweep.lidar, sweep.passes, sweep.distance, sweep.instance, actors[seen]
@@ -106,7 +107,7 @@ def _occlusion(scene: Scene, sweeps: list[LidarSweep], actors: Ints) -> Array:
     return 1 - visible / np.maximum(visible + occluded, 1)
 
 
-BOX_MARGIN_M = 0.01  # by which boxes are grown, so that no ray that grazes a mesh is missed
+BOX_MARGIN_M = 0.01  # by which boxes are enlarged, so that no ray that grazes a mesh is missed
 
 
 def count_occluded_rays(
@@ -118,10 +119,10 @@ def count_occluded_rays(
     instance: Ints32,
     actors: Ints,
 ) -> Ints:
-    """Return the number (K,) of rays that return from each of `actors` (K,) in an empty world, but not in this one.
+    """Count the rays (K,) that would return from `actors` (K,) in an empty world, but do not in this one.
 
-    `distance` (N,) [m] and `instance` (N,) are where the sweep's rays ended and at what: a + 1 at actor a. `passes`
-    (N,) marks the rays that go through glass.
+    `distance` (N,) [m] and `instance` (N,) are those of the ends of the sweep's rays: a + 1 for actor a. `passes` (N,)
+    marks the rays that pass through glass; `world_from_sensor` (4, 4) [m] is the sensor's pose.
     """
     pattern, surfaces = build_ray_pattern(lidar), scene.surfaces
     body_from_sensor = _bodies_from(scene.poses()[actors], scene.rotations()[actors], world_from_sensor)
@@ -129,9 +130,10 @@ def count_occluded_rays(
         pattern, lidar.azimuth_steps, body_from_sensor, scene.trace.size[actors], BOX_MARGIN_M, distance
     )
     group = np.repeat(np.arange(len(actors)), counts)
-    if lidar.rolling:  # an actor may have been hit at another place than where it is at the scene's instant
+    if lidar.rolling:  # an actor may have been hit at another place than that at the scene's instant
         others = instance[rays] != actors[group] + 1
-        rays, group = rays[others], group[others]
+        rays = rays[others]
+        group = group[others]
     directions = pattern[rays]
 
     def trace(rays: Ints | slice, *, near_m: Array32 | None = None) -> Hits:
@@ -143,44 +145,44 @@ def count_occluded_rays(
 
 
 def _bodies_from(poses: Array, rotations: Array, world_from_sensor: Array) -> Array:
-    """Return (K, 4, 4) transforms `body_from_sensor` of actors at `poses` (K, >=3) x, y, z, turned by (K, 3, 3)."""
+    """Return (K, 4, 4) `body_from_sensor` of actors at `poses` (K, >=3) x, y, z [m] with these rotations (K, 3, 3)."""
     turn = np.swapaxes(rotations, 1, 2)
-    found = np.tile(np.eye(4), (len(poses), 1, 1))
-    found[:, :3, :3] = turn @ world_from_sensor[:3, :3]
-    found[:, :3, 3] = np.einsum("kij,kj->ki", turn, world_from_sensor[:3, 3] - poses[:, :3])
-    return found
+    transforms = np.tile(np.eye(4), (len(poses), 1, 1))
+    transforms[:, :3, :3] = turn @ world_from_sensor[:3, :3]
+    transforms[:, :3, 3] = np.einsum("kij,kj->ki", turn, world_from_sensor[:3, 3] - poses[:, :3])
+    return transforms
 
 
 @compiled
 def _stopped_rays(directions, steps, body_from_sensor, size, margin, distance):
-    """Return the rays that end before each of K boxes on their way, box after box, and their number (K,) by box."""
+    """Return the rays that end before K boxes on their way, box by box, and their numbers (K,)."""
     counts = np.zeros(len(size), np.int64)
-    found = np.empty(1024, np.int64)
+    stopped = np.empty(1024, np.int64)
     total = 0
     for box in range(len(size)):
         rays = find_occluded_rays(directions, steps, body_from_sensor[box], size[box], margin, distance)
         counts[box] = len(rays)
-        if total + len(rays) > len(found):
+        if total + len(rays) > len(stopped):
             larger = np.empty(2 * (total + len(rays)), np.int64)
-            larger[:total] = found[:total]
-            found = larger
-        found[total : total + len(rays)] = rays
+            larger[:total] = stopped[:total]
+            stopped = larger
+        stopped[total : total + len(rays)] = rays
         total += len(rays)
-    return found[:total], counts
+    return stopped[:total], counts
 
 
 @compiled
 def find_occluded_rays(directions, steps, body_from_sensor, size, margin, distance):
     """Return the indices of the rays of a spinning pattern (channels * steps, 3) that end before a box on their way.
 
-    Rays end at `distance` (N,) [m]. The box of `size` (3,), grown by `margin` [m], stands on the origin of the body
-    frame. Slab test, for the columns between the azimuths of the box's corners only.
+    Rays end at `distance` (N,) [m]. The box of `size` (3,) [m], enlarged by `margin` [m], stands on the origin of the
+    body frame. Only the columns between the azimuths of the box's corners are tested, by the slab method.
     """
     low = np.array([-size[0] / 2, -size[1] / 2, 0.0]) - margin
     high = np.array([size[0] / 2, size[1] / 2, size[2]]) + margin
     first, columns = _columns(low, high, body_from_sensor, steps)
     channels = len(directions) // steps
-    found = np.empty(channels * columns, np.int64)
+    occluded = np.empty(channels * columns, np.int64)
     count = 0
     for channel in range(channels):
         for column in range(first, first + columns):
@@ -199,9 +201,9 @@ def find_occluded_rays(directions, steps, body_from_sensor, size, margin, distan
                 enter = max(enter, min(one, other))
                 leave = min(leave, max(one, other))
             if enter <= leave and distance[ray] <= enter:
-                found[count] = ray
+                occluded[count] = ray
                 count += 1
-    return found[:count]
+    return occluded[:count]
 
 
 @compiled
@@ -228,7 +230,7 @@ def _columns(low, high, body_from_sensor, steps):
     return first % steps, min(last - first + 1, steps)
 
 
-READABLE = np.cos(np.radians(80.0))  # of the largest angle between a sign's normal and the line of sight
+READABLE = np.cos(np.radians(80.0))  # cosine of the largest angle between a sign's normal and the line of sight
 STATES = {
     **dict.fromkeys("rR", "red"),
     **dict.fromkeys("yY", "amber"),
@@ -239,10 +241,10 @@ STATES = {
 
 
 def view_signs(scene: Scene, world_from_camera: Array, instance: Ints32) -> SignViews:
-    """Return the signs and signal heads whose front an image shows.
+    """Return the signs and signal heads whose front is visible in an image.
 
-    `instance` (H, W) is -(t + 1) at the town's thing t; `world_from_camera` (4, 4) is the camera's pose. The scene is
-    at the instant of the image.
+    `instance` (H, W) is -(t + 1) at the town's thing t; `world_from_camera` (4, 4) [m] is the camera's pose. The scene
+    must be at the instant of the image.
     """
     things = scene.things
     regions = find_thing_regions(instance, len(things))

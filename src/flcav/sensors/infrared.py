@@ -2,13 +2,13 @@
 
 A pixel's apparent temperature is t * (e * T + (1 - e) * T_mirrored) + (1 - t) * T_air, with the surface's temperature T
 and emissivity e, the temperature T_mirrored of what it reflects, and the transmittance t = exp(-extinction * distance)
-of the air. Temperatures are mixed linearly instead of radiances: within 30 K of each other that is right to about 1 K.
+of the air. Temperatures are mixed linearly instead of radiances, which is accurate to about 1 K within 30 K.
 
 T = T_air + difference: a surface in the sun is up to `sun_k` warmer (times the cosine of incidence and the clouds'
-transmittance), one that faces a clear night sky up to `sky_k` colder, the less the more of the sky is hidden; rain
-takes most of both away. Moving vehicles are warm at engine, tyres, brakes and lamps, people by skin and clothes. Window
-panes reflect the sky; smooth noise varies the temperatures of the town's surfaces. The extinction of fog in the
-long-wave infrared is taken as 0.6 of that of light, that of clear air as 0.2 per km. The lens blurs by `BLUR_PX`.
+transmittance), one that faces a clear night sky up to `sky_k` colder, in proportion to the visible sky; rain reduces
+both. Moving vehicles are warm at engine, tyres, brakes and lamps, people at skin and clothes. Window panes reflect the
+sky; smooth noise varies the temperatures of the town's surfaces. The extinction of fog in the long-wave infrared is
+taken as 0.6 of that of light, that of clear air as 0.2 per km. The lens blurs by `BLUR_PX`.
 """
 
 from typing import NamedTuple
@@ -33,11 +33,11 @@ from flcav.world.weather import Weather
 
 FAR_M = 1000.0
 KELVIN_STEP = 0.01  # quantisation of a thermal image
-FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012  # extinctions: fog's over that of light, air, 1 mm/h
-ENGINE_SHARE = 0.28  # engine compartment, share of a vehicle's length from its front
-LAMP_K = 14.0  # how much warmer a lit lamp is
+FOG_SHARE, CLEAR_AIR_PER_M, RAIN_PER_M = 0.6, 0.0002, 0.0012  # fog's extinction over that of light; air, rain at 1 mm/h
+ENGINE_SHARE = 0.28  # length of the engine compartment over that of the vehicle
+LAMP_K = 14.0  # warming of a lit lamp
 BLUR_PX = 0.6  # standard deviation of the lens' point spread function
-PATCHES_K = 1.6  # range of the noise of one surface's temperature
+PATCHES_K = 1.6  # range of the noise of a surface's temperature
 PANE_EMISSIVITY = 0.85
 WALL, BUILDING = int(Material.WALL), int(TownPart.BUILDING)
 
@@ -45,11 +45,11 @@ WALL, BUILDING = int(Material.WALL), int(TownPart.BUILDING)
 class Warmth(NamedTuple):
     """Thermal properties of a material: differences from the temperature of the air, and emissivity."""
 
-    sun_k: float = 10.0  # warmer by this, facing a clear sun at noon
-    sky_k: float = 4.0  # colder by this under a clear night sky
+    sun_k: float = 10.0  # warming when facing a clear sun at noon [K]
+    sky_k: float = 4.0  # cooling under a clear night sky [K]
     emissivity: float = 0.94
-    moving_k: float = 0.0  # warmer by this while its vehicle moves
-    body_c: float | None = None  # body temperature [deg C] of living things, in any weather
+    moving_k: float = 0.0  # warming while its vehicle moves [K]
+    body_c: float | None = None  # surface temperature of people in any weather [deg C]
 
 
 WARMTH: dict[Material, Warmth] = {
@@ -98,9 +98,9 @@ def render_thermal(
     *,
     hidden: int | None = None,
 ) -> NDArray[np.uint16]:
-    """Return a thermal image (H, W) of apparent temperatures [0.01 K], without the actor `hidden` (the carrier).
+    """Render a thermal image (H, W) of apparent temperatures [0.01 K], without the actor `hidden` (the carrier).
 
-    `world_from_camera` (4, 4) is the pose of the optical frame, as for `camera.photograph`.
+    `world_from_camera` (4, 4) [m] is the pose of the optical frame, as for `camera.photograph`.
     """
     rays = compute_pixel_rays(infrared)
     appearance, light = build_appearance(scene), compute_light(weather)
@@ -116,12 +116,16 @@ def render_thermal(
     cold = free * (0.5 + 0.5 * seen.normal[:, 2]) * (1 - 0.9 * weather.cloud_cover)
     night = float(np.clip((8.0 - weather.sun_elevation_deg) / 14.0, 0, 1))
     dry = 1 - 0.8 * max(weather.wetness, min(weather.rain_mm_h / 5.0, 1.0))
-    own = _SUN[material] * heat - night * _SKY[material] * np.where(_SKY[material] > 0, cold, 1.0) + PATCHES_K * patch
-    own = air + dry * own + _living(seen, material, air) + _driving(scene, seen, material, bool(light.lamps > 0.5))
+    surface_k = (
+        _SUN[material] * heat - night * _SKY[material] * np.where(_SKY[material] > 0, cold, 1.0) + PATCHES_K * patch
+    )
+    surface_k = (
+        air + dry * surface_k + _living(seen, material, air) + _driving(scene, seen, material, bool(light.lamps > 0.5))
+    )
     rise = seen.ray[:, 2] - 2 * np.einsum("ij,ij->i", seen.ray, seen.normal) * seen.normal[:, 2]
     mirrored = np.where(rise > 0, sky_temperature(weather, rise), air)
     emissivity = np.where(pane > 0, 1 - pane * (1 - PANE_EMISSIVITY), _EMISSIVITY[material])
-    shown = emissivity * own + (1 - emissivity) * mirrored
+    shown = emissivity * surface_k + (1 - emissivity) * mirrored
     shown = np.where(met, shown, sky_temperature(weather, seen.ray[:, 2]))
     extinction = FOG_SHARE * weather.fog_per_m + CLEAR_AIR_PER_M + RAIN_PER_M * weather.rain_mm_h**0.6
     passes = np.where(met, np.exp(-extinction * np.where(met, seen.distance, 0)), np.exp(-extinction * 500.0))
@@ -132,7 +136,7 @@ def render_thermal(
 
 
 def air_temperature(weather: Weather) -> float:
-    """Return the temperature of the air [K]: 286 + 9 * sin(sun elevation), less under clouds by day and in rain."""
+    """Return the air temperature [K]: 286 + 9 * sin(sun elevation), lower under clouds by day and in rain."""
     warm = 9.0 * np.sin(np.radians(np.clip(weather.sun_elevation_deg, -30, 90)))
     return float(286.0 + warm - 2.5 * weather.cloud_cover * (warm > 0) - min(weather.rain_mm_h / 10.0, 1.0) * 2.0)
 
@@ -150,14 +154,14 @@ def _sunshine(weather: Weather) -> float:
 
 
 def _living(seen: GBuffer, material: Bytes, air: float) -> Array:
-    """Return (N,) how much warmer than the air skin and clothes are [K]; 0 for other surfaces."""
+    """Return (N,) the difference of skin and clothes from the air temperature [K]; 0 for other surfaces."""
     body = _BODY[material] + 273.15
     clothed = np.where(material == Material.SKIN, 1.0, 0.7)
     return np.where(np.isnan(body) | (seen.instance < 1), 0.0, clothed * (body - air))
 
 
 def _driving(scene: Scene, seen: GBuffer, material: Bytes, lamps_on: bool) -> Array:
-    """Return (N,) how much warmer the parts of vehicles in traffic are than when parked [K]; 0 for other surfaces."""
+    """Return (N,) the warming of parts of vehicles in traffic over parked ones [K]; 0 for other surfaces."""
     trace = scene.trace
     warm = np.zeros(len(seen))
     for actor in np.unique(seen.instance[seen.instance > 0]) - 1:
@@ -168,15 +172,15 @@ def _driving(scene: Scene, seen: GBuffer, material: Bytes, lamps_on: bool) -> Ar
         along = (seen.position[rows] - body[:3, 3]) @ body[:3, 0] / trace.size[actor, 0]
         low = seen.position[rows, 2] - body[2, 3] < 0.62 * trace.size[actor, 2]
         bonnet = np.clip((along - 0.5 + ENGINE_SHARE) / 0.08, 0, 1) * low
-        own = material[rows]
-        warm[rows] = _MOVING[own] + np.where(own == Material.PAINT, 9.0 * bonnet, 0) + 5.0 * bonnet
+        part_material = material[rows]
+        warm[rows] = _MOVING[part_material] + np.where(part_material == Material.PAINT, 9.0 * bonnet, 0) + 5.0 * bonnet
         if lamps_on:
-            warm[rows] += LAMP_K * ((own == Material.HEADLAMP) | (own == Material.TAILLAMP))
+            warm[rows] += LAMP_K * ((part_material == Material.HEADLAMP) | (part_material == Material.TAILLAMP))
     return warm
 
 
 def _texture_of(seen: GBuffer, appearance: Appearance, infrared: Infrared) -> tuple[Array32, Array32]:
-    """Return each pixel's share (N,) of window panes and its noise of temperature (N,), -0.5 to 0.5."""
+    """Return the pixels' shares (N,) of window panes, and temperature noise (N,), -0.5 to 0.5."""
     pane, patch = np.zeros(len(seen), np.float32), np.zeros(len(seen), np.float32)
     _texture(seen, appearance, np.float32(1 / infrared.intrinsics()[0, 0]), pane, patch)
     return pane, patch
@@ -202,5 +206,5 @@ def _texture(seen, appearance, pixel_angle, pane, patch):
             across = seen.distance[ray] * pixel_angle
             slant = across / max(facing, np.float32(0.02))
             building = appearance.part_row[row]
-            found = shade_facade(building, x, y, z, nx, ny, across, slant, appearance.facades, table)
-            pane[ray] = found[3]
+            facade = shade_facade(building, x, y, z, nx, ny, across, slant, appearance.facades, table)
+            pane[ray] = facade[3]

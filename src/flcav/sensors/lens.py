@@ -1,4 +1,4 @@
-"""Pinhole camera model with Brown-Conrady distortion: projection and its inverse.
+"""Pinhole camera model with Brown-Conrady distortion: projection and unprojection.
 
 Optical frame: x right, y down, z forward along the optical axis. Pixel (column u, row v); the centre of the first pixel
 is at (0, 0), as in OpenCV. With a = x / z, b = y / z and r^2 = a^2 + b^2 (Brown 1966, OpenCV's order of coefficients):
@@ -17,7 +17,7 @@ from flcav.arrays import Array, Array32
 from flcav.config import Config
 
 BODY_FROM_OPTICAL: Array = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # rotation of axes
-NEWTON_STEPS = 12  # by which the distortion is inverted
+NEWTON_STEPS = 12  # iterations of the inversion of the distortion
 
 
 class Lens(Config):
@@ -46,7 +46,7 @@ class Lens(Config):
         return self
 
     def intrinsics(self) -> Array:
-        """Return the (3, 3) camera matrix, which maps a', b', 1 to pixels u, v, 1."""
+        """Return the (3, 3) camera matrix [px], which maps a', b', 1 to pixels u, v, 1."""
         focal = self.width / 2 / np.tan(np.radians(self.fov_deg) / 2) if self.fx is None else self.fx
         vertical = focal if self.fy is None else self.fy
         cx = (self.width - 1) / 2 if self.cx is None else self.cx
@@ -59,12 +59,12 @@ class Lens(Config):
 
 
 def project_optical(lens: Lens, points: ArrayLike) -> Array:
-    """Return the pixels (N, 2) u, v of points (N, 3) in the optical frame; NaN for those with z <= 0."""
+    """Project points (N, 3) [m] of the optical frame to pixels (N, 2) u, v; NaN for those with z <= 0."""
     return project_points(lens.intrinsics(), lens.distortion(), points)
 
 
 def project_points(intrinsics: Array, distortion: Array, points: ArrayLike) -> Array:
-    """Return pixels as `project_optical` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
+    """Project points as `project_optical` does, given the camera matrix (3, 3) [px] and the distortion (5,)."""
     x, y, z = np.asarray(points, np.float64).reshape(-1, 3).T
     z = np.where(z > 1e-9, z, np.nan)
     fx, fy, cx, cy = _focus(intrinsics)
@@ -72,9 +72,9 @@ def project_points(intrinsics: Array, distortion: Array, points: ArrayLike) -> A
 
 
 def unproject(lens: Lens, pixels: ArrayLike) -> Array:
-    """Return the undistorted a, b (N, 2) of pixels (N, 2) u, v: points of the plane z = 1.
+    """Unproject pixels (N, 2) u, v to undistorted a, b (N, 2): points of the plane z = 1 of the optical frame.
 
-    Newton's method; NaN where it finds no direction that the distortion maps to the pixel.
+    By Newton's method; NaN where no direction is found that the distortion maps to the pixel.
     """
     return unproject_pixels(lens.intrinsics(), lens.distortion(), np.asarray(pixels, np.float64).reshape(-1, 2))
 
@@ -97,27 +97,27 @@ def _directions(width: int, height: int, intrinsics: tuple[float, ...], distorti
 
 
 def unproject_pixels(intrinsics: Array, distortion: Array, pixels: Array) -> Array:
-    """Return a, b (N, 2) as `unproject` does, given the camera matrix (3, 3) and the distortion coefficients (5,)."""
+    """Unproject pixels as `unproject` does, given the camera matrix (3, 3) [px] and the distortion (5,)."""
     fx, fy, cx, cy = _focus(intrinsics)
     wanted = (pixels - (cx, cy)) / (fx, fy)
     if not distortion.any():
         return wanted
-    found, step = wanted.copy(), 1e-6
+    plane, step = wanted.copy(), 1e-6
     along_a, along_b = np.array((step, 0.0)), np.array((0.0, step))
     for _ in range(NEWTON_STEPS):
-        error = _distort(distortion, found) - wanted
-        by_a = (_distort(distortion, found + along_a) - _distort(distortion, found - along_a)) / (2 * step)
-        by_b = (_distort(distortion, found + along_b) - _distort(distortion, found - along_b)) / (2 * step)
+        error = _distort(distortion, plane) - wanted
+        by_a = (_distort(distortion, plane + along_a) - _distort(distortion, plane - along_a)) / (2 * step)
+        by_b = (_distort(distortion, plane + along_b) - _distort(distortion, plane - along_b)) / (2 * step)
         slope = by_a[:, 0] * by_b[:, 1] - by_a[:, 1] * by_b[:, 0]
         slope = np.where(slope > 1e-3, slope, np.nan)  # where the distortion folds over, it has no inverse
-        found = found - np.stack(
+        plane = plane - np.stack(
             (
                 (by_b[:, 1] * error[:, 0] - by_b[:, 0] * error[:, 1]) / slope,
                 (by_a[:, 0] * error[:, 1] - by_a[:, 1] * error[:, 0]) / slope,
             ),
             axis=1,
         )
-    return np.where(np.abs(_distort(distortion, found) - wanted).max(axis=1, keepdims=True) < 1e-7, found, np.nan)
+    return np.where(np.abs(_distort(distortion, plane) - wanted).max(axis=1, keepdims=True) < 1e-7, plane, np.nan)
 
 
 def _distort(distortion: Array, plane: Array) -> Array:

@@ -1,7 +1,7 @@
 """GNSS and IMU simulation: white noise and drifting biases (Gauss-Markov process, random walk).
 
-Biases are simulated on a grid of STEP_S from time 0 and interpolated linearly, so that the value at a time depends on
-the random stream and that time alone, in whatever order times are asked.
+Biases are simulated on a grid of STEP_S from time 0 and interpolated linearly, so that the value at a time depends only
+on the random stream and that time, not on the order of requests.
 
 A GNSS receiver has white noise and a first-order Gauss-Markov bias. An IMU measures the specific force f = a - g (at
 rest 9.8 m/s^2 upwards) and the angular rate; its white noise is given as a spectral density and its bias as a random
@@ -17,16 +17,16 @@ from flcav.config import Config
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.scene import Scene
 
-STEP_S = 0.1  # of the grid on which biases are simulated
+STEP_S = 0.1  # step of the grid on which biases are simulated
 GRAVITY = np.array((0.0, 0.0, -9.80665))  # [m/s^2]
 
 
 def draw_gauss_markov(rng: np.random.Generator, time_s: ArrayLike, deviation: Array, correlation_s: float) -> Array:
-    """Return (..., K) values of independent first-order Gauss-Markov processes at the times `time_s` (...) >= 0.
+    """Sample K independent stationary first-order Gauss-Markov processes at times `time_s` (...) >= 0 [s]: (..., K).
 
-    Each is stationary, with the standard deviation `deviation` (K,) and the autocorrelation exp(-t / `correlation_s`).
+    They have the standard deviations `deviation` (K,) and the autocorrelation exp(-t / `correlation_s`).
     """
-    from scipy.signal import lfilter  # imported late: it takes a second, and only GNSS needs it
+    from scipy.signal import lfilter  # imported late, since it takes a second and only GNSS needs it
 
     kept = np.exp(-STEP_S / correlation_s)
     normal = _grid(rng, time_s, len(deviation))
@@ -35,7 +35,7 @@ def draw_gauss_markov(rng: np.random.Generator, time_s: ArrayLike, deviation: Ar
 
 
 def draw_random_walk(rng: np.random.Generator, time_s: ArrayLike, start: Array, per_root_s: Array) -> Array:
-    """Return (..., K) values of independent random walks at the times `time_s` (...) >= 0.
+    """Sample K independent random walks at the times `time_s` (...) >= 0 [s]: (..., K).
 
     The initial values have the standard deviations `start` (K,), increments over t seconds `per_root_s` (K,) * sqrt(t).
     """
@@ -70,11 +70,11 @@ class Gnss(Config):
 def measure_position(
     scene: Scene, world_from_gnss: Array, gnss: Gnss, rng: np.random.Generator, bias_rng: np.random.Generator
 ) -> Array:
-    """Return one GNSS fix at the scene's time: (3,) latitude [deg], longitude [deg], altitude [m], WGS 84.
+    """Measure a GNSS fix at the scene's time: (3,) latitude [deg], longitude [deg], altitude [m], WGS 84.
 
-    `world_from_gnss` (4, 4) is the antenna's pose. `rng` draws this frame's white noise. `bias_rng` draws the bias: a
-    generator at the start of this receiver's stream of the scene, so that the bias does not depend on which frames were
-    rendered before.
+    `world_from_gnss` (4, 4) [m] is the antenna's pose. `rng` draws this frame's white noise. `bias_rng` draws the bias:
+    a generator at the start of this receiver's stream of the scene, so that the bias does not depend on which frames
+    were rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
     noise, bias = draw_fix_errors(gnss, time_s, rng, bias_rng)
@@ -84,7 +84,7 @@ def measure_position(
 def draw_fix_errors(
     gnss: Gnss, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return noise and bias (..., 3) x, y, up [m] of fixes at the times `time_s` (...); see `measure_position`."""
+    """Draw noise and bias (..., 3) east, north, up [m] of fixes at `time_s` (...) [s]; see `measure_position`."""
     noise = rng.standard_normal((*np.shape(time_s), 3)) * (gnss.noise_m, gnss.noise_m, gnss.noise_up_m)
     bias = draw_gauss_markov(bias_rng, time_s, np.array((gnss.bias_m, gnss.bias_m, gnss.bias_up_m)), gnss.bias_s)
     return noise, bias
@@ -110,11 +110,11 @@ def measure_inertia(
     rng: np.random.Generator,
     bias_rng: np.random.Generator,
 ) -> Array:
-    """Return one IMU sample at the scene's time: (6,) specific force [m/s^2] and angular rate [rad/s], IMU frame.
+    """Measure an IMU sample at the scene's time: (6,) specific force [m/s^2] and angular rate [rad/s], IMU frame.
 
-    `world_from_imu` (4, 4) is its pose, `carrier` the actor it is on (None: it stands still). `rng` draws this frame's
-    white noise. `bias_rng` draws the bias: a generator at the start of this unit's stream of the scene, so that the
-    bias does not depend on which frames were rendered before.
+    `world_from_imu` (4, 4) [m] is its pose, `carrier` the actor that carries it (None: it is stationary). `rng` draws
+    this frame's white noise. `bias_rng` draws the bias: a generator at the start of this unit's stream of the scene, so
+    that the bias does not depend on which frames were rendered before.
     """
     time_s = float(scene.trace.time_s[scene.index]) + scene.offset_s
     turn = world_from_imu[:3, :3]
@@ -127,7 +127,7 @@ def measure_inertia(
 def draw_imu_errors(
     imu: Imu, time_s: ArrayLike, rng: np.random.Generator, bias_rng: np.random.Generator
 ) -> tuple[Array, Array]:
-    """Return noise and bias (..., 6) of IMU samples at the times `time_s` (...); see `measure_inertia`."""
+    """Draw noise and bias (..., 6) [m/s^2, rad/s] of IMU samples at `time_s` (...) [s]; see `measure_inertia`."""
     noise = np.repeat((imu.force_noise, imu.rate_noise), 3) * np.sqrt(imu.rate_hz / 2)
     start = np.repeat((imu.force_bias, imu.rate_bias), 3)
     growth = np.repeat((imu.force_walk, imu.rate_walk), 3)
@@ -135,10 +135,11 @@ def draw_imu_errors(
 
 
 def _motion(scene: Scene, at: Array, carrier: int | None) -> tuple[Array, Array]:
-    """Return acceleration (3,) [m/s^2] and angular rate (3,) [rad/s] of the carrier at a point (3,), world frame."""
+    """Return acceleration [m/s^2] and angular rate [rad/s] (3,) of the carrier at a point (3,) [m], world frame."""
     if carrier is None:
         return np.zeros(3), np.zeros(3)
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     rate = np.array((0.0, 0.0, trace.yaw_rate[index, carrier]))
     arm = at - scene.world_from_actor(carrier)[:3, 3]
     return trace.acceleration[index, carrier] + np.cross(rate, np.cross(rate, arm)), rate

@@ -1,4 +1,4 @@
-"""Simulation of one frame: every sensor of an agent's rig at one instant of the traffic, with ground truth."""
+"""Simulation of one frame: all sensors of an agent's rig at one instant of the traffic, with ground truth."""
 
 import re
 from dataclasses import dataclass
@@ -37,13 +37,13 @@ def observe(
     error: CalibrationError = EXACT,
     number: int | None = None,
 ) -> Frame:
-    """Return the frame of `agent` ("cav0", "pole3") with `rig` at instant `index` of the scene's traffic run.
+    """Simulate the frame of `agent` ("cav0", "pole3") with `rig` at instant `index` of the scene's traffic run.
 
-    The frame's index is `number`, by default `index`; in a live world, whose traces have one instant, the step.
-    Moves `scene` there. The same arguments give the same bytes, whatever was observed before: each sensor has a random
-    stream of its own, named by `seed`, scene, number, agent and sensor, so that it does not depend on the rig's other
-    sensors. `error` changes the frame's assumed calibration alone.
-    Raises `InputError` for an agent that the run does not have, or not at that instant.
+    The frame's index is `number`, by default `index`; in a live world, whose traces have one instant, the step. This
+    moves `scene` there. The same arguments give the same bytes, whatever was observed before: a sensor's random stream
+    is named by `seed`, scene, number, agent and sensor, so that it does not depend on the rig's other sensors. `error`
+    changes only the frame's assumed calibration. Raises `InputError` for an agent that does not exist in the run, or at
+    that instant.
     """
     number = index if number is None else number
     carrier = _Carrier(scene, agent, index, _actor_of(scene, agent, index), build_calibration(rig))
@@ -114,7 +114,7 @@ def observe(
 
 @dataclass(frozen=True)
 class _Carrier:
-    """The vehicle or pole that carries the sensors, in a scene, with their true calibration."""
+    """The vehicle or pole that carries the sensors in a scene, with their true calibration."""
 
     scene: Scene
     agent: str
@@ -132,7 +132,7 @@ class _Carrier:
         return pose(x, y, z, float(poles.yaw[site]))
 
     def go_to(self, sensor: str) -> Array:
-        """Move the scene to the trigger time of `sensor` and return its (4, 4) `world_from_sensor` then."""
+        """Move the scene to the trigger time of `sensor`, and return the sensor's (4, 4) pose at that time."""
         self.scene.move_to(self.index, self.calibration.offset_ms[sensor] / 1e3)
         return self.pose() @ self.calibration.agent_from_sensor[sensor]
 
@@ -140,16 +140,17 @@ class _Carrier:
         """Return the (3,) velocity of a sensor at the scene's time, world frame [m/s]."""
         if self.own is None:
             return np.zeros(3)
-        trace, offset_s = self.scene.trace, self.scene.offset_s
+        trace = self.scene.trace
+        offset_s = self.scene.offset_s
         arm = world_from_sensor[:3, 3] - self.pose()[:3, 3]
         spin = np.array((0.0, 0.0, trace.yaw_rate[self.index, self.own]))
         velocity = trace.velocity[self.index, self.own] + offset_s * trace.acceleration[self.index, self.own]
         return velocity + np.cross(spin, arm)
 
     def poses_at_triggers(self) -> dict[str, Array]:
-        """Return the (4, 4) `world_from_agent` at trigger times other than the spin's, by sensor; empty for a pole.
+        """Return the (4, 4) `world_from_agent` at trigger times that differ from the spin, by sensor; empty for a pole.
 
-        Leaves the scene at the spin.
+        The scene is left at the spin.
         """
         poses = {}
         for sensor, offset_ms in self.calibration.offset_ms.items():
@@ -161,7 +162,7 @@ class _Carrier:
 
 
 def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
-    """Move the scene to instant `index` and return the index of the actor called `agent`; None for a pole.
+    """Move the scene to instant `index`, and return the row of the actor named `agent`; None for a pole.
 
     Raises `InputError` for a pole or vehicle that does not exist, or is not in town at that instant.
     """
@@ -172,19 +173,20 @@ def _actor_of(scene: Scene, agent: str, index: int) -> int | None:
             known = ", ".join(f"pole{pole}" for pole in poles)
             raise InputError(f"agent '{agent}': town {scene.town.name} has no such pole; it has {known}")
         return None
-    found = np.flatnonzero(scene.trace.actor == agent)
-    if not len(found):
+    rows = np.flatnonzero(scene.trace.actor == agent)
+    if not len(rows):
         raise InputError(f"agent '{agent}': no such vehicle in this traffic run")
-    if not scene.trace.present[index, found[0]]:
+    if not scene.trace.present[index, rows[0]]:
         raise InputError(f"agent '{agent}' is not in town at {scene.trace.time_s[index]:.1f} s")
-    return int(found[0])
+    return int(rows[0])
 
 
 def _sweep(
     carrier: _Carrier, name: str, lidar: Lidar, weather: Weather, rng: np.random.Generator
 ) -> tuple[Array32, LidarSweep]:
-    """Return the points (N, 4) of a LiDAR, and its rays and counts for the ground truth."""
-    scene, world_from_sensor = carrier.scene, carrier.go_to(name)
+    """Return the points (N, 4) of a LiDAR, sensor frame, and its sweep for the ground truth."""
+    scene = carrier.scene
+    world_from_sensor = carrier.go_to(name)
     points, actor, passes, hits = scan(scene, world_from_sensor, lidar, rng, carrier.own, weather)
     count = len(scene.trace.actor)
     returns = np.bincount(actor + 1, minlength=count + 1)[1:]
@@ -193,17 +195,18 @@ def _sweep(
 
 
 def _actors_seen(carrier: _Carrier, world_from_camera: Array, lens: Lens) -> Ints32:
-    """Return an instance image (H, W) by one ray for each pixel: a + 1 at the trace's actor a, else 0."""
+    """Return an instance image (H, W) with one ray per pixel: a + 1 at the trace's actor a, else 0."""
     hits = carrier.scene.cast(world_from_camera, compute_pixel_rays(lens), hidden=carrier.own)
     return np.maximum(hits.instance, 0).reshape(lens.height, lens.width)
 
 
 def _within_range(carrier: _Carrier, rig: Rig) -> Mask:
-    """Return (A,) whether each actor is present and the centre of its box within the range of any LiDAR.
+    """Return (A,) whether actors are present with their box centres within the range of a LiDAR.
 
-    Where the rig has no LiDAR: within CAMERA_RANGE_M of any camera.
+    Without LiDARs, within CAMERA_RANGE_M of a camera.
     """
-    scene, world_from_agent = carrier.scene, carrier.pose()
+    scene = carrier.scene
+    world_from_agent = carrier.pose()
     trace = scene.trace
     center = trace.position[scene.index] + trace.size * (0, 0, 0.5)
     ranges = {name: mounted.settings.range_m for name, mounted in rig.lidars.items()}

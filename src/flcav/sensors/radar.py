@@ -2,18 +2,16 @@
 
 Only direct echoes of the first surface are modelled: no multipath over the road, nothing behind glass.
 
-Radar cross-sections at 77 GHz, and a Swerling 1 detector over resolution cells.
+Mean radar cross-sections of actors are those commonly measured at 76 to 81 GHz (pedestrian -8 dBsm: Yamada et al.,
+2005; cars 10 dBsm with flashes off flat front, rear and sides: Schipper et al., 2011). An actor's cross-section is
+spread evenly over its silhouette, so that a half-occluded car has half of it. Ground follows the constant-gamma model
+of land clutter.
 
-Mean cross-sections of actors are those commonly measured at 76 to 81 GHz (pedestrian -8 dBsm: Yamada et al., 2005; cars
-10 dBsm with flashes off flat front, rear and sides: Schipper et al., 2011). An actor's cross-section is spread evenly
-over its silhouette, so that a car of which half is hidden has half of it. Ground follows the constant-gamma model of
-land clutter.
-
-The radar equation gives each cell's signal-to-noise ratio, S = K g(direction) sigma L(rain) / r^4, with g the two-way
-antenna gain and sigma the cross-section. A cell fluctuates as Swerling's case 1: its measured power, in units of the
-noise, is exponential with mean 1 + S and is reported above T = -ln(P_fa); so the probability of detection is
-P_fa^(1 / (1 + S)) (Richards, "Fundamentals of Radar Signal Processing", section 6.3). Errors of a reported value shrink
-with the square root of the power.
+The radar equation gives the signal-to-noise ratio of a resolution cell, S = K g(direction) sigma L(rain) / r^4, with g
+the two-way antenna gain and sigma the cross-section. A cell fluctuates as Swerling's case 1: its measured power, in
+units of the noise, is exponential with mean 1 + S and is reported above T = -ln(P_fa); so the probability of detection
+is P_fa^(1 / (1 + S)) (Richards, "Fundamentals of Radar Signal Processing", section 6.3). Errors of a reported value
+decrease with the square root of the power.
 """
 
 from typing import NamedTuple
@@ -30,13 +28,13 @@ from flcav.world.scene import Scene
 from flcav.world.trace import CATEGORIES
 from flcav.world.weather import Weather
 
-FLASH = 24.0  # exponent of the cosine of a flash's angle: about 27 degrees wide at half its decibels
+FLASH = 24.0  # exponent of the cosine of a flash's angle: about 27 degrees wide at half of its decibels
 LYING = (Material.GROUND, Material.ROAD, Material.SIDEWALK)  # horizontal surfaces: constant-gamma clutter
 TOWN_DB: dict[Material, float] = {
-    Material.GROUND: -20.0,  # of horizontal surfaces: gamma
+    Material.GROUND: -20.0,  # horizontal surfaces: gamma
     Material.ROAD: -30.0,
     Material.SIDEWALK: -28.0,
-    Material.WALL: -10.0,  # of others: cross-section per square metre of silhouette, at grazing incidence
+    Material.WALL: -10.0,  # of others: cross-section per projected area, at grazing incidence
     Material.ROOF: -10.0,
     Material.BARK: -8.0,
     Material.LEAF: -14.0,
@@ -49,17 +47,17 @@ GLINT = 40.0  # exponent of the cosine of incidence
 _TOWN = 10 ** (np.array([TOWN_DB.get(material, ELSE_DB) for material in Material]) / 10)
 _LIES = np.array([material in LYING for material in Material])
 REFERENCE_M2 = 10.0  # cross-section of the target in the definition of `detects_car_m`
-EDGE_DB = 6.0  # two-way gain at the edge of the field of view, below that ahead
+EDGE_DB = 6.0  # loss of two-way gain at the edge of the field of view, relative to straight ahead
 SPLIT = 1.6  # cell size over the standard deviation of a value, at a signal-to-noise ratio of 1/2 (Barton)
 RAIN_DB = (1.13, 0.718)  # k, a of k R^a [dB/km] at 77 GHz: ITU-R P.838-3
 
 
 class AspectRcs(NamedTuple):
-    """Radar cross-section of a class of actors, by aspect."""
+    """Radar cross-section of a class of actors, by aspect angle."""
 
-    mean_dbsm: float  # level without flashes, seen from the side
-    flash_db: float  # gain of specular flashes straight ahead, behind and to either side
-    end_db: float  # level seen from ahead and behind, over that from the side
+    mean_dbsm: float  # level without flashes, from the side [dBsm]
+    flash_db: float  # gain of specular flashes straight ahead, behind and to either side [dB]
+    end_db: float  # level from ahead and behind, relative to that from the side [dB]
 
 
 ACTOR_RCS: dict[str, AspectRcs] = {
@@ -77,9 +75,9 @@ _ACTOR = np.array([*(ACTOR_RCS[category] for category in CATEGORIES), PROP_RCS])
 
 
 def compute_actor_rcs(category: Words, aspect: Array) -> Array:
-    """Return (K,) mean radar cross-sections [m^2] of whole, unoccluded actors.
+    """Return (K,) mean radar cross-sections [m^2] of unoccluded actors.
 
-    `category` (K,) are their classes, `aspect` (K,) the direction to the radar [rad], counter-clockwise from ahead.
+    `category` (K,) are their classes, `aspect` (K,) the directions to the radar [rad], counter-clockwise from ahead.
     """
     mean, flash, end = _ACTOR[[_CATEGORIES.index(str(name)) for name in category]].reshape(-1, 3).T
     ahead, aside = np.abs(np.cos(aspect)) ** FLASH, np.abs(np.sin(aspect)) ** FLASH
@@ -87,13 +85,13 @@ def compute_actor_rcs(category: Words, aspect: Array) -> Array:
 
 
 def silhouette(size: Array, aspect: Array) -> Array:
-    """Return (K,) projected areas [m^2] of boxes of `size` (K, 3) [m], seen horizontally from `aspect` (K,) [rad]."""
+    """Return (K,) projected areas [m^2] of boxes of `size` (K, 3) [m] at horizontal aspect angles (K,) [rad]."""
     length, width, height = size.T
     return (length * np.abs(np.sin(aspect)) + width * np.abs(np.cos(aspect))) * height
 
 
 def compute_town_rcs(material: Bytes, cosine: Array) -> Array:
-    """Return (K,) cross-sections per projected area of the town's surfaces, by material and `cosine` of incidence."""
+    """Return (K,) cross-sections per projected area of the town's surfaces, by material and cosine of incidence."""
     glint = 1 + (10 ** (GLINT_DB / 10) - 1) * cosine**GLINT
     return _TOWN[material] * np.where(_LIES[material], 1.0, glint)
 
@@ -115,7 +113,7 @@ class Radar(Config):
     false_alarm_rate: float = Field(default=3e-7, ge=1e-15, lt=0.1)  # false alarms per resolution cell and sweep
 
     def resolution(self) -> Array:
-        """Return a cell's size (4,): range [m], azimuth [rad], elevation [rad] and Doppler [m/s]."""
+        """Return the size of a resolution cell (4,): range [m], azimuth [rad], elevation [rad] and Doppler [m/s]."""
         angles = np.radians((self.azimuth_cell_deg, self.elevation_cell_deg))
         return np.array((self.range_cell_m, *angles, self.doppler_cell_m_s))
 
@@ -127,18 +125,18 @@ class Radar(Config):
 
 
 class Cells(NamedTuple):
-    """The C resolution cells that hold any echo."""
+    """The C resolution cells that contain an echo."""
 
-    values: Array  # (C, 4) as in `Radar.extent`: means weighted by cross-section
+    values: Array  # (C, 4) range [m], azimuth, elevation [rad], Doppler [m/s]: means weighted by cross-section
     sigma: Array  # (C,) sum of the cross-sections [m^2]
-    actor: Ints  # (C,) that of the largest cross-section; -1 for the town
+    actor: Ints  # (C,) actor with the largest cross-section; -1 for the town
 
 
 def resolve_cells(values: Array, sigma: Array, actor: Ints32, radar: Radar) -> Cells:
-    """Return the resolution cells that hold N echoes, which are summed up by cell.
+    """Sum N echoes by resolution cell, and return the cells.
 
-    `values` (N, 4) are range [m], azimuth [rad], elevation [rad] and Doppler [m/s] of the echoes, `sigma` (N,) their
-    cross-sections [m^2], `actor` (N,) the actors they come from (-1: the town).
+    `values` (N, 4) are range [m], azimuth [rad], elevation [rad] and Doppler [m/s] of the echoes, radar frame, `sigma`
+    (N,) their cross-sections [m^2], `actor` (N,) the actors they come from (-1: the town).
     """
     low = radar.extent()[:, 0]
     key = np.floor((values - low) / radar.resolution()).astype(np.int64)
@@ -153,10 +151,10 @@ def resolve_cells(values: Array, sigma: Array, actor: Ints32, radar: Radar) -> C
 
 
 def snr_per_m2(radar: Radar, values: Array, rain_mm_h: float) -> Array:
-    """Return (N,) signal-to-noise ratios of 1 m^2 at `values` (N, >=3) range, azimuth, elevation: the radar equation.
+    """Return (N,) signal-to-noise ratios of 1 m^2 at `values` (N, >=3) range [m], azimuth, elevation [rad].
 
-    Calibrated such that REFERENCE_M2 straight ahead is detected half the time at `detects_car_m` in clear air. Rain
-    attenuates both ways.
+    By the radar equation, calibrated such that REFERENCE_M2 straight ahead is detected with probability 1/2 at
+    `detects_car_m` in clear air. Rain [mm/h] attenuates both ways.
     """
     threshold = -np.log(radar.false_alarm_rate)
     at_reference = threshold / np.log(2) - 1  # at which the probability of detection is 1/2
@@ -168,25 +166,25 @@ def snr_per_m2(radar: Radar, values: Array, rain_mm_h: float) -> Array:
 
 
 def detect_cells(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> tuple[Array, Ints]:
-    """Return the detections (M, 5) among `cells` and their actors (M,).
+    """Detect echoes: return the detections (M, 5) among `cells` and their actors (M,).
 
     A detection is range [m], azimuth [rad], elevation [rad], Doppler [m/s], all with errors, and cross-section [dBsm].
-    Those measured outside the radar's extent are left out.
+    Detections measured outside the radar's extent are left out.
     """
     per_m2 = snr_per_m2(radar, cells.values, rain_mm_h)
     power = (1 + per_m2 * cells.sigma) * rng.standard_exponential(len(per_m2))
-    found = power > -np.log(radar.false_alarm_rate)
-    power = power[found]
-    values = cells.values[found]
+    detected = power > -np.log(radar.false_alarm_rate)
+    power = power[detected]
+    values = cells.values[detected]
     values = values + rng.standard_normal(values.shape) * radar.resolution() / (SPLIT * np.sqrt(2 * power))[:, None]
     low, high = radar.extent().T
     inside = ((values >= low) & (values <= high)).all(axis=1)
-    reported = np.column_stack((values, 10 * np.log10(power / per_m2[found])))
-    return reported[inside], cells.actor[found][inside]
+    reported = np.column_stack((values, 10 * np.log10(power / per_m2[detected])))
+    return reported[inside], cells.actor[detected][inside]
 
 
 def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Array:
-    """Return M false alarms (M, 5), as `detect_cells`: a Poisson number of cells, at random places."""
+    """Draw false alarms (M, 5), as in `detect_cells`: a Poisson number of them, at uniformly random places."""
     low, high = radar.extent().T
     cells = np.prod(np.ceil((high - low) / radar.resolution()))
     count = rng.poisson(cells * radar.false_alarm_rate)
@@ -195,7 +193,7 @@ def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Ar
     return np.column_stack((values, 10 * np.log10(power / snr_per_m2(radar, values, rain_mm_h))))
 
 
-RAYS_PER_CELL = 3  # along azimuth, and as many along elevation
+RAYS_PER_CELL = 3  # in azimuth, and as many in elevation
 LIMBS_M_S = {"pedestrian": 0.5, "bicycle": 0.5}  # standard deviation of limbs' speeds (micro-Doppler)
 
 
@@ -209,11 +207,12 @@ def sweep_radar(
     hidden: int | None = None,
     weather: Weather | None = None,
 ) -> tuple[Array32, Ints32]:
-    """Return the detections of one radar sweep, nearest first, and the actor of each.
+    """Simulate one radar sweep: return its detections, nearest first, and their actors.
 
-    Detections (N, 5) are range [m], azimuth [rad, to the left], elevation [rad, upwards], Doppler [m/s, positive where
-    the distance grows] and radar cross-section [dBsm]. Actors (N,) are the trace's, by the largest share of the echo;
-    -1 for the town and for false alarms. `velocity` (3,) is the radar's [m/s, world frame], `hidden` the carrier.
+    Detections (N, 5) are range [m], azimuth [rad, to the left], elevation [rad, upwards], radar frame, Doppler [m/s,
+    positive for receding] and radar cross-section [dBsm]. Actors (N,) are rows of the trace, by the largest share of
+    the echo; -1 for the town and for false alarms. `world_from_radar` (4, 4) [m] and `velocity` (3,) [m/s] are the
+    radar's pose and velocity, world frame; `hidden` is the carrier.
     """
     directions, solid_angle = draw_rays(radar, rng)
     hits = scene.cast(world_from_radar, directions, far_m=radar.range_m, hidden=hidden)
@@ -241,7 +240,7 @@ def compute_echo_directions(echoes: Array32) -> Array:
 
 
 def draw_rays(radar: Radar, rng: np.random.Generator) -> tuple[Array32, Array]:
-    """Return N unit rays (N, 3), one at random in each cell of a grid over the field of view, and cells' (N,) [sr]."""
+    """Draw one unit ray per cell of a grid over the field of view: (N, 3), radar frame, and solid angles (N,) [sr]."""
     _, (left, right), (low, high), _ = radar.extent()
     _, azimuth_cell, elevation_cell, _ = radar.resolution()
     columns = int(np.ceil((right - left) / azimuth_cell * RAYS_PER_CELL))
@@ -256,8 +255,8 @@ def draw_rays(radar: Radar, rng: np.random.Generator) -> tuple[Array32, Array]:
 def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, solid_angle: Array) -> Array:
     """Return (N,) radar cross-sections [m^2] of the surface patches that N rays hit.
 
-    `ahead` (N, 3) are the rays in the radar's frame, `solid_angle` (N,) [sr] what each stands for: its patch has the
-    projected area solid angle * distance^2.
+    `ahead` (N, 3) are the unit rays, radar frame, `solid_angle` (N,) [sr] their shares of the field of view: a patch
+    has the projected area solid angle * distance^2.
     """
     surfaces = scene.surfaces
     row = surfaces.first[hits.instance] + hits.face
@@ -270,7 +269,8 @@ def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hi
     seen, which = np.unique(hits.instance[moving] - 1, return_inverse=True)
     x, y, _, yaw = scene.poses()[seen].T
     aspect = np.arctan2(world_from_radar[1, 3] - y, world_from_radar[0, 3] - x) - yaw
-    category, size = scene.trace.category[seen], scene.trace.size[seen]
+    category = scene.trace.category[seen]
+    size = scene.trace.size[seen]
     per_area[moving] = (compute_actor_rcs(category, aspect) / silhouette(size, aspect))[which]
     return per_area * solid_angle * hits.distance.astype(np.float64) ** 2
 
@@ -278,8 +278,9 @@ def cross_sections(scene: Scene, world_from_radar: Array, ahead: Array, hits: Hi
 def _range_rates(
     scene: Scene, world_from_radar: Array, ahead: Array, hits: Hits, velocity: Array, rng: np.random.Generator
 ) -> Array:
-    """Return (N,) range rates [m/s] of the surface points that N rays hit, positive where the distance grows."""
-    trace, index = scene.trace, scene.index
+    """Return (N,) range rates [m/s] of the surface points that N rays hit, positive for receding."""
+    trace = scene.trace
+    index = scene.index
     limbs = np.array([LIMBS_M_S.get(str(category), 0.0) for category in trace.category])
     line = ahead @ world_from_radar[:3, :3].T
     moving = np.flatnonzero(hits.instance > 0)

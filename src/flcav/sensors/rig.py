@@ -1,9 +1,7 @@
-"""Rigs: the sensors of an agent with their mounts and settings, presets of them, and their calibration.
+"""Rigs: the sensors of an agent with their mounts and settings, presets of rigs, and their calibration.
 
-Calibration of a rig (extrinsics, intrinsics, distortion, trigger times), and random errors of calibration.
-
-The true calibration follows from the rig. The agent works with an assumed one, which differs by one Gaussian error per
-sensor and dataset.
+The true calibration (extrinsics, intrinsics, distortion, trigger times) follows from the rig. The agent assumes
+another one, which differs by one Gaussian error per sensor and dataset.
 """
 
 import re
@@ -28,9 +26,11 @@ from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.radar import Radar
 from flcav.statistics.streams import stream
 
-CAMERA_RANGE_M = 100.0  # of ground truth for rigs without LiDAR; what shows in an image is labelled at any distance
+CAMERA_RANGE_M = (
+    100.0  # range of ground truth for rigs without LiDAR; actors visible in an image are labelled at any distance
+)
 TRIGGER_MS = 100.0  # largest offset of a trigger from the spin
-RESERVED = ("traces", "navigation", "town")  # folders of a dataset, so no names of sensors
+RESERVED = ("traces", "navigation", "town")  # folders of a dataset, which cannot be names of sensors
 _NAME = re.compile(rf"[A-Za-z0-9][A-Za-z0-9_-]{{0,{LONGEST_NAME - 1}}}")
 
 Reach = Annotated[float, Field(ge=-100, le=100)]  # [m]
@@ -54,7 +54,7 @@ class Mount(Config):
     roll_deg: Turn = 0.0  # roll; positive leans to the right
 
     def agent_from_sensor(self) -> Array:
-        """Return the (4, 4) mount; of a camera with body axes (x forward, y left, z up), not optical ones."""
+        """Return the (4, 4) mount [m]; a camera's has body axes (x forward, y left, z up), not optical ones."""
         yaw, pitch, roll = np.radians((self.yaw_deg, self.pitch_deg, self.roll_deg))
         return pose(self.x, self.y, self.z, yaw, pitch, roll)
 
@@ -139,18 +139,18 @@ class Rig(Config):
         return {name: sensor for kind in type(self).model_fields for name, sensor in getattr(self, kind).items()}
 
     def with_navigation(self) -> "Rig":
-        """Return the rig with the GNSS receiver and the IMU of `car`, where it has none of its own."""
+        """Return the rig, with the GNSS receiver and the IMU of `car` if it has none."""
         known = car()
         return self.model_copy(update={"gnss": self.gnss or known.gnss, "imus": self.imus or known.imus})
 
 
 def lidar32() -> Rig:
-    """Return a rig of one 32-channel LiDAR above a car's roof."""
+    """Return a rig with one 32-channel LiDAR above a car's roof."""
     return Rig(lidars={"lidar": MountedLidar(mount=Mount(z=1.85), settings=Lidar(channels=32, azimuth_steps=900))})
 
 
 def lidar_pole() -> Rig:
-    """Return a rig of one 64-channel LiDAR at a pole's mount, with channels from 2 degrees up to 45 degrees down."""
+    """Return a rig with one 64-channel LiDAR at a pole's mount, with channels from 2 degrees up to 45 degrees down."""
     settings = Lidar(channels=64, azimuth_steps=1024, range_m=100.0, up_deg=2.0, down_deg=-45.0, sensitivity_m=400.0)
     return Rig(lidars={"lidar": MountedLidar(settings=settings)})
 
@@ -179,7 +179,7 @@ def car_surround() -> Rig:
 
 
 def roadside() -> Rig:
-    """Return a pole's rig: 64-channel LiDAR, and two cameras 42 degrees left and right of where the pole faces."""
+    """Return a pole's rig: 64-channel LiDAR, and two cameras 42 degrees left and right of the pole's heading."""
     cameras = {
         name: MountedCamera(mount=Mount(yaw_deg=yaw_deg, pitch_deg=20.0))
         for name, yaw_deg in (("camera_left", 42.0), ("camera_right", -42.0))
@@ -188,15 +188,15 @@ def roadside() -> Rig:
 
 
 def kitti_lidar() -> Rig:
-    """Return a rig of KITTI's LiDAR (HDL-64E) alone."""
+    """Return a rig with only KITTI's LiDAR (HDL-64E)."""
     return Rig(lidars={"velodyne": MountedLidar(mount=Mount(z=1.73), settings=HDL64E)})
 
 
 def kitti() -> Rig:
     """Return KITTI's rig: HDL-64E, left colour camera, GNSS and IMU (Geiger et al., IJRR 32(11), 2013, fig. 3).
 
-    Intrinsics and positions are those of the recordings of 26 September 2011; their rotations of less than a degree are
-    left out.
+    Intrinsics and positions are those of the recordings of 26 September 2011; rotations of less than a degree are left
+    out.
     """
     camera = Camera(width=1242, height=375, fx=721.5377, fy=721.5377, cx=609.5593, cy=172.854)
     unit = Mount(x=-0.81, y=0.32, z=0.93)
@@ -231,8 +231,8 @@ class CalibrationError(Config):
 def build_calibration(rig: Rig) -> Calibration:
     """Return the true calibration of `rig`, by sensor name.
 
-    Of all sensors: the mount (4, 4), with optical axes for cameras, and the trigger time [ms] after the LiDAR spin. Of
-    colour and thermal cameras also: the intrinsic matrix (3, 3) [px] and the distortion coefficients (5,).
+    For all sensors: the extrinsics (4, 4) [m], with optical axes for cameras, and the trigger time [ms] after the LiDAR
+    spin; for colour and thermal cameras also the intrinsic matrix (3, 3) [px] and the distortion coefficients (5,).
     """
     lenses = _lenses(rig)
     return Calibration(
@@ -249,10 +249,10 @@ def build_calibration(rig: Rig) -> Calibration:
 
 
 def perturb_calibration(true: Calibration, error: CalibrationError, *, seed: int, agent: str) -> Calibration:
-    """Return the calibration that `agent` assumes: `true` with Gaussian errors; `true` itself where `error` is zero.
+    """Return the calibration that `agent` assumes: `true` with Gaussian errors, or `true` itself if `error` is zero.
 
-    Each sensor gets a rigid error of its mount (translation, rotation vector; in the sensor's axes), one of both focal
-    lengths and one of its trigger time. They depend on the seed and the names of the agent and the sensor alone.
+    A sensor gets a rigid error of its extrinsics (translation and rotation vector, sensor frame), one of both focal
+    lengths and one of its trigger time. They depend only on the seed and the names of the agent and the sensor.
     """
     if error == CalibrationError():
         return true
@@ -266,7 +266,7 @@ def perturb_calibration(true: Calibration, error: CalibrationError, *, seed: int
 
 
 def _draw(error: CalibrationError, seed: int, agent: str, name: str) -> tuple[Array, float, float]:
-    """Return one sensor's errors: (4, 4) `sensor_from_assumed` of the mount, focal length [px], trigger time [ms]."""
+    """Draw a sensor's errors: (4, 4) `sensor_from_assumed` of the extrinsics, focal length [px], trigger time [ms]."""
     normal = stream(seed, "calibration", agent, name).normal(size=8)
     sensor_from_assumed = np.eye(4)
     sensor_from_assumed[:3, :3] = Rotation.from_rotvec(error.rotation_deg * normal[3:6], degrees=True).as_matrix()

@@ -1,6 +1,6 @@
 """Image annotations of actors: visible pixels, visible and amodal boxes, truncation, occlusion.
 
-Amodal 2-D boxes: bounding rectangles of actors' projected convex hulls, exact for lenses without distortion.
+Amodal 2-D boxes are the bounding rectangles of actors' projected convex hulls, exact for lenses without distortion.
 """
 
 from functools import lru_cache
@@ -17,8 +17,8 @@ from flcav.sensors.lens import Lens, compute_pixel_rays, project_optical, unproj
 from flcav.world.meshes import actor_mesh
 from flcav.world.scene import Scene
 
-OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # from the centres of the outermost pixels
-SAMPLES = 4096  # pixels sampled of an amodal box for its occlusion, about; of larger ones every n-th row and column
+OUTER_EDGES = np.array((-0.5, -0.5, 0.5, 0.5))  # offsets from the centres of the outermost pixels
+SAMPLES = 4096  # approximate limit of sampled pixels per amodal box; larger boxes use every n-th row and column
 
 
 class Regions(NamedTuple):
@@ -29,12 +29,12 @@ class Regions(NamedTuple):
 
 
 def find_actor_regions(instance: Ints32, count: int) -> Regions:
-    """Return the regions of actors 0 to `count` - 1, whose values in the `instance` image (H, W) are 1 to `count`."""
+    """Return the regions of actors 0 to `count` - 1, which have the values 1 to `count` in the image (H, W)."""
     return _regions(instance, count, 1)
 
 
 def find_thing_regions(instance: Ints32, count: int) -> Regions:
-    """Return the regions of things 0 to `count` - 1, whose values in the `instance` image (H, W) are -1 to -`count`."""
+    """Return the regions of things 0 to `count` - 1, which have the values -1 to -`count` in the image (H, W)."""
     return _regions(instance, count, -1)
 
 
@@ -65,8 +65,8 @@ def view_actors(
 ) -> Views:
     """Return the image annotations of `actors` (M,): 2-D boxes, pixels, truncation and occlusion.
 
-    `instance` (H, W) is a + 1 at the scene's actor a, `regions` are those of all the scene's actors. The scene is at
-    the instant of the image. Occlusion compares an image's pixels with rays cast at the actor alone.
+    `instance` (H, W) is a + 1 at the scene's actor a, `regions` are those of all the scene's actors. The scene must be
+    at the instant of the image. Occlusion compares the image's pixels with rays cast at the actor in an empty world.
     """
     box = compute_amodal_boxes(scene, world_from_camera, lens, actors)
     occlusion = np.ones(len(actors))
@@ -88,7 +88,7 @@ def view_actors(
 
 
 def _sampled(box: Array) -> tuple[Ints, Ints]:
-    """Return the rows and the columns of the pixels sampled for the occlusion of an actor with the `box` (4,)."""
+    """Return the rows and columns of the pixels sampled for the occlusion of an actor with the `box` (4,) [px]."""
     x1, y1, x2, y2 = box
     step = max(1, int(np.sqrt((x2 - x1) * (y2 - y1) / SAMPLES)))
     first_column, first_row = int(np.ceil(x1)), int(np.ceil(y1))
@@ -106,9 +106,9 @@ def _unoccluded(scene: Scene, world_from_camera: Array, lens: Lens, actor: int, 
     return int(np.count_nonzero(hits.face >= 0))
 
 
-NEAR_M = 0.1  # depth of the near plane, at which actors are clipped
+NEAR_M = 0.1  # depth of the near plane, where actors are clipped
 BOX_EDGES = np.array([(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7)])
-BEYOND_IMAGE = 1.3  # distortion is extrapolated up to so many times the image's radius
+BEYOND_IMAGE = 1.3  # multiple of the image's radius up to which the distortion is extrapolated
 
 
 class Hull(NamedTuple):
@@ -122,19 +122,20 @@ class Hull(NamedTuple):
 def hull(category: str, shape: int, size: tuple[float, ...] | None = None) -> Hull:
     """Return the convex hull of an actor's mesh, body frame: see `actor_mesh`."""
     vertices = actor_mesh(category, shape, size).vertices.astype(np.float64)
-    found = ConvexHull(vertices)
-    rows = np.searchsorted(found.vertices, found.simplices, sorter=(order := np.argsort(found.vertices)))
+    convex = ConvexHull(vertices)
+    rows = np.searchsorted(convex.vertices, convex.simplices, sorter=(order := np.argsort(convex.vertices)))
     faces = order[rows]
     sides = np.sort(np.concatenate((faces[:, :2], faces[:, 1:], faces[:, ::2])), axis=1)
-    return Hull(vertices[found.vertices], np.unique(sides, axis=0))
+    return Hull(vertices[convex.vertices], np.unique(sides, axis=0))
 
 
 def compute_amodal_boxes(
     scene: Scene, world_from_camera: Array, lens: Lens, actors: Ints, near_m: float = NEAR_M
 ) -> Array:
-    """Return the amodal 2-D boxes (M, 4) x1 y1 x2 y2 [px] of `actors` (M,), around all that is beyond the near plane.
+    """Return the amodal 2-D boxes (M, 4) x1 y1 x2 y2 [px] of `actors` (M,), around their parts beyond the near plane.
 
-    Not clipped to the image; NaN where they do not touch it. `world_from_camera` (4, 4) is of the optical frame.
+    They are not clipped to the image; NaN where they do not touch it. `world_from_camera` (4, 4) [m] is the pose of the
+    optical frame, `near_m` the depth of the near plane [m].
     """
     camera_from_world = inverse(world_from_camera)
     boxes = np.full((len(actors), 4), np.nan)
@@ -156,13 +157,13 @@ def compute_amodal_boxes(
 
 
 def clip_boxes(boxes: Array, lens: Lens) -> Array:
-    """Return boxes (M, 4) clipped to the image; of zero area where they lie outside, NaN where they are NaN."""
+    """Return boxes (M, 4) [px] clipped to the image; of zero area where they are outside, NaN where they are NaN."""
     last = (lens.width - 0.5, lens.height - 0.5)
     return np.clip(boxes, -0.5, (*last, *last))
 
 
 def compute_truncation(boxes: Array, lens: Lens) -> Array:
-    """Return (M,) the share of each box (M, 4) that lies outside the image; 1 where the box is NaN."""
+    """Return (M,) the shares of boxes (M, 4) [px] that are outside the image; 1 where a box is NaN."""
     with np.errstate(invalid="ignore", divide="ignore"):
         share = _area(clip_boxes(boxes, lens)) / _area(boxes)
     return 1 - np.nan_to_num(share, nan=0.0)
@@ -173,8 +174,9 @@ def _area(boxes: Array) -> Array:
 
 
 def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: Ints) -> Mask:
-    """Return (M,) whether each actor's bounding sphere touches the camera's viewing frustum (frustum culling)."""
-    trace, index = scene.trace, scene.index
+    """Return (M,) whether the actors' bounding spheres touch the camera's viewing frustum (frustum culling)."""
+    trace = scene.trace
+    index = scene.index
     size = trace.size[actors]
     drift = abs(scene.offset_s) * np.linalg.norm(np.nan_to_num(trace.velocity[index, actors]), axis=1)
     radius = np.linalg.norm(size, axis=1) / 2 + 2 * drift
@@ -186,14 +188,14 @@ def _may_show(scene: Scene, camera_from_world: Array, lens: Lens, actors: Ints) 
 
 
 def _border(lens: Lens) -> Array:
-    """Return (36, 2) pixels u, v on the edges of the image."""
+    """Return (36, 2) points u, v [px] on the edges of the image."""
     u, v = np.linspace(0, lens.width - 1, 9), np.linspace(0, lens.height - 1, 9)
     across = [np.column_stack((u, np.full(9, edge))) for edge in (0, lens.height - 1)]
     return np.concatenate((*across, *(np.column_stack((np.full(9, edge), v)) for edge in (0, lens.width - 1))))
 
 
 def clip_in_front(points: Array, edges: Ints, near_m: float) -> Array:
-    """Return the vertices (V, 3) of a hull clipped to z >= `near_m`: those beyond, and edges' cuts with the plane."""
+    """Clip a hull to z >= `near_m` [m]: return its vertices (V, 3) beyond the plane, and its edges' intersections."""
     ahead = points[:, 2] >= near_m
     one, other = (points[end] for end in edges[ahead[edges[:, 0]] != ahead[edges[:, 1]]].T)
     share = (near_m - one[:, 2:]) / (other[:, 2:] - one[:, 2:])
@@ -201,7 +203,10 @@ def clip_in_front(points: Array, edges: Ints, near_m: float) -> Array:
 
 
 def _project(lens: Lens, points: Array) -> Array:
-    """Return pixels (N, 2) of points (N, 3) before the camera; points too far out for the distortion are drawn in."""
+    """Project points (N, 3) in front of the camera to pixels (N, 2).
+
+    Those too far out for the distortion are moved in.
+    """
     if lens.distortion().any():
         plane = points[:, :2] / points[:, 2:]
         radius = np.linalg.norm(plane, axis=1, keepdims=True)
@@ -216,10 +221,10 @@ def _image_radius(lens: Lens) -> float:
 
 
 def outline_boxes(corners: Array, lens: Lens, world_from_camera: Array) -> tuple[Array, Array]:
-    """Return the rectangles (M, 4) x1 y1 x2 y2 [px] that boxes fill in an image, and the shares (M,) outside it.
+    """Return the bounding rectangles (M, 4) x1 y1 x2 y2 [px] of boxes in an image, and their shares (M,) outside it.
 
-    `corners` (M, 8, 3) are theirs in the world, in the order of `Boxes.corners`, `world_from_camera` (4, 4) is of the
-    optical frame. Rectangles are not clipped to the image; NaN where they do not touch it.
+    `corners` (M, 8, 3) [m] are the boxes' corners, world frame, in the order of `Boxes.corners`; `world_from_camera`
+    (4, 4) [m] is the pose of the optical frame. Rectangles are not clipped; NaN where they do not touch the image.
     """
     amodal = np.full((len(corners), 4), np.nan)
     corners = transform_points(inverse(world_from_camera), corners.reshape(-1, 3)).reshape(-1, 8, 3)

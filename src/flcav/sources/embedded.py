@@ -23,14 +23,14 @@ from flcav.world.traffic.traffic import simulate_drives
 
 
 class EmbeddedSource(DividedSource):
-    """A `Replayable` source of the frames of a recipe.
+    """The built-in simulator as a `Replayable` source of a recipe's frames.
 
     The traffic of scene i depends on the town, the seed, the number of vehicles, the times of the spins and the
-    scenarios, not on the number of scenes.
+    scenarios, but not on the number of scenes.
     """
 
     def __init__(self, recipe: Recipe, beside: Path | None = None) -> None:
-        """Load the town of `recipe`; a town's folder may also be relative to `beside`, the folder of the recipe.
+        """Load the town of `recipe`; a town's folder may also be relative to `beside`, the folder of the recipe file.
 
         Raises `InputError` where the town or a pole does not exist, there is neither a vehicle nor a pole to observe,
         a sensor is not mounted above the ground, or the town's name is too long for the names of frames.
@@ -60,9 +60,9 @@ class EmbeddedSource(DividedSource):
         self._last_scene: tuple[str, Scene] | None = None
 
     def describe(self) -> Mapping[str, Json]:
-        """Return the recipe as JSON values, with names resolved: numbers of poles, rigs, hashes of the town's files."""
-        own = self.recipe.model_dump(mode="json")
-        asked = {
+        """Return the recipe as JSON values with names resolved: pole numbers, rigs, hashes of the town's files."""
+        fields = self.recipe.model_dump(mode="json")
+        optional = {
             "randomise",
             "rare",
             "window_s",
@@ -71,7 +71,7 @@ class EmbeddedSource(DividedSource):
             "navigation_s",
         }  # left out where they are not asked for
         return {
-            **{name: value for name, value in own.items() if name not in asked or value},
+            **{name: value for name, value in fields.items() if name not in optional or value},
             "town": self.town.name,
             "town_files": {name: hashlib.sha256(data).hexdigest() for name, data in self._files().items()},
             "scenes": len(self.scenes()),
@@ -85,14 +85,15 @@ class EmbeddedSource(DividedSource):
         return self._files() if kept else {}
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        """Yield the scene's frames by spin, and within a spin the vehicles' before the poles'."""
+        """Yield the scene's frames by spin, and within a spin those of the vehicles before those of the poles."""
         yield from self.replay(scene, self.trace(scene), range(self.frame_count(scene)))
 
     def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
         """Yield the scene's frames with the given `numbers`, observed in the traffic `trace`: see `Replayable`."""
         if self._last_scene is None or self._last_scene[0] != scene:
             self._last_scene = scene, Scene(self.town, trace)
-        world, recipe = self._last_scene[1], self.recipe
+        world = self._last_scene[1]
+        recipe = self.recipe
         weather = recipe.weather.draw(stream(recipe.seed, scene, "weather"))
         for number in numbers:
             index, agent = divmod(number, len(self.agents))
@@ -110,8 +111,9 @@ class EmbeddedSource(DividedSource):
             )
 
     def _records(self, trace: Trace, index: int, agent: int) -> bool:
-        """Return whether an agent records the spin `index`: those of windows only near poles, with `window_range_m`."""
-        near_m, middles = self.recipe.window_range_m, self.recipe.find_middles(index)
+        """Return whether an agent records the spin `index`; with `window_range_m`, windows only near a pole."""
+        near_m = self.recipe.window_range_m
+        middles = self.recipe.find_middles(index)
         if near_m is None or not self.poles or index in middles:
             return True
         if agent >= self.recipe.cavs:
@@ -125,7 +127,7 @@ class EmbeddedSource(DividedSource):
         return self._simulate(scene)[0]
 
     def navigation_logs(self, scene: str) -> Mapping[str, NavigationLog]:
-        """Return vehicle -> the navigation log of its drive in a scene; empty without `navigation_s`."""
+        """Return the navigation log of each vehicle's drive in a scene, by name; empty without `navigation_s`."""
         if not self.recipe.navigation_s:
             return {}
         drives, about = self._simulate(scene)[1], {"scene": scene, "seed": self.recipe.seed}
@@ -136,7 +138,7 @@ class EmbeddedSource(DividedSource):
         return {agent: log for agent, log in logs.items() if log is not None}
 
     def _simulate(self, scene: str) -> tuple[Trace, Trace]:
-        """Return the traffic of the scene, and the motion of its vehicles for their navigation logs."""
+        """Return the traffic of the scene at its spins, and the densely sampled motion for the navigation logs."""
         if self._last_traffic is None or self._last_traffic[0] != scene:
             seed = derive_seed(self.recipe.seed, "traffic", self.scenes().index(scene))
             warmup = stream(self.recipe.seed, scene, "warmup").integers(*self.recipe.warmup_steps, endpoint=True)
@@ -171,10 +173,10 @@ class EmbeddedSource(DividedSource):
 
 
 def read_town_files(town: Town, name: str) -> Mapping[str, bytes]:
-    """Return the contents of a town's files by name; the recipe calls it `name`."""
+    """Return the contents of a town's files by file name; `name` is the town as the recipe names it."""
     heights = HILLS if name in HILLY else HEIGHTS
     names = ("town.yaml", *([] if town.relief is None else [heights]))
-    paths = [town.net, *(town.net.parent / own for own in names)]
+    paths = [town.net, *(town.net.parent / file for file in names)]
     return {path.name: path.read_bytes() for path in paths}
 
 

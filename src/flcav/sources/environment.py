@@ -4,7 +4,8 @@
 
 It needs the extra `gym`. An action is the pedals, from full brake (-1) to full throttle (1), and the steering, from
 right (-1) to left (1). The reward is the progress along the route [m], less `COLLISION` for a collision; the episode
-ends with one, `OFF_M` beside the route, and at its end. Observations are in the car's frame, x forward and y left:
+ends with a collision, `OFF_M` off the route, and at the end of the route. Observations are in the ego frame, x forward
+and y left:
 
 - `ego` (5,): speed [m/s], yaw rate [rad/s], angle of the front wheels [rad], offset to the left of the route [m],
   heading less the route's [rad]
@@ -13,7 +14,7 @@ ends with one, `OFF_M` beside the route, and at its end. Observations are in the
 - `light` (2,): distance to the next traffic light on the route [m], at most `SIGHT_M`, and 1 where it is green
 - `actors` (`ACTORS`, 8): the nearest others within `SIGHT_M`: x, y [m], cosine and sine of the heading, velocity x, y
   over ground [m/s], length, width [m]; zeros where there are fewer
-- `lidar` (N, 4), with a `lidar`: x, y, z [m] in its own frame and intensity, zeros after the last return
+- `lidar` (N, 4), with a `lidar`: x, y, z [m] in the LiDAR frame and intensity, zeros after the last return
 """
 
 from typing import Any
@@ -44,7 +45,7 @@ Observation = dict[str, NDArray[np.float32]]
 
 EGO = "ego"
 CAR = ("car", 3)  # a sedan
-COLLISION = 50.0
+COLLISION = 50.0  # penalty, in metres of progress
 OFF_M = 6.0
 AHEAD, SPACING_M = 16, 3.0
 ACTORS, SIGHT_M = 16, 80.0
@@ -120,7 +121,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
             self._world = None
 
     def _set_out(self, world: LiveWorld) -> tuple[Route, float]:
-        """Put the car where there is room at the start of a route; return that, and how far along it the car is."""
+        """Spawn the ego where there is room near the start of a route; return the route and its distance along [m]."""
         for _ in range(TRIES):
             route = draw_route(self._net, self.np_random, ROUTE_M)
             along = float(self.np_random.uniform(5.0, 15.0))
@@ -132,11 +133,13 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         raise InputError(f"{self.town.name}: no room was found for the car in {TRIES} places")
 
     def _observe(self, snapshot: Snapshot) -> Observation:
-        """Return what the car sees, and note how far along the route it is."""
+        """Return the observation in the ego frame, and update the distance along the route [m]."""
         assert self._world is not None
         assert self._route is not None
-        trace, row = snapshot.trace, snapshot.row(EGO)
-        position, yaw = trace.position[0, :, :2], trace.yaw[0]
+        trace = snapshot.trace
+        row = snapshot.row(EGO)
+        position = trace.position[0, :, :2]
+        yaw = trace.yaw[0]
         x, y, heading = *position[row].tolist(), float(yaw[row])
         self._along, offset = self._route.project(x, y, self._along)
         velocity = np.stack(rotate(trace.velocity[0, :, 0], trace.velocity[0, :, 1], -heading), axis=1)
@@ -166,7 +169,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return {name: values.astype(np.float32) for name, values in seen.items()}
 
     def _see_light(self, snapshot: Snapshot) -> Array:
-        """Return the distance to the next light on the route, and whether it is green."""
+        """Return (2,) the distance to the next traffic light on the route [m], and 1 if it is green, else 0."""
         assert self._route is not None
         for along, link in self._route.stops:
             if self._along <= along <= self._along + SIGHT_M:
@@ -175,7 +178,7 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return np.array((SIGHT_M, 1.0))
 
     def _scan(self, snapshot: Snapshot) -> NDArray[np.float32]:
-        """Return the points of the LiDAR, with zeros up to the number of its rays."""
+        """Return (N, 4) points x, y, z [m] in the LiDAR frame and intensity, zero-padded to the number of rays."""
         assert self._rig is not None
         if self._scene is None:
             self._scene = Scene(self.town, snapshot.trace)

@@ -1,4 +1,4 @@
-"""A live world as a source of frames: the drives of a planner, seen by its vehicles' sensors."""
+"""A live world as a source of frames: closed-loop drives of a planner, observed by its vehicles' sensors."""
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -20,27 +20,27 @@ from flcav.world.weather import WEATHERS, Weather
 
 
 class Driver(Protocol):
-    """A planner: it puts its vehicles into a world, and drives them. Recording by several processes pickles it."""
+    """A planner that spawns its vehicles in a world and drives them. Recording in several processes pickles it."""
 
     def describe(self) -> Mapping[str, Json]:
-        """Return what determines how it drives, as JSON values: those of equal descriptions drive alike."""
+        """Return what determines its driving, as JSON values: equal descriptions mean equal driving."""
         ...
 
     def begin(self, world: LiveWorld) -> None:
-        """Put the vehicles into a world that has just begun; whatever it knows of earlier worlds is forgotten."""
+        """Spawn the vehicles in a world that has just begun, and discard any state of earlier worlds."""
         ...
 
     def drive(self, now: Snapshot) -> Mapping[str, Controls]:
-        """Return the controls of the vehicles until the next step; a vehicle that is left out keeps its last ones."""
+        """Return the controls of the vehicles until the next step, by name; a missing vehicle keeps its last ones."""
         ...
 
 
 @dataclass
 class LiveSource:
-    """The frames of a planner's drives: each scene is a live world of its own, observed at regular times.
+    """A source of the frames of a planner's drives: every scene is a separate live world, observed at regular times.
 
-    The vehicles named in `rigs` must be there at every spin. Raises `InputError` for numbers that are not positive,
-    a time between spins that is no multiple of the world's step, and a sensor below the ground.
+    The vehicles named in `rigs` must exist at every spin. Raises `InputError` for numbers that are not positive, a
+    time between spins that is not a multiple of the world's step, and a sensor below the ground.
     """
 
     town: Town
@@ -49,8 +49,8 @@ class LiveSource:
     settings: Settings
     scene_count: int = 1
     spins: int = 10
-    every_s: float = 0.5  # between spins
-    first_s: float = 0.5  # of the first spin
+    every_s: float = 0.5  # time between spins [s]
+    first_s: float = 0.5  # time of the first spin [s]
     split: str = "train"
     weather: Weather = WEATHERS["clear"]
     _traces: dict[str, Trace] = field(default_factory=dict, init=False, repr=False)
@@ -94,9 +94,9 @@ class LiveSource:
         return self.spins * len(self.rigs)
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        """Yield the frames of a scene while its world goes on, by spin, and within a spin by vehicle.
+        """Yield the frames of a scene while its world runs, by spin, and within a spin by vehicle.
 
-        Raises `InputError` where a vehicle is not there, `RuntimeError` where SUMO fails.
+        Raises `InputError` where a vehicle does not exist, `RuntimeError` where SUMO fails.
         """
         seed = derive_seed(self.settings.seed, "live", self.scenes().index(scene))
         started = replace(self.settings, seed=seed, remembers=False)

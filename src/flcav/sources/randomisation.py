@@ -45,14 +45,14 @@ DROPPING = 0.4  # fraction of the LiDARs that lose many returns
 
 
 def randomise_town(town: Town, draw: Draw) -> Town:
-    """Return a town on the same net with streets, traffic and, unless it has heights, terrain drawn by `draw`."""
+    """Return a town on the same net with randomised streets and traffic, and terrain unless the town has heights."""
     parameters = _draw_parameters(town.parameters, draw)
     drawn = furnish_town(town.name, town.net, read_net(town.net), parameters)
     return lift_town(drawn, town.relief or draw_terrain(drawn, draw))
 
 
 def town_files(town: Town) -> Mapping[str, bytes]:
-    """Return the files of a town's folder by name: net, parameters and heights, from which `load_town` makes it."""
+    """Return the files of a town's folder by name: net, parameters and heights, as `load_town` reads them."""
     values = town.parameters.model_dump(mode="json", exclude_defaults=True)
     files = {"town.net.xml": town.net.read_bytes(), "town.yaml": yaml.safe_dump(values, sort_keys=False).encode()}
     if town.relief is not None:
@@ -81,7 +81,7 @@ def _draw_parameters(town: TownParameters, draw: Draw) -> TownParameters:
 
 
 def _draw_street(street: StreetParameters, draw: Draw) -> StreetParameters:
-    """Return the parameters of a street: its plots, what encloses them, what stands about, parked vehicles."""
+    """Return random parameters of a street: plots, boundaries, clutter, kerbside furniture and parked vehicles."""
 
     def span(low: tuple[float, float], more: tuple[float, float]) -> tuple[float, float]:
         start = draw.uniform(*low)
@@ -116,7 +116,7 @@ def _mix(names: list[str], draw: Draw) -> dict[str, float]:
 
 
 def draw_terrain(town: Town, draw: Draw) -> Relief:
-    """Return uneven ground with slopes under a level town: long waves, short ones, and roughness beside the roads."""
+    """Return random terrain [m] for a level town, world frame: long and short waves, and roughness off the roads."""
     x0, y0, x1, y1 = town.bounds
     near = _grid((x0, y0, x1, y1), CELL_M)
     far = _grid((x0 - LAND_M, y0 - LAND_M, x1 + LAND_M, y1 + LAND_M), FAR_CELL_M)
@@ -142,7 +142,7 @@ def _grid(bounds: tuple[float, float, float, float], cell_m: float) -> Array:
 
 
 def randomise_rig(rig: Rig, draw: Draw) -> Rig:
-    """Return the rig with every LiDAR's mount, beams, reach and losses drawn; other sensors stay as they are."""
+    """Return the rig with mount, beams, range and losses of every LiDAR randomised; other sensors stay as they are."""
     return rig.model_copy(update={"lidars": {name: _draw_lidar(one, draw) for name, one in rig.lidars.items()}})
 
 
@@ -175,7 +175,7 @@ def _draw_lidar(lidar: MountedLidar, draw: Draw) -> MountedLidar:
 
 
 def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
-    """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`; each unit's beams are a little off."""
+    """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`, with small errors per beam."""
     if pattern == "even":
         elevations = np.linspace(
             draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(EVEN_BEAMS[0], EVEN_BEAMS[1] + 1))
@@ -191,9 +191,9 @@ def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
 
 
 def randomise_bodies(trace: Trace, draw: Draw) -> Trace:
-    """Return the trace with sizes of actors drawn around those of their shapes, and the ends of cars and vans bowed.
+    """Return the trace with the actors' sizes [m] drawn around those of their shapes, and bowed ends of cars and vans.
 
-    Pedestrians differ most: in their stride, and in how they hold their arms.
+    Pedestrians vary most, since stride and arms count.
     """
     spans = np.array([FACTORS.get(kind, ALIKE) for kind in trace.category.tolist()]).reshape(-1, 3, 2)
     size = (trace.size * draw.uniform(spans[..., 0], spans[..., 1])).round(3)

@@ -1,4 +1,4 @@
-"""Recording recipes: validated YAML files that say what a dataset contains, and how its frames divide into scenes."""
+"""Recording recipes: validated YAML files that define a dataset, and the division of its frames into scenes."""
 
 import os
 from collections.abc import Mapping
@@ -166,11 +166,11 @@ class Recipe(Displayed, Config):
 
     @property
     def middle_spins(self) -> tuple[int, ...]:
-        """Return the numbers of the `spins_per_scene` spins, among those of their windows."""
+        """Return the indices, among all spins, of the `spins_per_scene` spins, which are the middles of windows."""
         return tuple(np.flatnonzero(np.isin(self._steps(), self._middle_steps())).tolist())
 
     def find_middles(self, spin: int) -> NDArray[np.int64]:
-        """Return the numbers, among all spins, of the `spins_per_scene` spins whose window has the spin `spin`."""
+        """Return the indices, among all spins, of the `spins_per_scene` spins whose window contains the spin `spin`."""
         middle = np.array(self.middle_spins)
         away = np.abs(self._steps()[middle] - self._steps()[spin])
         return middle[away <= round(self.window_s / STEP_S)]
@@ -217,7 +217,7 @@ class CarlaRecipe(Recipe):
 
 
 def refuse_unknown_to_carla(field: str, rig: Rig) -> None:
-    """Raise ValueError where a sensor of the `rig`, of the recipe's `field`, has something that CARLA's has not."""
+    """Raise ValueError where a sensor of `rig`, the recipe's `field`, has a property that CARLA does not simulate."""
     for name, lidar in rig.lidars.items():
         if lidar.settings.elevations_deg is not None or lidar.settings.rolling:
             what = "uneven channels" if lidar.settings.elevations_deg is not None else "a rolling spin"
@@ -239,7 +239,7 @@ def refuse_unknown_to_carla(field: str, rig: Rig) -> None:
 
 
 def recipe_path(name: str) -> Path:
-    """Return the file of the recipe `name` that comes with flcav, e.g. "objects" or "allocation/three_tasks".
+    """Return the path of the packaged recipe `name`, e.g. "objects" or "allocation/three_tasks".
 
     Recipes are in the folder `recipes/` of a checkout, and within the package of an installation. Raises `InputError`
     for an unknown name.
@@ -255,7 +255,7 @@ def recipe_path(name: str) -> Path:
 
 
 def find_recipe(path: Path) -> Path:
-    """Return `path`, or the recipe that comes with flcav if `path` is "recipes/NAME.yaml" and no such file exists."""
+    """Return `path`, or the packaged recipe if `path` is "recipes/NAME.yaml" and no such file exists."""
     if path.parts[:1] != ("recipes",) or path.suffix != ".yaml" or path.exists():
         return path
     try:
@@ -265,7 +265,7 @@ def find_recipe(path: Path) -> Path:
 
 
 def parse_recipe(values: Mapping[str, Json], origin: str) -> Recipe:
-    """Return the fields `values` as a recipe, a `CarlaRecipe` if they have a `source`: see `parse_config`."""
+    """Parse the fields `values` as a recipe, a `CarlaRecipe` if they have a `source`: see `parse_config`."""
     return parse_config(_choose_model(values), values, origin)
 
 
@@ -274,9 +274,9 @@ def _choose_model(values: object) -> type[Recipe]:
 
 
 def load_recipe(path: Path | str) -> Recipe:
-    """Return the recipe in the YAML file at `path`, a `CarlaRecipe` if it has a `source`: see docs/recipes.md.
+    """Load the recipe in the YAML file at `path`, a `CarlaRecipe` if it has a `source`: see docs/recipes.md.
 
-    The field `town` becomes an absolute path where it names a folder beside the file. Raises `InputError` that names
+    The field `town` becomes an absolute path where it names a folder next to the file. Raises `InputError`, which names
     file, field, value and violated rule.
 
     >>> from flcav import load_recipe
@@ -292,10 +292,10 @@ def load_recipe(path: Path | str) -> Recipe:
 
 
 class DividedSource:
-    """A source whose scenes are those of a recipe in a town: each has the frames of all agents at all its spins."""
+    """Base of sources that divide a recipe's frames into scenes: a scene has the frames of all agents at all spins."""
 
     def __init__(self, recipe: Recipe, town: str, agents: tuple[str, ...]) -> None:
-        """Raises `InputError` where nobody observes, or the town's name is too long for the names of frames."""
+        """Raise `InputError` where there is no agent, or the town's name is too long for the names of frames."""
         if not agents:
             raise InputError("fields 'cavs' = 0 and 'poles' = []: nobody observes; give at least one of them")
         self._name = f"{town}-{recipe.seed}"

@@ -1,4 +1,4 @@
-"""Protocols of sources of frames: a simulator, or a reader of logs."""
+"""Protocols of sources of frames, such as a simulator or a reader of logs."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Protocol, runtime_checkable
@@ -33,28 +33,28 @@ class Source(Protocol):
         ...
 
     def trace(self, scene: str) -> Trace | None:
-        """Return the traffic of a scene, once all its frames were yielded; None where the source does not know it."""
+        """Return the traffic of a scene once all its frames are yielded; None where the source does not know it."""
         ...
 
 
 @runtime_checkable
 class Replayable(Source, Protocol):
-    """A source that can produce any frame of a scene from its traffic, so that frames are recorded in parallel.
+    """A source that produces any frame of a scene from the scene's traffic, so that frames are recorded in parallel.
 
-    Its `trace(scene)` returns the traffic at any time, before the frames too, and never None.
+    Its `trace(scene)` returns the traffic at any time, even before the frames are yielded, and never None.
     """
 
     def replay(self, scene: str, trace: Trace, numbers: range) -> Iterator[Frame]:
-        """Yield the frames with the given `numbers`, positions in `frames(scene)`, of a scene with traffic `trace`."""
+        """Yield the frames of a scene with traffic `trace` whose positions in `frames(scene)` are `numbers`."""
         ...
 
 
 @runtime_checkable
 class LoggingSource(Replayable, Protocol):
-    """A source that also knows what the vehicles' navigation sensors measured over their whole drives."""
+    """A source that also provides the GNSS and IMU measurements of the vehicles over their whole drives."""
 
     def navigation_logs(self, scene: str) -> Mapping[str, NavigationLog]:
-        """Return vehicle -> its navigation log of a scene; empty where none are asked for."""
+        """Return the navigation logs of a scene by vehicle; empty where the source records none."""
         ...
 
 
@@ -69,8 +69,8 @@ class TownSource(Source, Protocol):
 
 @runtime_checkable
 class Isolated(Source, Protocol):
-    """A source whose library may end the process that it runs in: one process of its own records it, in silence."""
+    """A source whose library may crash the process: it is recorded in a separate process without output."""
 
     def explain_end(self) -> str:
-        """Return why such a process has ended before its time, in a sentence."""
+        """Return one sentence on why such a process ended prematurely."""
         ...

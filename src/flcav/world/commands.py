@@ -1,8 +1,8 @@
-"""Commands to a live world: what a client does to it between two steps.
+"""Commands to a live world, which a client gives between two steps.
 
-World frame: ENU, metres, radians. Where `z` is None an actor stands on the ground; where bridges are, on the level that
-is nearest to `z`. An actor placed far above it falls, one far below it stays there: see `dynamics.bodies.ALOFT_M`.
-Actors are known by names that the client chooses.
+World frame: ENU, metres, radians. If `z` is None an actor stands on the ground; at bridges, on the level nearest to
+`z`. An actor placed far above the ground falls, one far below it stays there: see `dynamics.bodies.ALOFT_M`. Actors
+have names that the client chooses.
 """
 
 from dataclasses import dataclass
@@ -16,7 +16,7 @@ class Controls:
     """The controls of a vehicle; they hold until the next ones."""
 
     throttle: float = 0.0  # 0 to 1
-    steer: float = 0.0  # -1 to 1, share of the greatest steering angle, positive to the left
+    steer: float = 0.0  # -1 to 1, in greatest steering angles, positive to the left
     brake: float = 0.0  # 0 to 1
     hand_brake: bool = False
     reverse: bool = False
@@ -24,29 +24,29 @@ class Controls:
 
 @dataclass(frozen=True)
 class Spawn:
-    """A vehicle, walker or prop appears, at rest."""
+    """Spawn a vehicle, walker or prop at rest."""
 
     name: str
     category: str  # one of `trace.CATEGORIES`, or "prop"
     shape: int  # row of `SHAPES[category]`, or of `parameters.PROPS`
-    x: float  # of the middle of its box [m]
-    y: float
-    yaw: float = 0.0
-    z: float | None = None  # of its underside
+    x: float  # of the centre of its box [m]
+    y: float  # of the centre of its box [m]
+    yaw: float = 0.0  # [rad]
+    z: float | None = None  # of its underside [m]
     size: Size | None = None  # length, width, height [m]; None: those of the shape
-    anywhere: bool = False  # even where something else stands
+    anywhere: bool = False  # even where another object stands
 
 
 @dataclass(frozen=True)
 class Remove:
-    """An actor disappears; of SUMO's traffic nobody sets out in its place."""
+    """Remove an actor; one of SUMO's traffic is not replaced."""
 
     name: str
 
 
 @dataclass(frozen=True)
 class Drive:
-    """A vehicle is driven by these controls."""
+    """Set the controls of a vehicle."""
 
     name: str
     controls: Controls
@@ -54,45 +54,45 @@ class Drive:
 
 @dataclass(frozen=True)
 class Grip:
-    """The tyres of a vehicle have this share of the friction of a dry road, until the next such command."""
+    """Set the friction of a vehicle's tyres until the next such command."""
 
     name: str
-    share: float  # 0 to 1
+    share: float  # friction over that of a dry road, 0 to 1
 
 
 @dataclass(frozen=True)
 class Walk:
-    """A walker walks at this velocity in the plane, until the next such command."""
+    """Set the velocity at which a walker walks until the next such command."""
 
     name: str
-    velocity: tuple[float, float]  # x, y [m/s]
+    velocity: tuple[float, float]  # x, y, world frame [m/s]
 
 
 @dataclass(frozen=True)
 class Place:
-    """An actor is moved to another pose at once; it keeps its velocity."""
+    """Move an actor to another pose instantly; it keeps its velocity."""
 
     name: str
-    x: float
-    y: float
-    yaw: float
-    z: float | None = None
-    pitch: float = 0.0  # of an actor without physics or without gravity, as `roll`: see `geometry.pose`
-    roll: float = 0.0
+    x: float  # [m]
+    y: float  # [m]
+    yaw: float  # [rad]
+    z: float | None = None  # of its underside [m]
+    pitch: float = 0.0  # of an actor without physics or without gravity, as in `geometry.pose` [rad]
+    roll: float = 0.0  # of the same actors [rad]
 
 
 @dataclass(frozen=True)
 class Push:
-    """An actor has another velocity at once; without physics it does not move, and only reports that velocity."""
+    """Set the velocity of an actor instantly; without physics it does not move, but reports that velocity."""
 
     name: str
-    velocity: Vector  # [m/s]
-    yaw_rate: float | None = None  # [rad/s]; None: as it is
+    velocity: Vector  # x, y, z, world frame [m/s]
+    yaw_rate: float | None = None  # [rad/s]; None: unchanged
 
 
 @dataclass(frozen=True)
 class Simulate:
-    """The physics of an actor are on or off: without, it stays where it is placed, and nothing moves it.
+    """Switch the physics of an actor on or off: without physics it stays where it is placed, and nothing moves it.
 
     Without `gravity` it keeps the height, pitch and roll at which it was placed.
     """
@@ -104,7 +104,7 @@ class Simulate:
 
 @dataclass(frozen=True)
 class SetLight:
-    """The lights of a junction show these letters, one for each link; None: those of their program again."""
+    """Set the traffic lights of a junction to these letters, one per link, or return them to their program (None)."""
 
     junction: str
     state: str | None
@@ -112,7 +112,7 @@ class SetLight:
 
 @dataclass(frozen=True)
 class FreezeLights:
-    """The programs of all lights stand still, or go on."""
+    """Freeze or unfreeze the programs of all traffic lights."""
 
     frozen: bool
 

@@ -1,8 +1,8 @@
 """Geodetic positions on the WGS 84 ellipsoid.
 
-Points of a town (east, north, up around its origin) become latitude, longitude and altitude by way of Earth-centred,
-Earth-fixed (ECEF) coordinates, without approximation; from ECEF back to latitude by Bowring's iteration ("The accuracy
-of geodetic latitude and height equations", Survey Review 28:202, 1985), exact to nanometres near the ground.
+Points of a town (east, north, up from its origin) are converted to latitude, longitude and altitude by way of
+Earth-centred, Earth-fixed (ECEF) coordinates, without approximation; ECEF to latitude by Bowring's iteration ("The
+accuracy of geodetic latitude and height equations", Survey Review 28:202, 1985), exact to nanometres near the ground.
 """
 
 import numpy as np
@@ -18,20 +18,20 @@ ITERATIONS = 4  # of Bowring's method
 
 
 def convert_to_geodetic(origin: GeoReference, enu: Array) -> Array:
-    """Return (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84, of points (..., 3) x, y, up [m].
+    """Convert points (..., 3) x, y, up [m] to (..., 3) latitude [deg], longitude [deg], altitude [m], WGS 84.
 
-    x and y are east and north, unless `origin` has other axes.
+    x and y are east and north of `origin`, unless it has other axes.
     """
     return _from_earth(_to_earth(origin) + enu @ (_earth_from_enu(origin) @ _enu_from_map(origin)).T)
 
 
 def convert_from_geodetic(origin: GeoReference, place: GeoReference) -> Array:
-    """Return (3,) east, north, up [m] of `place` from `origin`, whatever their maps' axes."""
+    """Return (3,) east, north, up [m] of `place` relative to `origin`, independent of their maps' axes."""
     return (_to_earth(place) - _to_earth(origin)) @ _earth_from_enu(origin)
 
 
 def convert_to_map(origin: GeoReference, geodetic: Array) -> Array:
-    """Return (..., 3) x, y, up [m] of places (..., 3): the inverse of `convert_to_geodetic`."""
+    """Convert latitude, longitude [deg], altitude [m] (..., 3) to x, y, up [m], as the inverse of the above."""
     enu = (_place_on_earth(*np.moveaxis(geodetic, -1, 0)) - _to_earth(origin)) @ _earth_from_enu(origin)
     return enu @ np.linalg.inv(_enu_from_map(origin)).T
 

@@ -1,6 +1,6 @@
-"""A live world: vehicles and walkers under control, and the traffic of SUMO that reacts to them, step by step.
+"""A live world: vehicles and walkers under control, and SUMO's traffic that reacts to them, step by step.
 
-A world starts with a seed, obeys commands, and hands out immutable snapshots. The same seed, commands and steps give
+A world starts with a seed, executes commands, and returns immutable snapshots. The same seed, commands and steps give
 the same bytes; so a world is forked by repeating its history (`replay`).
 """
 
@@ -26,29 +26,29 @@ from flcav.world.snapshot import NOBODY, Actors, Collision, Snapshot, join_actor
 from flcav.world.trace import Trace
 from flcav.world.traffic.live import WARM_UP_S, SumoTraffic, TrafficLights, read_light_programs, stand_parked
 
-SUBSTEP_S, SUBSTEP_M = 0.05, 2.0  # longest step and way of the vehicle model: nobody passes through a box in it
-LONGEST_S = 10.0  # of a step
-NEAR_M = 2.0  # obstacles so far from a body are looked at
-RESERVED = ("veh", "ped", "parked")  # begin the names of other actors
-FARTHEST = 1e7  # greatest coordinate, and speed
+SUBSTEP_S, SUBSTEP_M = 0.05, 2.0  # longest time and distance of a substep, in which no body tunnels through a box
+LONGEST_S = 10.0  # longest step
+NEAR_M = 2.0  # margin around bodies within which obstacles are tested
+RESERVED = ("veh", "ped", "parked")  # prefixes of the names of other actors
+FARTHEST = 1e7  # greatest coordinate [m] and speed [m/s]
 NOTHING: Mapping[str, Controls] = MappingProxyType({})
 
 
 class Obstructed(InputError):
-    """Raised where an actor cannot appear, since its place is occupied."""
+    """An actor cannot be spawned because its place is occupied."""
 
 
 @dataclass(frozen=True)
 class Settings:
-    """Initial conditions and settings of a live world, besides its town."""
+    """Initial conditions and settings of a live world, in addition to its town."""
 
     seed: int = 0
-    traffic: int = 0  # vehicles of SUMO; without these and without pedestrians there is no SUMO
-    pedestrians: int = 0  # of SUMO
+    traffic: int = 0  # number of SUMO's vehicles; with neither vehicles nor pedestrians, SUMO is not started
+    pedestrians: int = 0  # number of SUMO's pedestrians
     parked: bool = True  # with the vehicles parked along the streets
-    dt_s: float = 0.05  # length of a step
-    leans: bool = False  # cars under control pitch and roll on their springs
-    remembers: bool = True  # keeps its history, which grows by every step and command
+    dt_s: float = 0.05  # length of a step [s]
+    leans: bool = False  # controlled cars pitch and roll on their springs
+    remembers: bool = True  # it keeps its history, which grows with every step and command
 
 
 DEFAULT = Settings()
@@ -58,11 +58,11 @@ DEFAULT = Settings()
 class LiveStep:
     """A step in the history of a live world."""
 
-    dt_s: float
+    dt_s: float  # [s]
 
 
 class LiveWorld:
-    """A town whose time goes on in steps; a context manager, since it may own a SUMO process.
+    """A simulated town that advances in steps; a context manager, since it may own a SUMO process.
 
     >>> from flcav import load_town
     >>> from flcav.world.commands import Controls, Spawn
@@ -74,9 +74,9 @@ class LiveWorld:
     """
 
     def __init__(self, town: Town, settings: Settings = DEFAULT) -> None:
-        """Start at time 0, with SUMO's traffic under way.
+        """Start at time 0, after a warm-up of SUMO's traffic.
 
-        Raises `InputError` for settings that do not fit the town, `RuntimeError` where SUMO fails.
+        Raises `InputError` for invalid settings, `RuntimeError` where SUMO fails.
         """
         _check_step(settings.dt_s)
         if min(settings.traffic, settings.pedestrians) < 0:
@@ -110,21 +110,22 @@ class LiveWorld:
         self.close()
 
     def close(self) -> None:
-        """End the traffic; a world with traffic cannot be stepped any more."""
+        """End SUMO; a world with traffic cannot be stepped any more."""
         if self._traffic is not None:
             self._traffic.close()
 
     @property
     def snapshot(self) -> Snapshot:
-        """The world now."""
+        """The present state of the world."""
         if self._snapshot is None:
             self._snapshot = self._build_snapshot()
         return self._snapshot
 
     def step(self, controls: Mapping[str, Controls] = NOTHING, *, dt_s: float | None = None) -> Snapshot:
-        """Return the world one step later, `dt_s` [s] or that of the settings; vehicles keep their last `controls`.
+        """Advance the world by one step of `dt_s` [s], by default that of the settings; return its new state.
 
-        Raises `InputError` for unknown vehicles and for a bad `dt_s`, `RuntimeError` where SUMO fails.
+        Vehicles without new `controls` keep their last ones. Raises `InputError` for unknown vehicles and an invalid
+        `dt_s`, `RuntimeError` where SUMO fails.
         """
         dt_s = self.settings.dt_s if dt_s is None else dt_s
         _check_step(dt_s)
@@ -132,23 +133,24 @@ class LiveWorld:
             if self.bodies.find(name).controls != wanted:
                 self.apply(commands.Drive(name, wanted))
         self._note(LiveStep(dt_s))
-        begins, velocity = self._time_s, self.bodies.velocity.copy()
-        found: dict[tuple[str, str], Collision] = {}
+        begins = self._time_s
+        velocity = self.bodies.velocity.copy()
+        collisions: dict[tuple[str, str], Collision] = {}
         fastest = float(np.abs(velocity).max(initial=0.0))
         parts = math.ceil(max(dt_s / SUBSTEP_S, dt_s * fastest / SUBSTEP_M) - 1e-9)
         for part in range(1, parts + 1):
             self._time_s = round(begins + dt_s * part / parts, 9)
             self.lights.advance(dt_s / parts)
             self._advance_traffic()
-            self._move(dt_s / parts, found)
+            self._move(dt_s / parts, collisions)
         self.bodies.acceleration = (self.bodies.velocity - velocity) / dt_s
         self._number += 1
-        self._collisions = tuple(found.values())
+        self._collisions = tuple(collisions.values())
         self._snapshot = None
         return self.snapshot
 
     def apply(self, command: Command) -> None:
-        """Carry out a command at once; raises `InputError` where it cannot be, and then changes nothing."""
+        """Execute a command. Raises `InputError` where that is not possible, without changing anything."""
         bodies = self.bodies
         match command:
             case commands.Spawn():
@@ -192,7 +194,10 @@ class LiveWorld:
         self._snapshot = None
 
     def find_obstruction(self, command: commands.Spawn) -> str | None:
-        """Return the name of what stands where an actor would appear, as in `Collision`; None where there is room."""
+        """Return the name of an object in the place of an actor to be spawned, as in `Collision`.
+
+        None if it is free.
+        """
         probe = Bodies(self._ground)
         probe.add(
             ControlledBody(command.name, make_blueprint(command.category, command.shape, command.size)), *_pose(command)
@@ -203,7 +208,7 @@ class LiveWorld:
         return names[overlaps[0, 1]] if len(overlaps) else None
 
     def height(self, x: float, y: float, z: float | None = None) -> float:
-        """Return the height of the ground [m] at a place, or of the bridge there that is nearer to `z`."""
+        """Return the height of the ground [m] at x, y [m], world frame, or of a bridge that is nearer to `z` [m]."""
         return float(self._ground.heights(np.array([x]), np.array([y]), np.array([np.nan if z is None else z]))[0])
 
     def _note(self, entry: Command | LiveStep) -> None:
@@ -211,7 +216,8 @@ class LiveWorld:
             self.history.append(entry)
 
     def _spawn(self, command: commands.Spawn) -> None:
-        name, made = command.name, make_blueprint(command.category, command.shape, command.size)
+        name = command.name
+        made = make_blueprint(command.category, command.shape, command.size)
         if not name or name.startswith(RESERVED):
             raise InputError(f"name {shorten(name)}: must not be empty, nor begin with {', '.join(RESERVED)}")
         if any(body.name == name for body in self.bodies.members):
@@ -222,7 +228,7 @@ class LiveWorld:
         self.bodies.add(ControlledBody(name, made), *_pose(command))
 
     def _advance_traffic(self) -> None:
-        """Let SUMO go on to the present time, and look where its actors are now."""
+        """Advance SUMO to the present time, and interpolate its actors."""
         if self._traffic is None:
             return
         while self._traffic.ticks * STEP_S < self._time_s - 1e-6:
@@ -232,7 +238,7 @@ class LiveWorld:
         self._flow = self._traffic.at(self._time_s)
 
     def _move(self, dt_s: float, found: dict[tuple[str, str], Collision]) -> None:
-        """Move the bodies, and let those that touch something collide; add the collisions to those `found`."""
+        """Move the bodies by `dt_s` [s] and resolve their contacts; add the collisions to `found`."""
         bodies = self.bodies
         if not (count := len(bodies.members)):
             return
@@ -240,7 +246,7 @@ class LiveWorld:
         bodies.move(dt_s)
         now = bodies.actors()
         boxes, names = self._list_boxes(now, *corners(outline_actors(now)))
-        mass, inertia = (np.concatenate((own, np.full(len(names) - count, np.inf))) for own in bodies.weights())
+        mass, inertia = (np.concatenate((values, np.full(len(names) - count, np.inf))) for values in bodies.weights())
         flow = slice(count, count + len(self._flow.name))
         velocity, yaw_rate = np.zeros((len(names), 2)), np.zeros(len(names))
         velocity[:count], yaw_rate[:count] = now.velocity[:, :2], now.yaw_rate
@@ -254,15 +260,15 @@ class LiveWorld:
         self._report(contacts, names, found)
         self._hit.update(names[row] for row in contacts.second.tolist() if flow.start <= row < flow.stop)
 
-    def _list_boxes(self, own: Actors, low: Array, high: Array) -> tuple[Footprints, list[str]]:
-        """Return the boxes of the bodies, of SUMO's actors, and of obstacles about these corners; and their names."""
+    def _list_boxes(self, actors: Actors, low: Array, high: Array) -> tuple[Footprints, list[str]]:
+        """Return the boxes of the bodies, of SUMO's actors and of obstacles near rectangles, and their names."""
         near = self.obstacles.near(low - NEAR_M, high + NEAR_M)
         obstacles = Footprints(*(array[near] for array in self.obstacles.boxes))
-        boxes = join_footprints(outline_actors(own), outline_actors(self._flow), obstacles)
-        return boxes, [*own.name, *self._flow.name, *(self.obstacles.name[row] for row in near.tolist())]
+        boxes = join_footprints(outline_actors(actors), outline_actors(self._flow), obstacles)
+        return boxes, [*actors.name, *self._flow.name, *(self.obstacles.name[row] for row in near.tolist())]
 
     def _report(self, contacts: Contacts, names: Sequence[str], found: dict[tuple[str, str], Collision]) -> None:
-        """Add the contacts to those `found` during a step: impulses of the same two add up."""
+        """Add the contacts to the collisions `found` during a step: impulses of the same pair are summed."""
         impulses = contacts.impulse[:, None] * contacts.normal
         for row in range(len(impulses)):
             pair = names[int(contacts.first[row])], names[int(contacts.second[row])]
@@ -296,7 +302,7 @@ class LiveWorld:
 
 
 def replay(town: Town, settings: Settings, history: Sequence[Command | LiveStep]) -> LiveWorld:
-    """Return a world with this history: a fork of the one whose settings and history they are."""
+    """Return a fork of a world: a new one with its settings in which its history is repeated."""
     world = LiveWorld(town, settings)
     try:
         for entry in history:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 PAINT_REFLECTIVITY = np.array([0.08, 0.14, 0.22, 0.30, 0.45, 0.60, 0.70], np.float32)  # (P,) car paints, black to white
-# Albedos, linear red, green, blue, that go with each of PAINT_REFLECTIVITY: dark at 905 nm is roughly dark to the eye.
+# Albedos, linear red, green, blue, by entry of PAINT_REFLECTIVITY: dark at 905 nm is roughly dark in visible light.
 PAINT_COLOURS: tuple[tuple[tuple[float, float, float], ...], ...] = (
     ((0.010, 0.010, 0.012), (0.012, 0.014, 0.022), (0.020, 0.012, 0.012)),
     ((0.045, 0.047, 0.052), (0.012, 0.030, 0.110), (0.015, 0.055, 0.040)),

@@ -1,4 +1,4 @@
-"""Scenes: the static mesh of a town and the meshes of its actors at one instant of a trace, for ray casting."""
+"""Scenes for ray casting: the static mesh of a town and the meshes of its actors at one instant of a trace."""
 
 import zlib
 from collections.abc import Mapping
@@ -27,9 +27,9 @@ class Surfaces(NamedTuple):
     """
 
     normal: Array32  # (S, 3) unit normals, of either sign, body frame
-    material: Bytes  # (S,) a Material
-    first: Ints  # (I,) first row of each instance's mesh
-    reflectivity: Array32  # (I, M) at 905 nm, by material: actors differ in their paint
+    material: Bytes  # (S,) a `Material`
+    first: Ints  # (I,) first row of the instance's mesh
+    reflectivity: Array32  # (I, M) diffuse reflectance at 905 nm, by material: actors differ in their paint
     retro: Mask = RETRO  # (M,) retroreflectors
 
 
@@ -39,7 +39,7 @@ class Scene:
     def __init__(self, town: Town, trace: Trace) -> None:
         """Start at the first instant of `trace`. Meshes are cached for all scenes of the process.
 
-        Raises `OSError` where the ray casting engine is missing.
+        Raises `OSError` where the ray casting library is missing.
         """
         self.town = town
         self.paints: Mapping[str, tuple[float, float, float]] = {}  # linear RGB by actor; others are painted by name
@@ -48,9 +48,9 @@ class Scene:
         self._cast(trace)
 
     def follow(self, trace: Trace) -> None:
-        """Go to the first instant of another trace in the same town, in which actors may have come and gone.
+        """Move to the first instant of another trace in the same town, which may have other actors.
 
-        If they are the same, nothing but their places changes: so a scene can follow the snapshots of a live world.
+        If the actors are the same, only their poses are changed: so a scene can follow the snapshots of a live world.
         """
         same = all(
             np.array_equal(getattr(trace, name), getattr(self.trace, name))
@@ -63,7 +63,7 @@ class Scene:
         self._place()
 
     def _cast(self, trace: Trace) -> None:
-        """Make an instance of each actor of a trace, and go to its first instant."""
+        """Create the instances of a trace's actors, and move to its first instant."""
         self.trace, self.index, self.offset_s = trace, 0, 0.0
         models = [self._town_model, *(_actor_model(*trace.model(actor)) for actor in range(len(trace.actor)))]
         self.surfaces = _surfaces(models, [str(name) for name in trace.actor])
@@ -77,7 +77,7 @@ class Scene:
 
     @property
     def town_solid(self) -> Solid:
-        """The acceleration structure of the town, which all scenes of the town share."""
+        """The bounding volume hierarchy of the town, which all scenes of the town share."""
         return self._town_model.solid
 
     @cached_property
@@ -86,7 +86,7 @@ class Scene:
         return list_signs_and_signals(self.town)
 
     def move_to(self, index: int, offset_s: float = 0.0) -> None:
-        """Move every actor to its pose at instant `index` of the trace, or `offset_s` [s] later.
+        """Move all actors to their poses at instant `index` of the trace, or `offset_s` [s] later.
 
         Poses off an instant are extrapolated with constant acceleration and yaw rate. Raises `ValueError` where
         `offset_s` is not within -`OFFSET_S` and `OFFSET_S`.
@@ -98,24 +98,28 @@ class Scene:
             self._place()
 
     def poses(self) -> Array:
-        """Return x, y, z [m] and yaw [rad] of every actor at the scene's time (A, 4), world frame; NaN where absent."""
+        """Return x, y, z [m] and yaw [rad] of the actors at the scene's time (A, 4), world frame; NaN where absent."""
         trace, i, dt = self.trace, self.index, self.offset_s
-        position, yaw = trace.position[i], trace.yaw[i]
+        position = trace.position[i]
+        yaw = trace.yaw[i]
         if dt:
             position = position + dt * trace.velocity[i] + dt**2 / 2 * trace.acceleration[i]
             yaw = yaw + dt * trace.yaw_rate[i]
         return np.concatenate((position, yaw[:, None]), axis=1)
 
     def world_from_actor(self, actor: int) -> Array:
-        """Return the pose (4, 4) [m] of an actor that is present; the origin of its body frame is its ground centre."""
+        """Return the pose (4, 4) [m] of a present actor, world frame.
+
+        The origin of its body frame is its ground centre.
+        """
         return pose(*self.poses()[actor], *self.trace.tilts(self.index)[actor])
 
     def world_from_instance(self) -> Array:
-        """Return the rotations of the instances (I, 3, 3); the identity for the town and for absent actors."""
+        """Return the rotation matrices of the instances (I, 3, 3); the identity for the town and for absent actors."""
         return np.concatenate((np.eye(3)[None], self.rotations()))
 
     def rotations(self) -> Array:
-        """Return the rotations of the actors' body frames (A, 3, 3); the identity for absent ones."""
+        """Return the rotation matrices of the actors' body frames (A, 3, 3); the identity for absent actors."""
         yaw = np.nan_to_num(self.poses()[:, 3])
         if self.trace.tilt is None:
             return rotations_about_z(yaw)
@@ -131,17 +135,20 @@ class Scene:
         hidden: int | None = None,
         threads: int = 1,
     ) -> Hits:
-        """Return the first hit of each ray (N, 3), without the actor `hidden`: see `embree.Assembly.trace`."""
+        """Return the first hits of unit rays (N, 3), without the actor `hidden`: see `embree.Hierarchy.trace`.
+
+        `world_from_rays` (4, 4) [m] is the pose of the frame of the rays, which start at its origin.
+        """
         self._hide(hidden)
         return self._assembly.trace(world_from_rays, directions, near_m=near_m, far_m=far_m, threads=threads)
 
     def find_occluded(
         self, origins: Array32, directions: Array32, far_m: Array32, *, hidden: int | None = None, threads: int = 1
     ) -> Mask:
-        """Return (N,) whether anything but the actor `hidden` occludes each ray before its end `far_m` (N,) [m].
+        """Return (N,) whether rays are occluded before their ends `far_m` (N,) [m], ignoring the actor `hidden`.
 
-        `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the world frame. A ray whose
-        `far_m` is not positive is never occluded.
+        `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the world frame. A ray with a
+        `far_m` that is not positive is never occluded.
         """
         self._hide(hidden)
         return self._assembly.find_occluded(origins, directions, far_m, threads=threads)
@@ -156,10 +163,10 @@ class Scene:
         near_m: Array32 | None = None,
         far_m: float = np.inf,
     ) -> Hits:
-        """Return the first hits of K groups of rays, group k with the mesh of `actors[k]` alone.
+        """Return the first hits of K groups of rays, group k only with the mesh of `actors[k]`.
 
-        `instance` is the group's number. Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose
-        pose in the actor's body frame is `body_from_rays[k]` (4, 4).
+        `instance` is the group index. Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose
+        pose in the actor's body frame is `body_from_rays[k]` (4, 4) [m].
         """
         solids = [self._solids[actor + 1] for actor in actors.tolist()]
         return trace_each(solids, body_from_rays, ends, directions, near_m=near_m, far_m=far_m)
@@ -170,7 +177,7 @@ class Scene:
             self._place()
 
     def _place(self) -> None:
-        """Place the instances of actors that have moved since the last time, and remove absent and hidden ones."""
+        """Update the instances of actors that have moved since the last call, and remove absent and hidden ones."""
         poses = np.concatenate((self.poses(), self.trace.tilts(self.index)), axis=1)
         wanted = np.where(self.trace.present[self.index, :, None], poses, np.nan)
         if self._hidden is not None:
@@ -188,7 +195,7 @@ class Scene:
 
 
 class _Model(NamedTuple):
-    """A mesh with its normals and its acceleration structure."""
+    """A mesh with its normals and its bounding volume hierarchy."""
 
     mesh: Mesh
     normal: Array32
@@ -200,7 +207,7 @@ def _model(mesh: Mesh) -> _Model:
 
 
 def _surfaces(models: list[_Model], names: list[str]) -> Surfaces:
-    """Return the faces of all distinct models; an actor's paint is drawn by a hash of its name."""
+    """Return the faces of all distinct models; an actor's paint is chosen by a hash of its name."""
     distinct = {id(model): model for model in models}
     starts = np.cumsum([0, *(len(model.mesh.faces) for model in distinct.values())])
     first = dict(zip(distinct, starts))

@@ -1,15 +1,15 @@
-"""Shapes of actors by category: outer dimensions, which both the traffic simulation and the meshes use."""
+"""Shapes of actors by category: outer dimensions for the traffic simulation and for the meshes."""
 
 from typing import NamedTuple
 
 
 class Shape(NamedTuple):
-    """Name and outer dimensions of one shape [m]."""
+    """The shape of an actor: its name and outer dimensions."""
 
     name: str
-    length: float
-    width: float
-    height: float
+    length: float  # [m]
+    width: float  # [m]
+    height: float  # [m]
 
 
 SHAPES: dict[str, tuple[Shape, ...]] = {
@@ -49,7 +49,7 @@ SHAPES: dict[str, tuple[Shape, ...]] = {
     ),
 }
 ANGLED = "angled"  # parked at an angle
-RARE: dict[str, str] = {  # kinds of objects that no town has unless it is asked for them, with their category
+RARE: dict[str, str] = {  # kinds of objects that a town has only on request, with their category
     "trailer_car": "car",
     "overturned": "car",
     "ladder_van": "van",
@@ -57,4 +57,4 @@ RARE: dict[str, str] = {  # kinds of objects that no town has unless it is asked
     "cargo_bike": "bicycle",
     ANGLED: "car",
 }
-PARKED_ONLY = ("overturned", ANGLED)  # of these
+PARKED_ONLY = ("overturned", ANGLED)  # rare kinds that are only parked

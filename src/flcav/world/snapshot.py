@@ -1,4 +1,4 @@
-"""Snapshots of a live world: all actors, lights and collisions at one instant."""
+"""Snapshots of a live world: all actors, traffic lights and collisions at one instant."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -14,23 +14,23 @@ from flcav.world.trace import Trace
 
 @dataclass(frozen=True)
 class Collision:
-    """The contact of an actor under control with another actor, or with an obstacle of the town, during one step."""
+    """A collision of a controlled actor with another actor or an obstacle of the town, during one step."""
 
-    name: str  # the actor
-    other: str  # the other one, or an obstacle as "kind:row": building, tree, clutter, post, lamp, sign, pole, signal
-    impulse: tuple[float, float]  # x, y on the actor [N s]; on the other one its opposite
-    point: tuple[float, float]  # x, y of the contact [m]
+    name: str  # the controlled actor
+    other: str  # the other actor, or an obstacle "kind:row": building, tree, clutter, post, lamp, sign, pole, signal
+    impulse: tuple[float, float]  # x, y on the controlled actor [N s], world frame; the other one gets its opposite
+    point: tuple[float, float]  # x, y of the contact [m], world frame
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A live world at one instant; its arrays cannot be written."""
+    """The state of a live world at one instant; its arrays are read-only."""
 
     step: int  # number of steps since the start
-    time_s: float  # since the start
-    trace: Trace  # with one instant, of all actors: under control in the order they came, SUMO's, parked ones
-    controls: Mapping[str, Controls]  # of the vehicles under control
-    collisions: tuple[Collision, ...]  # of the step that led here
+    time_s: float  # time since the start [s]
+    trace: Trace  # one instant of all actors: controlled ones in the order of spawning, SUMO's, parked vehicles
+    controls: Mapping[str, Controls]  # of the controlled vehicles
+    collisions: tuple[Collision, ...]  # during the last step
 
     def __post_init__(self) -> None:
         for field in fields(self.trace):
@@ -38,21 +38,21 @@ class Snapshot:
                 array.flags.writeable = False
 
     def row(self, name: str) -> int:
-        """Return the row of an actor in the trace; raises `KeyError` where it is absent."""
-        found = np.flatnonzero(self.trace.actor == name)
-        if not len(found):
+        """Return the row of an actor in the trace. Raises `KeyError` where it is absent."""
+        rows = np.flatnonzero(self.trace.actor == name)
+        if not len(rows):
             raise KeyError(name)
-        return int(found[0])
+        return int(rows[0])
 
 
 def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
-    """Return the trace of all actors at the times of one snapshot or more, in ascending order.
+    """Join one snapshot or more, in ascending order of time, to a trace of all their actors.
 
-    Raises `ValueError` for none, and where an actor's category, shape or size is not the same in all.
+    Raises `ValueError` without snapshots, and where an actor's category, shape or size differs between snapshots.
     """
     if not snapshots:
         raise ValueError("a trace needs at least one snapshot")
-    names = list(dict.fromkeys(name for each in snapshots for name in each.trace.actor.tolist()))
+    names = list(dict.fromkeys(name for snapshot in snapshots for name in snapshot.trace.actor.tolist()))
     row = {name: i for i, name in enumerate(names)}
     count, actors = len(snapshots), len(names)
     known: dict[str, tuple[str, int, tuple[float, ...]]] = {}
@@ -60,8 +60,8 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
     axes = {"position": (3,), "velocity": (3,), "acceleration": (3,), "yaw": (), "yaw_rate": ()}
     motion = {name: np.full((count, actors, *shape), np.nan) for name, shape in axes.items()}
     tilt = np.full((count, actors, 2), np.nan)
-    for i, each in enumerate(snapshots):
-        trace = each.trace
+    for i, snapshot in enumerate(snapshots):
+        trace = snapshot.trace
         at = [row[name] for name in trace.actor.tolist()]
         for actor, name in enumerate(trace.actor.tolist()):
             if known.setdefault(name, trace.model(actor)) != trace.model(actor):
@@ -74,14 +74,14 @@ def join_snapshots(snapshots: Sequence[Snapshot]) -> Trace:
     last = snapshots[-1].trace
     return replace(
         last,
-        time_s=np.array([each.time_s for each in snapshots]),
+        time_s=np.array([snapshot.time_s for snapshot in snapshots]),
         actor=np.array(names, np.str_),
         category=np.array(category, np.str_),
         shape=np.array(shape, np.int64),
         size=np.array(size, np.float64).reshape(-1, 3),
         present=present,
-        light_state=np.concatenate([each.trace.light_state for each in snapshots]),
-        tilt=None if all(each.trace.tilt is None for each in snapshots) else tilt,
+        light_state=np.concatenate([snapshot.trace.light_state for snapshot in snapshots]),
+        tilt=None if all(snapshot.trace.tilt is None for snapshot in snapshots) else tilt,
         **motion,
     )
 
@@ -91,7 +91,7 @@ class Actors(NamedTuple):
 
     name: tuple[str, ...]  # (N,)
     category: tuple[str, ...]  # (N,)
-    shape: Ints  # (N,)
+    shape: Ints  # (N,) row of SHAPES[category]
     size: Array  # (N, 3) length, width, height [m]
     position: Array  # (N, 3) ground centre [m]
     yaw: Array  # (N,) [rad]
@@ -102,7 +102,7 @@ class Actors(NamedTuple):
 
     @property
     def places(self) -> Array:
-        """Return x, y [m] and yaw [rad] of each (N, 3)."""
+        """The actors' x, y [m] and yaw [rad] (N, 3)."""
         return np.column_stack((self.position[:, :2], self.yaw))
 
 
@@ -111,13 +111,13 @@ NOBODY = Actors((), (), np.zeros(0, np.int64), _THREES, _THREES, _ONES, _THREES,
 
 
 def pick_actors(actors: Actors, mask: Mask) -> Actors:
-    """Return the actors for which `mask` (N,) is true."""
+    """Select the actors for which `mask` (N,) is true."""
     names, categories = (tuple(compress(words, mask)) for words in actors[:2])
     return Actors(names, categories, actors.shape[mask], *(column[mask] for column in actors[3:]))
 
 
 def join_actors(*parts: Actors) -> Actors:
-    """Return the actors of all parts, in order."""
+    """Concatenate actors, in order."""
     return Actors(
         tuple(name for part in parts for name in part.name),
         tuple(category for part in parts for category in part.category),

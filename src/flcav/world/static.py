@@ -1,4 +1,4 @@
-"""The static mesh of a town, its buildings included, with the object that each face belongs to."""
+"""The static mesh of a town, including its buildings, with the object that every face belongs to."""
 
 import pickle
 from collections.abc import Callable, Iterator
@@ -36,11 +36,11 @@ from flcav.world.meshes.furniture import (
 from flcav.world.meshes.mesh import Mesh, box, drape_area, drape_polygon, drape_wall, join_meshes, sheet, transform_mesh
 
 GROUND_M = -0.03  # height of open ground, a little below the road
-UNDER_M, ROUGH_M = 1.5, 1.0  # by which sloping ground reaches below roads and sidewalks, and how roughly it is cut
+UNDER_M, ROUGH_M = 1.5, 1.0  # overlap of sloping ground below roads and sidewalks, and tolerance of its outline
 DECK_M = (0.2, 1.0)  # least and greatest thickness of a bridge's deck
-ROOM_M = 4.0  # a deck is thinner where less than this would be left below it
+ROOM_M = 4.0  # clearance below a deck for which it is made thinner
 LAND_M = 150.0  # width of open ground beyond the town's bounds
-TOWNS_KEPT = 4  # size of the cache of meshes
+TOWNS_KEPT = 4  # number of cached meshes
 _FIELDS = ("vertices", "faces", "material", "part", "row")  # of a static world in a file, and their forms
 _FORMS = [("float32", (3,)), ("int32", (3,)), ("uint8", ()), ("uint8", ()), ("int32", ())]
 
@@ -62,26 +62,26 @@ class TownPart(IntEnum):
     MAST = 8  # of a roadside sensor
     SIGN = 9
     SIGNAL = 10
-    POLE = 11  # of the map that the town was imported from
+    POLE = 11  # of an imported map
     DECK = 12  # of a bridge
 
 
 class StaticWorld(NamedTuple):
-    """The static mesh of a town, and the object of each of its F faces."""
+    """The static mesh of a town, and the objects that its F faces belong to."""
 
     mesh: Mesh  # world frame
-    part: Bytes  # (F,) a Part
-    row: Ints32  # (F,) the object's row in its field of `Town`; clutter is numbered through all kinds
+    part: Bytes  # (F,) a `TownPart`
+    row: Ints32  # (F,) the object's row in its field of `Town`; clutter is numbered over all kinds
 
 
 class SignsAndSignals(NamedTuple):
     """The K traffic signs and signal heads of a town: first the signs, then the heads, in the town's order."""
 
     kind: tuple[str, ...]  # (K,) stop | yield | speed_30 | speed_60 | speed_90 | signal | walker_signal
-    position: Array  # (K, 3) centre of the plate or head, world [m]
-    yaw: Array  # (K,) direction it faces, world [rad]
+    position: Array  # (K, 3) centre of the plate or head, world frame [m]
+    yaw: Array  # (K,) direction it faces, world frame [rad]
     link: tuple[str, ...]  # (K,) the entry of `Trace.light` that a head shows; empty for signs
-    face: Ints32  # (F,) row here of the sign or head that each face of the town's mesh belongs to; -1: none
+    face: Ints32  # (F,) row of the sign or head that a face of the town's mesh belongs to; -1: none
 
     def __len__(self) -> int:
         return len(self.kind)
@@ -93,12 +93,12 @@ def build_town_mesh(town: Town) -> Mesh:
 
 
 def build_buildings_mesh(town: Town) -> Mesh:
-    """Return the mesh of a town's buildings alone, world frame; raises `ValueError` where it has none."""
+    """Return the mesh of a town's buildings, world frame. Raises `ValueError` where there are none."""
     return join_meshes([mesh for _, _, mesh in _buildings(town)])
 
 
 def list_signs_and_signals(town: Town) -> SignsAndSignals:
-    """Return the signs and signal heads of a town, with their faces in `build_town_mesh`; without posts and masts."""
+    """Return the signs and signal heads of a town, without posts and masts, and their faces in `build_town_mesh`."""
     world, signs, signals = build_static_world(town), town.signs, town.signals
     face = np.full(len(world.part), -1, np.int32)
     for part, first in ((TownPart.SIGN, 0), (TownPart.SIGNAL, len(signs.kind))):
@@ -113,18 +113,18 @@ def list_signs_and_signals(town: Town) -> SignsAndSignals:
 
 
 def _head_kinds(signals: Signals) -> list[str]:
-    """Return the kind of each signal head in `SignsAndSignals`."""
+    """Return the kinds of the signal heads, as in `SignsAndSignals`."""
     return ["signal"] * (len(signals.link) - signals.walkers) + ["walker_signal"] * signals.walkers
 
 
 class TownCache(Generic[Made]):
-    """What was made of the last `TOWNS_KEPT` towns, by a hash of their content."""
+    """A cache of values made from the last `TOWNS_KEPT` towns, by a hash of their content."""
 
     def __init__(self) -> None:
         self._kept: dict[str, Made] = {}
 
     def get(self, town: Town, make: Callable[[], Made]) -> Made:
-        """Return what was made of an equal town, or else what `make` makes now."""
+        """Return the cached value of an equal town, or else make and cache it."""
         key = sha256(pickle.dumps(town)).hexdigest()
         if key not in self._kept:
             while len(self._kept) >= TOWNS_KEPT:
@@ -137,7 +137,7 @@ _WORLDS = TownCache[StaticWorld]()
 
 
 def build_static_world(town: Town) -> StaticWorld:
-    """Return the static mesh of a town with the object of each face; the last `TOWNS_KEPT` are cached."""
+    """Return the static mesh of a town with the objects of its faces; the last `TOWNS_KEPT` are cached."""
     return _WORLDS.get(town, lambda: _build_world(town))
 
 
@@ -152,7 +152,7 @@ def _build_world(town: Town) -> StaticWorld:
 
 
 def save_static_world(town: Town, path: Path) -> None:
-    """Write the static world of a town as NumPy's archive `path`, whole or not at all."""
+    """Write the static world of a town as the NumPy archive `path`, atomically."""
     world = build_static_world(town)
     with atomic_path(path) as scratch, scratch.open("wb") as file:
         fields = {"vertices": world.mesh.vertices, "faces": world.mesh.faces, "material": world.mesh.material}
@@ -160,9 +160,9 @@ def save_static_world(town: Town, path: Path) -> None:
 
 
 def recall_static_world(town: Town, path: Path) -> None:
-    """Read what `save_static_world` wrote of the same town: `build_static_world` need not build it any more.
+    """Read what `save_static_world` wrote of the same town into the cache of `build_static_world`.
 
-    Raises `OSError` or `ValueError`, and recalls nothing, where there is no such file or it is damaged.
+    Raises `OSError` or `ValueError`, and leaves the cache as it is, where the file is missing or damaged.
     """
     try:
         with np.load(path, allow_pickle=False) as file:
@@ -182,7 +182,7 @@ def recall_static_world(town: Town, path: Path) -> None:
     _WORLDS.get(town, lambda: StaticWorld(Mesh(vertices, faces, material), part, row))
 
 
-Owned = tuple[TownPart, int, Mesh]  # kind of object, its row, its mesh in the world frame
+Owned = tuple[TownPart, int, Mesh]  # kind of object, row, mesh in the world frame
 
 
 def _parts(town: Town) -> Iterator[Owned]:
@@ -193,7 +193,7 @@ def _parts(town: Town) -> Iterator[Owned]:
 
 
 def _ground(town: Town) -> Mesh:
-    """Return the land around the roads; on a relief cut out below them, where rays would search it in vain."""
+    """Return the land around the roads; on a relief it is cut out below them, where rays would test it in vain."""
     if town.relief is not None:
         paved = shapely.union_all([shapely.Polygon(ring) for ring in (*town.roads, *town.sidewalks)])
         hidden = shapely.simplify(shapely.buffer(paved, -UNDER_M), ROUGH_M)
@@ -212,7 +212,7 @@ def _roads(town: Town) -> Iterator[Owned]:
 
 
 def _decks(town: Town) -> Iterator[Owned]:
-    """Yield the decks of bridges, each as its road, its underside and its two sides."""
+    """Yield the decks of bridges: road, underside and two sides of each."""
     for row, deck in enumerate(() if town.relief is None else town.relief.decks):
         yield TownPart.DECK, row, drape_area(deck.outline, deck.surface, 0.0, Material.ROAD)
         under = drape_area(deck.outline, deck.surface, 0.0, Material.WALL)
@@ -222,13 +222,13 @@ def _decks(town: Town) -> Iterator[Owned]:
 
 
 def _lower(top: NDArray, town: Town) -> NDArray:
-    """Return the points (N, 3) of a deck's underside below those of its surface."""
+    """Return the points (N, 3) [m] of a deck's underside below those of its surface, world frame."""
     thickness = np.clip(top[:, 2] - town.grounds(*top[:, :2].T) - ROOM_M, *DECK_M)
     return np.column_stack((top[:, :2], top[:, 2] - thickness)).astype(top.dtype)
 
 
 def _sidewalks(town: Town) -> Iterator[Owned]:
-    """Yield the sidewalks, each as its surface and its kerb face."""
+    """Yield the sidewalks: surface and kerb face of each."""
     for row, polygon in enumerate(town.sidewalks):
         yield TownPart.SIDEWALK, row, _plate(polygon, KERB_M, Material.SIDEWALK, town.relief)
         ring = np.concatenate((polygon, polygon[:1]))
@@ -241,7 +241,7 @@ def _sidewalks(town: Town) -> Iterator[Owned]:
 
 
 def _plate(polygon: Array, z: float, material: Material, relief: Relief | None) -> Mesh:
-    """Return a polygon (K, 2) as a surface `z` [m] above the ground, by constrained Delaunay triangulation."""
+    """Return a polygon (K, 2) [m] as a surface `z` [m] above the ground, by constrained Delaunay triangulation."""
     if relief is not None:
         return drape_polygon(polygon, relief, z, material)
     triangles = shapely.constrained_delaunay_triangles(shapely.Polygon(polygon))
@@ -259,7 +259,7 @@ def _buildings(town: Town) -> Iterator[Owned]:
 
 
 def find_lowest_ground(town: Town, rows: Array) -> Array:
-    """Return the lowest ground (N,) [m] under the corners of footprints (N, >=5) x, y, yaw, length, width [m, rad]."""
+    """Return the lowest ground (N,) [m] under footprints (N, >=5): x, y [m], yaw [rad], length, width [m]."""
     x, y, yaw, length, width = rows[:, :5].T
     cos, sin = np.cos(yaw), np.sin(yaw)
     corners = [(a * length / 2, b * width / 2) for a in (-1, 1) for b in (-1, 1)]
@@ -313,7 +313,7 @@ GABLED_BELOW_M = 9.0  # buildings lower than this have a gabled roof
 
 
 def make_building(length: float, width: float, height: float, rng: np.random.Generator) -> Mesh:
-    """Return a building of these dimensions [m] about its ground centre, `length` along x; `rng` draws its facades."""
+    """Return the mesh of a building of these dimensions [m], body frame, `length` along x; `rng` draws its facades."""
     walls = height * 0.68 if height < GABLED_BELOW_M else height - 0.5
     parts = [box((0, 0, walls / 2), (length, width, walls), Material.WALL)]
     parts.append(_gable(length, width, walls, height) if height < GABLED_BELOW_M else _parapet(length, width, walls))
@@ -326,7 +326,7 @@ def make_building(length: float, width: float, height: float, rng: np.random.Gen
 
 
 def _facade(along: float, depth: float, walls: float, rng: np.random.Generator) -> Mesh | None:
-    """Return the balconies, sills and porches of the side at y = `depth` / 2, or None where it has no bay."""
+    """Return the balconies, sills and porches of the side at y = `depth` / 2 [m], or None if it has no bay."""
     bays = int(along // BAY_M)
     storeys = int(walls // STOREY_M)
     parts = []

@@ -1,4 +1,4 @@
-"""Traffic traces: the motion of all actors, the signals and the scripted events of one traffic run."""
+"""Traffic traces: the motion of all actors, the signal states and the scripted events of one traffic run."""
 
 import json
 from dataclasses import dataclass
@@ -27,18 +27,18 @@ TILT = ("pitch", "roll")  # further columns, of traces on a relief
 
 
 class Event(NamedTuple):
-    """A scripted corner case that took place."""
+    """A scripted corner case that has happened."""
 
     kind: str  # as `Scenario.kind`
-    begins_s: float  # start of the action, on the clock of `Trace.time_s`
-    actors: tuple[str, ...]  # track ids of those who take part; one of them may be absent at all instants of the trace
+    begins_s: float  # start of the action, as in `Trace.time_s` [s]
+    actors: tuple[str, ...]  # track ids of the participants; one of them may be absent from the whole trace
 
 
 @dataclass(frozen=True)
 class Trace:
     """A traffic run: the motion of A actors at T instants, in the world frame.
 
-    An actor's position is that of its ground centre, the middle of the underside of its box.
+    An actor's position is that of its ground centre, the centre of the underside of its box.
 
     >>> from flcav import Dataset, Trace
     >>> trace: Trace = Dataset.open("data").trace("grid-0-000")
@@ -47,10 +47,10 @@ class Trace:
     """
 
     town: str  # name of the town
-    time_s: Array  # (T,) ascending, from the start of the traffic
+    time_s: Array  # (T,) ascending, from the start of the traffic [s]
     actor: Words  # (A,) track ids, e.g. "cav0", "veh17", "parked3", "ped8"
-    category: Words  # (A,) one of CATEGORIES; "prop" of what a client has put into a live world
-    shape: Ints  # (A,) row of SHAPES[category], of props of PROPS
+    category: Words  # (A,) one of CATEGORIES; "prop" for props that a client has spawned in a live world
+    shape: Ints  # (A,) row of SHAPES[category], for props of PROPS
     size: Array  # (A, 3) length, width, height [m]
     present: Mask  # (T, A) whether the actor is in the town
     position: Array  # (T, A, 3) ground centre [m]; NaN where absent
@@ -62,15 +62,15 @@ class Trace:
     light_state: Words  # (T, L) one SUMO state letter: G g y r ...
     events: tuple[Event, ...] = ()
     tilt: Array | None = None  # (T, A, 2) pitch and roll [rad], as in `geometry.pose`; NaN if absent; None: all level
-    bow: Array | None = None  # (A,) of the ends of its body [m], see `meshes.mesh.bow_ends`; None: all are flat
+    bow: Array | None = None  # (A,) bow of the ends of its body [m], see `meshes.mesh.bow_ends`; None: all are flat
 
     def model(self, actor: int) -> tuple[str, int, tuple[float, ...]]:
-        """Return category, shape, and size with any bow [m] of an actor, by which its mesh is known."""
+        """Return the arguments of `actor_mesh` for an actor: category, shape, and size with the bow, if any [m]."""
         bow = () if self.bow is None else (float(self.bow[actor]),)
         return str(self.category[actor]), int(self.shape[actor]), (*self.size[actor].tolist(), *bow)
 
     def tilts(self, index: int) -> Array:
-        """Return pitch and roll (A, 2) [rad] at an instant."""
+        """Return the actors' pitch and roll (A, 2) [rad] at an instant."""
         return np.zeros((len(self.actor), 2)) if self.tilt is None else self.tilt[index]
 
     def box_centres(self, index: int) -> Array:
@@ -81,7 +81,7 @@ class Trace:
         return self.position[index] + middle
 
     def save(self, path: Path | str) -> None:
-        """Write the trace as one Parquet file: a row per instant and present actor, the rest in the file's metadata."""
+        """Write the trace as a Parquet file: a row per instant and present actor, the rest in the file's metadata."""
         instant, actor = np.nonzero(self.present)
         motion = (self.position, self.yaw[..., None], self.velocity, self.acceleration, self.yaw_rate[..., None])
         state = np.concatenate(motion, axis=2)[instant, actor]
@@ -110,7 +110,7 @@ class Trace:
 
     @classmethod
     def load(cls, path: Path | str) -> "Trace":
-        """Return the trace that `save` wrote; raises `InputError` where `path` is missing or no trace."""
+        """Load the trace that `save` wrote. Raises `InputError` where `path` is missing or not a trace."""
         table = read_parquet(Path(path))
         metadata = table.schema.metadata or {}
         if METADATA not in metadata:
@@ -124,7 +124,10 @@ class Trace:
 
     @classmethod
     def _decode(cls, rest: dict[str, Any], table: pa.Table) -> "Trace":
-        """Return the trace of a file's metadata and rows; raises `ValueError` and others where they do not fit."""
+        """Decode a trace from a file's metadata and rows.
+
+        Raises `ValueError` and others where they are inconsistent.
+        """
         instants, actors, lights = len(rest["time_s"]), len(rest["actor"]), len(rest["light"])
         at = (table["instant"].to_numpy(), table["actor"].to_numpy())
         if min(column.min(initial=0) for column in at) < 0:
@@ -163,8 +166,8 @@ class Trace:
         return trace
 
     def _check(self) -> None:
-        """Raise `ValueError` where the fields are not consistent, a number is not finite or time does not ascend."""
-        if {len(each) for each in (self.actor, self.category, self.shape, self.size)} != {
+        """Raise `ValueError` where fields are inconsistent, a number is not finite, or times do not ascend."""
+        if {len(names) for names in (self.actor, self.category, self.shape, self.size)} != {
             len(set(self.actor.tolist()))
         }:
             raise ValueError("its actors are not told one by one")
@@ -174,7 +177,7 @@ class Trace:
         motion = (self.position, self.velocity, self.acceleration, self.yaw[..., None], self.yaw_rate[..., None])
         tilts = np.zeros(0) if self.tilt is None else self.tilt[self.present]
         numbers = (np.concatenate(motion, axis=2)[self.present], self.time_s, self.size, tilts)
-        if not all(np.isfinite(each).all() for each in numbers):
+        if not all(np.isfinite(values).all() for values in numbers):
             raise ValueError("a number is not finite")
         if self.bow is not None and not (
             self.bow.shape == self.actor.shape and ((self.bow >= 0) & (self.bow < 1)).all()
@@ -185,7 +188,7 @@ class Trace:
 
 
 def empty_trace(town: str) -> Trace:
-    """Return the trace of one instant of a town, by its name, without actors."""
+    """Return a trace of one instant without actors, in the town of this name."""
     none, instant = np.zeros((1, 0)), np.zeros((1, 0, 3))
     words = np.array([], np.str_)
     return Trace(

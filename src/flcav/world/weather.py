@@ -1,6 +1,6 @@
 """Weather parameters, presets, the classes of the weather task, and schedules of the weather over a scene.
 
-A preset is a point of the parameter space, a class a region of it (a box).
+A preset is a point of the parameter space, a class an axis-aligned box in it.
 """
 
 from collections.abc import Mapping
@@ -85,18 +85,18 @@ def classify_weather(weather: Weather) -> str | None:
 def find_nearest_class(weather: Weather) -> str:
     """Return the class whose region is nearest to `weather`; inside a region, its class.
 
-    The distance is Euclidean over the gaps between each parameter of `SEPARATION` and the region, in units of the
-    least gap between two classes; rain and visibility are on logarithmic scales. Wetness is left out, since roads stay
-    wet after rain.
+    The distance is Euclidean over the gaps between the parameters in `SEPARATION` and the region, in units of the least
+    gap between two classes; rain and visibility are on logarithmic scales. Wetness is left out, since roads stay wet
+    after rain.
     """
     return min(WEATHER_CLASSES, key=lambda name: _distance(weather, WEATHER_CLASSES[name]))
 
 
 def draw_weather(name: str, rng: np.random.Generator) -> Weather:
-    """Return a weather drawn from the region of the class `name`, or from the whole space for "any".
+    """Draw a weather from the region of the class `name`, or from the whole space for "any".
 
-    Rain and visibility are log-uniform, everything else is uniform; the sun's azimuth is uniform over the full circle.
-    Raises `KeyError` for an unknown class.
+    Rain and visibility are log-uniform, all other parameters uniform, the sun's azimuth over the full circle. Raises
+    `KeyError` for an unknown class.
     """
     region = _anywhere(rng) if name == ANY else WEATHER_CLASSES[name]
     drawn = {parameter: _draw(parameter, *limits, rng) for parameter, limits in region.items()}
@@ -104,9 +104,9 @@ def draw_weather(name: str, rng: np.random.Generator) -> Weather:
 
 
 def interpolate(one: Weather, other: Weather, share: float) -> Weather:
-    """Return the weather at the share `share` (0 to 1) of the way from `one` to `other`.
+    """Interpolate between two weathers, at `share` (0 to 1) of the way from `one` to `other`.
 
-    Parameters are interpolated linearly, the visibility by its reciprocal (linear in the extinction coefficient of
+    Parameters are interpolated linearly, the visibility by its reciprocal (linearly in the extinction coefficient of
     fog), the sun's azimuth along the shorter arc.
     """
     parts = {name: (getattr(one, name), getattr(other, name)) for name in Weather.model_fields}
@@ -119,14 +119,17 @@ def interpolate(one: Weather, other: Weather, share: float) -> Weather:
 
 
 def _expand_preset(value: Any) -> Any:
-    """Return the fields of a weather given by its preset's name or by `preset` and fields; other values as they are."""
+    """Expand a weather given by a preset's name, or by `preset` and fields, to its fields.
+
+    Return others as they are.
+    """
     if isinstance(value, dict) and "preset" in value:
         return _preset(value["preset"]) | {field: given for field, given in value.items() if field != "preset"}
     return _preset(value) if isinstance(value, str) else value
 
 
 def _preset(name: Any) -> dict[str, Any]:
-    """Return the fields of a preset; raises `ValueError` for an unknown one."""
+    """Return the fields of a preset. Raises `ValueError` for an unknown one."""
     if not isinstance(name, str) or name not in WEATHERS:
         raise ValueError(f"unknown weather; known weathers: {', '.join(WEATHERS)}{suggest(str(name), WEATHERS)}")
     return WEATHERS[name].model_dump()
@@ -158,7 +161,7 @@ class WeatherSchedule(Config):
     @classmethod
     def _from_short_forms(cls, value: Any) -> Any:
         if isinstance(value, list | tuple):
-            if names := [each for each in value if isinstance(each, str)]:
+            if names := [entry for entry in value if isinstance(entry, str)]:
                 raise ValueError(
                     f"a list is of keyframes, such as {{at_s: 0, weather: {names[0]}}}; for scenes that each draw one "
                     f"of several weathers write {{classes: [{', '.join(names)}]}}"
@@ -189,7 +192,7 @@ class WeatherSchedule(Config):
         return self
 
     def draw(self, rng: np.random.Generator) -> "WeatherSchedule":
-        """Return the schedule of one scene, of keyframes alone: those given, or weathers drawn from its classes."""
+        """Return the schedule of one scene as keyframes: those given, or weathers drawn from its classes."""
         if not self.classes:
             return self
         if self.turn_s is None:
@@ -202,10 +205,10 @@ class WeatherSchedule(Config):
         return WeatherSchedule(keyframes=tuple(turns))
 
     def at(self, time_s: float) -> Weather:
-        """Return the weather `time_s` after the scene's first spin, interpolated between keyframes.
+        """Return the weather at `time_s` [s] after the scene's first spin, interpolated between keyframes.
 
-        Before the first and after the last keyframe it is constant. Raises `ValueError` for a schedule of classes that
-        has not been drawn.
+        Before the first and after the last keyframe it is constant. Raises `ValueError` for a schedule of classes from
+        which none was drawn.
         """
         if not self.keyframes:
             raise ValueError("no weather was drawn from the classes: see WeatherSchedule.draw")
@@ -217,7 +220,7 @@ class WeatherSchedule(Config):
 
 
 def _draw(parameter: str, low: float, high: float, rng: np.random.Generator) -> float:
-    """Return a value between the limits: log-uniform for rain and visibility, else uniform."""
+    """Draw a value between the limits: log-uniformly for rain and visibility, else uniformly."""
     if parameter in ("rain_mm_h", "visibility_m") and low > 0:
         return float(np.clip(np.exp(rng.uniform(np.log(low), np.log(high))), low, high))
     return float(rng.uniform(low, high))
@@ -234,14 +237,14 @@ def _distance(weather: Weather, region: Region) -> float:
 
 
 def _scaled(parameter: str, value: float) -> float:
-    """Return a parameter on the scale of `SEPARATION`: decades of rain and visibility, others as they are."""
+    """Convert a parameter to the scale of `SEPARATION`: decades for rain and visibility, others unchanged."""
     if not np.isfinite(value) or parameter not in ("rain_mm_h", "visibility_m"):
         return value
     return float(np.log10(value + DRIZZLE_MM_H if parameter == "rain_mm_h" else value))
 
 
 def _anywhere(rng: np.random.Generator) -> Region:
-    """Return drawn limits of plausible weathers: 40 % with rain (from clouds, on wet roads), 25 % with fog."""
+    """Draw limits of plausible weathers: 40 % with rain (from clouds, on wet roads), 25 % with fog."""
     rains, foggy, dries = rng.random(3) < (0.4, 0.25, 0.7)
     return {
         "sun_elevation_deg": (-60.0, 75.0),

@@ -1,1 +1,1 @@
-"""CARLA as a source of frames, by its own client and documented calls alone (`carla` 0.9.16, extra `carla`)."""
+"""CARLA as a source of frames, by documented calls of its Python client (`carla` 0.9.16, extra `carla`)."""

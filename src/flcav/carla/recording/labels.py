@@ -1,8 +1,8 @@
 """Annotations from CARLA's actors: boxes and motion from its snapshots, occlusion from its semantic sensors.
 
-Occlusion is a share of rays: of those that meet an actor's box, the share that ends before it. Rays that pass the box
-beside the body within it are not counted as hidden, so that an actor in the open has 0. CARLA's boxes are somewhat
-larger than its bodies, and so are rectangles in images, which are those of the boxes.
+Occlusion is the share of the rays that meet an actor's box and end before it. Rays that pass through the box without
+hitting the body do not count as occluded, so that an unobstructed actor has 0. CARLA's boxes are somewhat larger than
+its bodies, and so are the rectangles in images, which are those of the boxes.
 """
 
 from collections.abc import Mapping
@@ -20,28 +20,28 @@ from flcav.sensors.lens import Lens, compute_pixel_rays
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sensors.views import clip_boxes, find_actor_regions, outline_boxes
 
-SLACK_M = 0.1  # by which a surface may stand out of its box
-SAME_M, SIGMAS = 0.02, 4.0  # two LiDARs' points by one ray are as near, and within so many deviations of the noise
+SLACK_M = 0.1  # by which a surface may protrude from its box
+SAME_M, SIGMAS = 0.02, 4.0  # largest distance of two LiDARs' points of the same ray, plus standard deviations of noise
 VEHICLES = tuple(SEMANTICS[name] for name in ("rider", "car", "truck", "bus", "motorcycle", "bicycle"))
 PEOPLE = (SEMANTICS["pedestrian"],)
 
 
 class LidarSweep(NamedTuple):
-    """The sweep of a LiDAR, and what the semantic one beside it met."""
+    """The sweep of a LiDAR, and that of the semantic LiDAR with the same pose."""
 
     lidar: Lidar
-    world_from_sensor: Array  # (4, 4)
-    points: NDArray[np.float32]  # (N, 4) sensor frame
-    met: SemanticSweep
+    world_from_sensor: Array  # (4, 4) [m]
+    points: NDArray[np.float32]  # (N, 4) x, y, z [m], intensity, sensor frame
+    met: SemanticSweep  # returns of the semantic LiDAR
 
 
 class CameraSight(NamedTuple):
-    """Depth and semantic class of a camera's pixels, with its pose."""
+    """The depth and semantic images of a camera, with its pose."""
 
     lens: Lens
-    world_from_camera: Array  # (4, 4), optical frame
-    depth_m: NDArray[np.float32]  # (H, W)
-    semantic: NDArray[np.uint8]  # (H, W)
+    world_from_camera: Array  # (4, 4) of the optical frame [m]
+    depth_m: NDArray[np.float32]  # (H, W) along the optical axis [m]
+    semantic: NDArray[np.uint8]  # (H, W) class
 
 
 def annotate_bodies(
@@ -51,9 +51,9 @@ def annotate_bodies(
     sweeps: Mapping[str, LidarSweep],
     sights: Mapping[str, CameraSight],
 ) -> tuple[Annotations, dict[str, NDArray[np.uint16]]]:
-    """Return the annotations of M bodies, and the instance image (H, W) of each camera.
+    """Return the annotations of M bodies, and the instance images (H, W) of the cameras, by name.
 
-    Annotated are all bodies but CARLA's actor `own` (the carrier) that are `within` (N,) range or show in a camera.
+    A body is annotated if it is `within` (N,) range or visible in a camera; the carrier, CARLA's actor `own`, is not.
     """
     count = len(state.bodies)
     instances = {name: _find_instances(state.boxes, sight) for name, sight in sights.items()}
@@ -64,7 +64,8 @@ def annotate_bodies(
     order = np.zeros(count + 1, np.uint16)
     order[rows + 1] = np.arange(1, len(rows) + 1)
     images = {name: order[image] for name, image in instances.items()}
-    boxes, bodies = state.boxes[rows], [state.bodies[row] for row in rows]
+    boxes = state.boxes[rows]
+    bodies = [state.bodies[row] for row in rows]
     numbers = np.array([body.number for body in bodies], np.int64)
     points = {name: _count_returns(boxes, numbers, sweep) for name, sweep in sweeps.items()}
     annotations = Annotations(
@@ -82,10 +83,10 @@ def annotate_bodies(
 
 
 def enter_box(origin: Array, directions: Array, half: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Return whether rays meet a box, and the distances (R,) at which they enter it.
+    """Return whether rays meet a box (R,), and the distances (R,) [m] at which they enter it, by the slab method.
 
-    In the frame of the box, of which `half` (3,) are half the sides: `origin` (3,) of all rays, `directions` (R, 3) of
-    unit length. By slabs (Kay and Kajiya, SIGGRAPH 1986).
+    In the box frame: `origin` (3,) [m] of all rays and unit `directions` (R, 3); `half` (3,) are the half sides [m]
+    (Kay and Kajiya, 1986).
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         first, second = (-half - origin) / directions, (half - origin) / directions
@@ -94,15 +95,16 @@ def enter_box(origin: Array, directions: Array, half: Array) -> tuple[NDArray[np
 
 
 def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) -> NDArray[np.int64]:
-    """Return the number (M,) of a LiDAR's points from each body: those beside a point of it of the semantic LiDAR's.
+    """Count (M,) a LiDAR's points on bodies: a point belongs to the actor of the nearest point of the semantic LiDAR.
 
-    A parked vehicle is no actor of CARLA's: points of its class in its box count.
+    A parked vehicle is not an actor of CARLA: points of a vehicle class in its box count.
     """
     if not len(sweep.points) or not len(sweep.met.points):
         return np.zeros(len(boxes), np.int64)
     away, nearest = (np.asarray(found) for found in KDTree(sweep.met.points).query(sweep.points[:, :3]))
     same = away <= SAME_M + SIGMAS * sweep.lidar.noise_m
-    actor, vehicle = sweep.met.actor[nearest[same]], np.isin(sweep.met.tag[nearest[same]], VEHICLES)
+    actor = sweep.met.actor[nearest[same]]
+    vehicle = np.isin(sweep.met.tag[nearest[same]], VEHICLES)
     counts = np.array([np.count_nonzero(actor == number) for number in numbers], np.int64)
     parked = np.flatnonzero(numbers == 0)
     ours = sweep.points[same][vehicle & (actor == 0)]
@@ -111,7 +113,7 @@ def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) 
 
 
 def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[LidarSweep]) -> Array:
-    """Return the share (M,) of rays at each box that ends before it, all LiDARs together; 1 where none arrives."""
+    """Return the share (M,) of the rays towards boxes that end before them, over all LiDARs; 1 where none arrives."""
     visible, hidden, rays = np.zeros((3, len(boxes)), np.int64)
     for sweep in sweeps:
         pattern = build_ray_pattern(sweep.lidar).astype(np.float64)
@@ -128,7 +130,7 @@ def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[Lid
             if numbers[row]:
                 seen = number == numbers[row]
                 visible[row] += np.count_nonzero(sweep.met.actor == numbers[row])
-            else:  # parked: the town's, by what is in its box
+            else:  # parked: part of the town, identified by the points in its box
                 ends = origin + (lines[towards] * distance[towards, None]) @ turn.T
                 seen = (np.abs(ends) <= half + SLACK_M).all(axis=1) & np.isin(sweep.met.tag[towards], VEHICLES)
                 visible[row] += np.count_nonzero(seen)
@@ -137,7 +139,7 @@ def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[Lid
 
 
 def _towards(lines: Array, turn: Array, origin: Array, half: Array) -> NDArray[np.int64]:
-    """Return the rays (R, 3), sensor frame, that may meet a box, by the cone around the sphere around it."""
+    """Return the indices of rays (R, 3), sensor frame, that may meet a box: in the cone of its bounding sphere."""
     away, radius = float(np.linalg.norm(origin)), float(np.linalg.norm(half))
     if away <= radius:
         return np.arange(len(lines))
@@ -146,8 +148,9 @@ def _towards(lines: Array, turn: Array, origin: Array, half: Array) -> NDArray[n
 
 
 def _find_instances(boxes: Boxes, sight: CameraSight) -> NDArray[np.int32]:
-    """Return the image (H, W) of row + 1 of the nearest box that a pixel of its class is in, else 0."""
-    lens, found = sight.lens, np.zeros(sight.depth_m.shape, np.int32)
+    """Return the instance image (H, W): row + 1 of the nearest box of its class around the pixel's point, or 0."""
+    lens = sight.lens
+    instance = np.zeros(sight.depth_m.shape, np.int32)
     outlines, _ = outline_boxes(boxes.corners(), lens, sight.world_from_camera)
     rectangles = clip_boxes(outlines, lens)
     known = np.flatnonzero(~np.isnan(rectangles).any(axis=1))
@@ -162,8 +165,8 @@ def _find_instances(boxes: Boxes, sight: CameraSight) -> NDArray[np.int32]:
             continue
         points = transform_points(sight.world_from_camera, (rays[window][mask] * depth[mask][:, None]))
         mask[mask] = points_in_boxes(points, boxes[[row]], SLACK_M)[0]
-        found[window][mask] = row + 1
-    return found
+        instance[window][mask] = row + 1
+    return instance
 
 
 def _view(boxes: Boxes, sight: CameraSight, instance: NDArray[np.uint16]) -> Views:
@@ -186,12 +189,12 @@ def _view(boxes: Boxes, sight: CameraSight, instance: NDArray[np.uint16]) -> Vie
 
 
 def _scaled_rays(lens: Lens) -> Array:
-    """Return the rays (H, W, 3) of the pixels, optical frame, scaled to a depth of 1."""
+    """Return the rays (H, W, 3) of the pixels, optical frame, scaled to unit depth."""
     rays = compute_pixel_rays(lens).reshape(lens.height, lens.width, 3).astype(np.float64)
     return rays / rays[..., 2:]
 
 
 def _window(rectangle: Array) -> tuple[slice, slice]:
-    """Return the rows and columns of the pixels within a rectangle x1 y1 x2 y2 of an image."""
+    """Return the rows and columns of the pixels within a rectangle x1, y1, x2, y2 [px]."""
     x1, y1, x2, y2 = rectangle
     return slice(int(np.ceil(y1)), int(np.floor(y2)) + 1), slice(int(np.ceil(x1)), int(np.floor(x2)) + 1)

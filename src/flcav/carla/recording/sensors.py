@@ -1,9 +1,9 @@
-"""Our rigs as CARLA's sensors, and their data in our units and frames.
+"""Rigs as CARLA's sensors, and their data converted to flcav's units and frames.
 
-A LiDAR turns once in each tick, so that each of its measurements is a whole spin at one instant: with a lower
-rotation frequency a tick would give a part of one. Beside each LiDAR stands a semantic one with the same rays, without
-losses, and beside each camera one of depths and one of classes: from these come the annotations. Source: CARLA's
-documentation, "Sensors reference".
+A LiDAR turns once per tick, so that a measurement is a whole spin at one instant: with a lower rotation frequency a
+tick would give a part of a spin. A LiDAR is accompanied by a semantic LiDAR with the same rays and no losses, a camera
+by a depth camera and a semantic camera: the annotations come from these. Source: CARLA's documentation, "Sensors
+reference".
 """
 
 import queue
@@ -27,26 +27,26 @@ if TYPE_CHECKING:
     import carla
 
 SEMANTIC_POINT = np.dtype([("xyz", "<f4", 3), ("cosine", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
-FAR_M = 1000.0  # depth that is coded by three bytes of ones
+FAR_M = 1000.0  # depth that is coded by 24 bits of ones
 DEPTH_STEPS = 2**24 - 1
-SKY_M = 0.999 * FAR_M  # from here on, a depth is that of the sky
-PINHOLE = {  # a camera without the lens that CARLA simulates by default
+SKY_M = 0.999 * FAR_M  # greater depths are sky
+PINHOLE = {  # a camera without the lens effects that CARLA simulates by default
     **{"lens_k": "0.0", "lens_kcube": "0.0", "lens_circle_multiplier": "0.0", "chromatic_aberration_intensity": "0.0"},
     **{"lens_flare_intensity": "0.0", "motion_blur_intensity": "0.0"},
 }
 
 
 class SemanticSweep(NamedTuple):
-    """Returns of a semantic LiDAR, N of them."""
+    """The N returns of a semantic LiDAR."""
 
     points: NDArray[np.float32]  # (N, 3) sensor frame [m]
-    actor: NDArray[np.uint32]  # (N,) CARLA's number; 0 for the town
+    actor: NDArray[np.uint32]  # (N,) CARLA's actor id; 0 for the town
     tag: NDArray[np.uint32]  # (N,) semantic class
 
 
 @dataclass
 class Feed:
-    """The data of one of CARLA's sensors, at the ticks that are asked for."""
+    """The data of one of CARLA's sensors at selected ticks."""
 
     name: str
     actor: "carla.Sensor"
@@ -61,11 +61,11 @@ class Feed:
             self._data.put(data)
 
     def expect(self, frame: int) -> None:
-        """Keep the data of the tick `frame`, which is to come, and of those after it."""
+        """Keep the data from the coming tick `frame` on."""
         self._from = frame
 
     def take(self, frame: int, timeout_s: float) -> "carla.SensorData":
-        """Return the data of the tick `frame`; raises `OSError` where it does not come in time, or at all."""
+        """Return the data of the tick `frame`. Raises `OSError` where it is late or missing."""
         while True:
             try:
                 data = self._data.get(timeout=timeout_s)
@@ -84,25 +84,28 @@ class Feed:
 def spawn_feeds(
     session: Session, rig: Rig, agent: str, base: Array, parent: "carla.Actor | None", frame: MapFrame, seed: int
 ) -> dict[str, Feed]:
-    """Return name -> feed of the CARLA sensors of a rig, also of those beside: see `semantic_name` and `depth_name`.
+    """Spawn the CARLA sensors of a rig and the auxiliary ones; return their feeds by name.
 
-    `base` is the (4, 4) pose of the agent: in the frame of the actor `parent`, without it in the world's.
+    Auxiliary sensors are named by `semantic_name` and `depth_name`. `base` is the (4, 4) pose of the agent [m]: in the
+    frame of the actor `parent`, or, without it, in the world frame.
     """
-    asked: dict[str, tuple[str, Mapping[str, str], Array]] = {}
+    specifications: dict[str, tuple[str, Mapping[str, str], Array]] = {}
     for name, lidar in rig.lidars.items():
         mount, attributes = lidar.mount.agent_from_sensor(), _lidar_attributes(lidar.settings)
         losses = _loss_attributes(lidar.settings, seed)
-        asked[name] = "sensor.lidar.ray_cast", attributes | losses, mount
-        asked[semantic_name(name)] = "sensor.lidar.ray_cast_semantic", attributes, mount
+        specifications[name] = "sensor.lidar.ray_cast", attributes | losses, mount
+        specifications[semantic_name(name)] = "sensor.lidar.ray_cast_semantic", attributes, mount
     for name, camera in rig.cameras.items():
         mount, attributes = camera.mount.agent_from_sensor(), _camera_attributes(camera.settings)
-        asked[name] = "sensor.camera.rgb", attributes | PINHOLE, mount
-        asked[depth_name(name)] = "sensor.camera.depth", attributes, mount
-        asked[semantic_name(name)] = "sensor.camera.semantic_segmentation", attributes, mount
+        specifications[name] = "sensor.camera.rgb", attributes | PINHOLE, mount
+        specifications[depth_name(name)] = "sensor.camera.depth", attributes, mount
+        specifications[semantic_name(name)] = "sensor.camera.semantic_segmentation", attributes, mount
     for kind, sensors in (("gnss", rig.gnss), ("imu", rig.imus)):
-        asked |= {name: (f"sensor.other.{kind}", {}, each.mount.agent_from_sensor()) for name, each in sensors.items()}
+        specifications |= {
+            name: (f"sensor.other.{kind}", {}, sensor.mount.agent_from_sensor()) for name, sensor in sensors.items()
+        }
     library, feeds = session.world.get_blueprint_library(), dict[str, Feed]()
-    for name, (kind, attributes, mount) in asked.items():
+    for name, (kind, attributes, mount) in specifications.items():
         blueprint = library.find(kind)
         for attribute, value in attributes.items():
             if blueprint.has_attribute(attribute):
@@ -114,29 +117,29 @@ def spawn_feeds(
 
 
 def semantic_name(name: str) -> str:
-    """Return the name of the feed of classes beside the LiDAR or camera `name`; no sensor of a rig has such a name."""
+    """Return the name of the semantic feed of the LiDAR or camera `name`; no sensor of a rig has such a name."""
     return f"{name}.classes"
 
 
 def depth_name(name: str) -> str:
-    """Return the name of the feed of depths beside the camera `name`."""
+    """Return the name of the depth feed of the camera `name`."""
     return f"{name}.depths"
 
 
 def read_lidar_points(data: "carla.LidarMeasurement") -> NDArray[np.float32]:
-    """Return the points (N, 4) x, y, z [m], intensity of a sweep, sensor frame."""
+    """Return the points (N, 4) of a sweep: x, y, z [m], sensor frame, and intensity."""
     points = np.frombuffer(bytes(data.raw_data), "<f4").reshape(-1, 4) * np.array((1, -1, 1, 1), np.float32)
     return np.clip(points, (-np.inf, -np.inf, -np.inf, 0), (np.inf, np.inf, np.inf, 1)).astype(np.float32)
 
 
 def read_semantic_points(data: "carla.SemanticLidarMeasurement") -> SemanticSweep:
-    """Return what a semantic LiDAR met."""
+    """Return the returns of a semantic LiDAR, sensor frame."""
     points = np.frombuffer(bytes(data.raw_data), SEMANTIC_POINT)
     return SemanticSweep(mirror(points["xyz"]).astype(np.float32), points["actor"], points["tag"])
 
 
 def read_colours(image: "carla.Image") -> NDArray[np.uint8]:
-    """Return the colours (H, W, 3) of an image."""
+    """Return an image as RGB (H, W, 3)."""
     return np.ascontiguousarray(_pixels(image)[..., 2::-1])
 
 
@@ -153,13 +156,13 @@ def read_classes(image: "carla.Image") -> NDArray[np.uint8]:
 
 
 def read_fix(data: "carla.GnssMeasurement") -> Array:
-    """Return (3,) latitude, longitude [degrees], altitude [m]."""
+    """Return a GNSS fix (3,): latitude, longitude [deg], altitude [m]."""
     return np.array((data.latitude, data.longitude, data.altitude))
 
 
 def read_inertia(data: "carla.IMUMeasurement") -> Array:
-    """Return (6,) specific force [m/s^2] and angular rate [rad/s], in the unit's frame."""
-    force, rate = (np.array((each.x, each.y, each.z)) for each in (data.accelerometer, data.gyroscope))
+    """Return an IMU measurement (6,): specific force [m/s^2] and angular rate [rad/s], IMU frame."""
+    force, rate = (np.array((vector.x, vector.y, vector.z)) for vector in (data.accelerometer, data.gyroscope))
     return np.concatenate((mirror(force), mirror_spin(rate)))
 
 
@@ -182,7 +185,7 @@ def _lidar_attributes(lidar: Lidar) -> dict[str, str]:
 
 
 def _loss_attributes(lidar: Lidar, seed: int) -> dict[str, str]:
-    """Return the attributes of noise and losses: those of `carla`, or the share `dropout`, whatever the distance."""
+    """Return the attributes of noise and losses: those of `carla`, or `dropout`, independent of distance."""
     if lidar.carla is not None:
         losses = {name: str(value) for name, value in lidar.carla.model_dump().items()}
     else:

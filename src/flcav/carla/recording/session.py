@@ -1,7 +1,7 @@
-"""A session with CARLA's server: a world of its own for a scene, in synchronous mode, and failures by name.
+"""A session with CARLA's server: a fresh world for a scene, in synchronous mode, and errors that name the scene.
 
-In synchronous mode CARLA waits for each tick, so that nothing passes unseen. Ticks are STEP_S apart, and physics takes
-its ten default substeps in each. Source: CARLA's documentation, "Synchrony and time-step" and "Traffic Manager".
+In synchronous mode CARLA waits for the client's ticks, so that no state is missed. Ticks are STEP_S apart, with the ten
+default substeps of physics. Source: CARLA's documentation, "Synchrony and time-step" and "Traffic Manager".
 """
 
 import re
@@ -19,12 +19,12 @@ if TYPE_CHECKING:
     import carla
 
 LAYERED = "_Opt"  # ending of CARLA's names of maps with layers
-GOODBYE_S = 2.0  # longest wait for an answer of a server that has failed
+GOODBYE_S = 2.0  # longest wait for a reply of a server that has failed
 
 
 @dataclass(frozen=True)
 class Session:
-    """A world of CARLA's that ticks when it is told to."""
+    """A world of CARLA in synchronous mode."""
 
     address: str
     timeout_s: float
@@ -33,7 +33,7 @@ class Session:
     manager: "carla.TrafficManager"
 
     def tick(self) -> "carla.WorldSnapshot":
-        """Let STEP_S pass, and return the world's state after it; raises `OSError` where another client ticks, too."""
+        """Advance the world by STEP_S; return its new state. Raises `OSError` where another client ticks, too."""
         frame = self.world.tick(self.timeout_s)
         snapshot = self.world.get_snapshot()
         if snapshot.frame != frame or abs(snapshot.timestamp.delta_seconds - STEP_S) > STEP_S / 100:
@@ -56,10 +56,10 @@ def check_installed() -> None:
 
 @contextmanager
 def open_session(recipe: CarlaRecipe, map_name: str, scene: str, seed: int) -> Iterator[Session]:
-    """Yield a session with the map loaded anew; the server is left with its clock running and without our actors.
+    """Yield a session with a freshly loaded map; afterwards the server is in asynchronous mode, without vehicles.
 
     Recordings on this machine take turns at a server. Raises `InputError` where the server has another version or lacks
-    the map, and `OSError` where it is lost.
+    the map, and `OSError` where the connection is lost.
     """
     import carla
 
@@ -88,7 +88,7 @@ def open_session(recipe: CarlaRecipe, map_name: str, scene: str, seed: int) -> I
 
 @contextmanager
 def _name_failures(address: str, scene: str) -> Iterator[None]:
-    """Raise the RuntimeError of CARLA's client, which it raises for all that fails, as an `OSError` that says where."""
+    """Convert the RuntimeError that CARLA's client raises for all failures to an `OSError` that names the scene."""
     try:
         yield
     except RuntimeError as error:
@@ -100,22 +100,22 @@ def _name_failures(address: str, scene: str) -> Iterator[None]:
 
 
 def _check_version(client: "carla.Client", address: str) -> None:
-    server, own = client.get_server_version(), client.get_client_version()
-    if server != own:
+    server, local = client.get_server_version(), client.get_client_version()
+    if server != local:
         raise InputError(
-            f"CARLA at {address} is version {shorten(server)} and the installed client {own}: they must be the same"
+            f"CARLA at {address} is version {shorten(server)} and the installed client {local}: they must be the same"
         )
 
 
 def _load_map(client: "carla.Client", address: str, name: str) -> "carla.World":
-    """Return the world of the map, without anything of before."""
+    """Return the world of the map in its initial state."""
     known = {path.rsplit("/", 1)[-1] for path in client.get_available_maps()}
-    found = next((each for each in (name, f"{name}{LAYERED}") if each in known), None)
-    if found is None:
+    path_name = next((candidate for candidate in (name, f"{name}{LAYERED}") if candidate in known), None)
+    if path_name is None:
         others = ", ".join(sorted(known)) or "none"
         raise InputError(f"CARLA at {address} has no map {shorten(name)}; it has {others}{suggest(name, known)}")
     current = client.get_world().get_map().name.rsplit("/", 1)[-1]
-    return client.reload_world() if current == found else client.load_world(found)
+    return client.reload_world() if current == path_name else client.load_world(path_name)
 
 
 def _leave(client: "carla.Client", world: "carla.World", manager: "carla.TrafficManager") -> None:

@@ -1,4 +1,4 @@
-"""CARLA as a source: its world and traffic, seen by the sensors of a recipe's rigs, annotated from its actors."""
+"""CARLA as a source of frames: its world and traffic, observed by the sensors of a recipe's rigs."""
 
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -52,31 +52,32 @@ from flcav.world.weather import Weather
 if TYPE_CHECKING:
     import carla
 
-SETTLED = 2  # ticks that the traffic takes to begin: one for walkers, one to list who is there
+SETTLED = 2  # ticks before the traffic is complete: one for walkers, one to list the actors
 LEAD = 2  # ticks from the spawning of sensors to the first spin
-BODY_M = 0.1  # by which a carrier's own points may lie outside its box
+BODY_M = 0.1  # by which points on the carrier may lie outside its box
 
 
 @dataclass(frozen=True)
 class Agent:
-    """A vehicle or pole that records."""
+    """An agent: a vehicle or pole that records."""
 
     name: str
     rig: Rig
     calibration: Calibration
-    number: int | None  # CARLA's of its vehicle; None of a pole
-    base: Array  # (4, 4) its frame in that of its vehicle, of a pole in the world
+    number: int | None  # CARLA's id of its vehicle; None for a pole
+    base: Array  # (4, 4) pose of the agent frame in the frame of its vehicle, or of a pole in the world frame [m]
     feeds: Mapping[str, Feed]
 
 
 class CarlaSource(DividedSource):
-    """The frames of a recipe from a CARLA server: each scene is its map loaded anew, with traffic of its own."""
+    """CARLA as a source of a recipe's frames: every scene is a freshly loaded map with new traffic."""
 
     def __init__(self, recipe: CarlaRecipe, beside: Path | None = None) -> None:
-        """Raises `InputError` where CARLA's client is not installed, a pole does not exist, or nobody observes.
+        """Find the town, if it is known, and its poles.
 
-        A town of ours, or its folder, which may be relative to `beside`, the recipe's, gives poles and the world's
-        origin; any other `town` is a map of the server's without poles.
+        A town of flcav, or its folder, which may be relative to `beside`, the recipe's folder, gives poles and the
+        world's origin; any other `town` is a map of the server without poles. Raises `InputError` where CARLA's client
+        is not installed, a pole does not exist, or there is no agent.
         """
         check_installed()
         self.recipe = recipe
@@ -96,15 +97,15 @@ class CarlaSource(DividedSource):
             check_mounts("pole_rig", recipe.pole_rig, pole, z - ground)
 
     def describe(self) -> Mapping[str, Json]:
-        """Return the recipe as JSON values, without where the server is; equal where frames are, as far as CARLA goes.
+        """Return the recipe as JSON values without the server's address; it determines the frames as far as CARLA does.
 
-        CARLA has no annotations of signs here.
+        There are no annotations of signs.
         """
         place = {"host", "port", "traffic_port", "timeout_s"}
-        asked = {"scenarios", "rare", "randomise", "window_s", "window_every_s", "window_range_m"}
-        own = self.recipe.model_dump(mode="json", exclude=place)
+        optional = {"scenarios", "rare", "randomise", "window_s", "window_every_s", "window_range_m"}
+        fields = self.recipe.model_dump(mode="json", exclude=place)
         return {
-            **{name: value for name, value in own.items() if name not in asked or value},
+            **{name: value for name, value in fields.items() if name not in optional or value},
             "town": self.town.name if self.town else "",
             "map": self.map,
             "carla": version("carla"),
@@ -115,16 +116,17 @@ class CarlaSource(DividedSource):
         }
 
     def trace(self, scene: str) -> None:
-        """Return None: the traffic is known at the frames alone."""
+        """Return None: the traffic is known only at the frames."""
         return
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        """Yield the scene's frames by spin, and within a spin the vehicles' before the poles'.
+        """Yield the scene's frames by spin, and within a spin those of the vehicles before those of the poles.
 
-        Raises `InputError` where the server has another version, or not what is asked for, and `OSError` where it or a
-        sensor is lost.
+        Raises `InputError` where the server has another version or lacks what the recipe needs, and `OSError` where
+        the connection or a sensor is lost.
         """
-        recipe, left = self.recipe, self.frame_count(scene)
+        recipe = self.recipe
+        left = self.frame_count(scene)
         warmup = int(stream(recipe.seed, scene, "warmup").integers(*recipe.warmup_steps, endpoint=True))
         times_s = recipe.times_s(warmup)
         weather = recipe.weather.draw(stream(recipe.seed, scene, "weather"))
@@ -133,7 +135,8 @@ class CarlaSource(DividedSource):
             session.world.set_weather(make_weather(weather.at(0.0)))
             rng = stream(recipe.seed, scene, "spawn")
             spawned = spawn_vehicles(session, recipe, rng) | spawn_walkers(session, recipe, rng)
-            ticks, snapshot = SETTLED, session.tick()
+            ticks = SETTLED
+            snapshot = session.tick()
             bodies = list_bodies(session, spawned, self.frame)
             agents: list[Agent] = []
             for spin, step in enumerate(steps):
@@ -161,7 +164,7 @@ class CarlaSource(DividedSource):
         bodies: Sequence[TrackedBody],
         scene: str,
     ) -> Agent:
-        """Return an agent with its sensors, which CARLA's then has."""
+        """Spawn the sensors of an agent in CARLA; return the agent."""
         vehicle = spawned.get(name)
         rig = self.recipe.pole_rig if vehicle is None else self.recipe.vehicle_rig
         base = self.poles[name] if vehicle is None else _find_body(bodies, vehicle.id).actor_from_foot()
@@ -177,14 +180,15 @@ class CarlaSource(DividedSource):
         state: State,
         at: tuple[str, int, float, Weather],
     ) -> Frame:
-        """Return the frame of an agent at a tick that has passed; `at`: scene, spin, time and weather."""
+        """Return the frame of an agent at the last tick; `at` is scene, spin, time [s] and weather."""
         (scene, spin, time_s, weather), seed = at, self.recipe.seed
-        own, world_from_agent = None, agent.base
+        vehicle = None
+        world_from_agent = agent.base
         if agent.number is not None:
-            own = snapshot.find(agent.number)
-            if own is None:
+            vehicle = snapshot.find(agent.number)
+            if vehicle is None:
                 raise OSError(f"CARLA's vehicle of {agent.name} is gone at tick {snapshot.frame} of the scene {scene}")
-            world_from_agent = read_pose(own.get_transform(), self.frame) @ agent.base
+            world_from_agent = read_pose(vehicle.get_transform(), self.frame) @ agent.base
         mounts = agent.calibration.agent_from_sensor
 
         def take(name: str) -> Any:
@@ -241,19 +245,25 @@ class CarlaSource(DividedSource):
         )
 
     def explain_end(self) -> str:
-        """Return why the process of CARLA's client has ended: a thread of the Traffic Manager's lost the server."""
+        """Explain the end of the client's process: a thread of its Traffic Manager has lost the server."""
         return (
             f"CARLA at {self.recipe.host}:{self.recipe.port} was lost, and its Traffic Manager ended the recording; "
             "scenes before are kept, and the same command goes on"
         )
 
     def town_files(self) -> Mapping[str, bytes]:
-        """Return the contents of the town's files by name; empty for a town that comes with flcav, or none."""
+        """Return the contents of the town's files by name.
+
+        Empty for a town that comes with flcav, and without a town.
+        """
         kept = self.town is not None and self.recipe.town not in PACKAGED
         return read_town_files(self.town, self.recipe.town) if kept and self.town else {}
 
     def _find_poles(self) -> dict[str, Array]:
-        """Return pole -> (4, 4) pose in the world, of the poles that record; raises `InputError` for an unknown one."""
+        """Return the (4, 4) poses of the recording poles, world frame [m], by name.
+
+        Raises `InputError` if one is unknown.
+        """
         town = self.town
         sites: list[int] = [] if town is None else town.poles.id.tolist()
         wanted = sites if self.recipe.poles == "all" else self.recipe.poles
@@ -268,7 +278,7 @@ class CarlaSource(DividedSource):
 
 
 def _find_town(name: str, beside: Path | None) -> Town | None:
-    """Return the town of a recipe; None where `name` is neither a town of flcav's nor a folder."""
+    """Return the town of a recipe; None where `name` is neither a town of flcav nor a folder."""
     folder = Path(name) if beside is None else beside / name
     return load_town(name, beside) if name in PACKAGED or os.path.isdir(folder) else None  # noqa: PTH112 - a long name
 
@@ -278,13 +288,16 @@ def _find_body(bodies: Sequence[TrackedBody], number: int) -> TrackedBody:
 
 
 def _drop_carrier(points: NDArray[np.float32], box: Boxes, world_from_sensor: Array) -> NDArray[np.float32]:
-    """Return the points (N, 4) of a LiDAR that are not on its carrier, whose `box` is the only one, or none."""
+    """Return the points (N, 4) of a LiDAR, sensor frame, that are not on its carrier.
+
+    `box` is the carrier's, or empty.
+    """
     inside = points_in_boxes(transform_points(world_from_sensor, points[:, :3].astype(np.float64)), box, BODY_M)
     return points[~inside.any(axis=0)]
 
 
 def _within_range(state: State, rig: Rig, world_from_agent: Array, mounts: Mapping[str, Array]) -> NDArray[np.bool_]:
-    """Return (N,) whether the centre of each box is within the range of a LiDAR; without one, CAMERA_RANGE_M."""
+    """Return (N,) whether box centres are in range of a LiDAR, or, without LiDARs, CAMERA_RANGE_M of a camera."""
     ranges = {name: mounted.settings.range_m for name, mounted in rig.lidars.items()}
     within = np.zeros(len(state.bodies), bool)
     for name, range_m in (ranges or dict.fromkeys(rig.cameras, CAMERA_RANGE_M)).items():
@@ -294,7 +307,7 @@ def _within_range(state: State, rig: Rig, world_from_agent: Array, mounts: Mappi
 
 
 def _fix(exact: Array, error_m: Array) -> Array:
-    """Return a position (3,) latitude, longitude [degrees], altitude [m] that is wrong by `error_m` east, north, up."""
+    """Return a GNSS fix (3,), latitude, longitude [deg], altitude [m], displaced by `error_m` (3,) east, north, up."""
     latitude, longitude, altitude = exact.tolist()
     here = GeoReference(latitude_deg=latitude, longitude_deg=longitude, altitude_m=altitude)
     return convert_to_geodetic(here, error_m)

@@ -1,4 +1,4 @@
-"""Traffic of a scene in CARLA: vehicles of its Traffic Manager and its walkers, drawn by the recipe's seed."""
+"""Traffic of a scene in CARLA: walkers, and vehicles of its Traffic Manager, drawn by the recipe's seed."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,22 +17,22 @@ if TYPE_CHECKING:
 
 CATEGORIES = ("car", "van", "truck", "bus", "motorcycle", "bicycle")  # as in CARLA's attribute base_type
 ALONE = "vehicle.tesla.model3"  # blueprint of the vehicles that record
-NARROWEST_M = 0.6  # width of two-wheelers, whose boxes in CARLA may have none
-THINNEST_M = 0.05  # side of any box
+NARROWEST_M = 0.6  # least width of two-wheelers, whose boxes in CARLA may have a width of 0
+THINNEST_M = 0.05  # least side of a box
 
 
 @dataclass(frozen=True)
 class TrackedBody:
-    """An actor of CARLA's, or a parked vehicle of its map, with its box."""
+    """An actor of CARLA, or a parked vehicle of its map, with its box."""
 
-    number: int  # CARLA's; 0 of a parked vehicle, which is no actor
+    number: int  # CARLA's actor id; 0 for a parked vehicle, which is not an actor
     track: str
     category: str
     size: tuple[float, float, float]  # length, width, height [m]
-    middle: Array  # (4, 4) of the box: in the actor's frame, of a parked vehicle in the world's
+    middle: Array  # (4, 4) pose of the box centre in the actor frame, of a parked vehicle in the world frame [m]
 
     def actor_from_foot(self) -> Array:
-        """Return the (4, 4) pose of the ground centre of the box in the actor's frame."""
+        """Return the (4, 4) pose of the centre of the box's underside in the actor frame [m]."""
         foot = self.middle.copy()
         foot[:3, 3] -= foot[:3, 2] * self.size[2] / 2
         return foot
@@ -40,29 +40,32 @@ class TrackedBody:
 
 @dataclass(frozen=True)
 class State:
-    """The N bodies that are in town at a tick."""
+    """The states of the N bodies that exist at a tick."""
 
     bodies: tuple[TrackedBody, ...]
     boxes: Boxes  # (N,) world frame
-    velocity: Array  # (N, 3) world [m/s]
-    acceleration: Array  # (N, 3) world [m/s^2]
+    velocity: Array  # (N, 3) world frame [m/s]
+    acceleration: Array  # (N, 3) world frame [m/s^2]
 
 
 def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generator) -> dict[str, "carla.Vehicle"]:
-    """Return agent or track -> vehicle, of those that record and of the others, driven by the Traffic Manager.
+    """Spawn recording and other vehicles, driven by the Traffic Manager; return them by agent or track.
 
-    Raises `InputError` where the map has not enough spawn points for the vehicles that record.
+    Raises `InputError` where the map has too few spawn points for the recording vehicles.
     """
     library, points = session.world.get_blueprint_library(), session.world.get_map().get_spawn_points()
-    every = sorted((each for each in library.filter("vehicle.*") if _category(each)), key=lambda each: each.id)
-    own = next((each for each in every if each.id == ALONE), None)
-    if own is None:
+    every = sorted(
+        (blueprint for blueprint in library.filter("vehicle.*") if _category(blueprint)),
+        key=lambda blueprint: blueprint.id,
+    )
+    ego_blueprint = next((blueprint for blueprint in every if blueprint.id == ALONE), None)
+    if ego_blueprint is None:
         raise InputError(f"CARLA at {session.address} has no blueprint {ALONE}, which records")
     places = [points[i] for i in rng.permutation(len(points))]
     names = [f"cav{i}" for i in range(recipe.cavs)] + [f"veh{i}" for i in range(recipe.vehicles)]
-    found: dict[str, carla.Vehicle] = {}
+    vehicles: dict[str, carla.Vehicle] = {}
     for name in names:
-        blueprint = own if name.startswith("cav") else every[int(rng.integers(len(every)))]
+        blueprint = ego_blueprint if name.startswith("cav") else every[int(rng.integers(len(every)))]
         if blueprint.has_attribute("color"):
             colours = blueprint.get_attribute("color").recommended_values
             blueprint.set_attribute("color", colours[int(rng.integers(len(colours)))])
@@ -71,22 +74,22 @@ def spawn_vehicles(session: Session, recipe: CarlaRecipe, rng: np.random.Generat
         while places and vehicle is None:
             vehicle = cast("carla.Vehicle | None", session.world.try_spawn_actor(blueprint, places.pop()))
         if vehicle is not None:
-            found[name] = vehicle
+            vehicles[name] = vehicle
         elif name.startswith("cav"):
             raise InputError(f"CARLA at {session.address} has no free spawn point for {name}: lower 'cavs'")
-    for vehicle in found.values():
+    for vehicle in vehicles.values():
         vehicle.set_autopilot(True, session.manager.get_port())
-    return found
+    return vehicles
 
 
 def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generator) -> dict[str, "carla.Actor"]:
-    """Return track -> walker, each on its way somewhere on the navigation mesh; fewer where there is no room."""
+    """Spawn walkers with random targets on the navigation mesh; return them by track, fewer where there is no room."""
     import carla
 
     library = session.world.get_blueprint_library()
-    kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda each: each.id)
+    kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda blueprint: blueprint.id)
     control = library.find("controller.ai.walker")
-    found: dict[str, carla.Actor] = {}
+    walkers: dict[str, carla.Actor] = {}
     drivers = []
     for number in range(recipe.pedestrians if kinds else 0):
         place = session.world.get_random_location_from_navigation()
@@ -98,7 +101,7 @@ def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generato
         kind.set_attribute("role_name", f"ped{number}")
         walker = session.world.try_spawn_actor(kind, carla.Transform(place))
         if walker is not None:
-            found[f"ped{number}"] = walker
+            walkers[f"ped{number}"] = walker
             drivers.append(session.world.spawn_actor(control, carla.Transform(), attach_to=walker))
     session.tick()  # a controller starts after the tick that its walker appears at
     for driver in drivers:
@@ -106,13 +109,13 @@ def spawn_walkers(session: Session, recipe: CarlaRecipe, rng: np.random.Generato
         target = session.world.get_random_location_from_navigation()
         if target is not None:
             driver.go_to_location(target)
-    return found
+    return walkers
 
 
 def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: MapFrame) -> list[TrackedBody]:
-    """Return the bodies of a world: all its vehicles and walkers, and the vehicles that are parked in its map.
+    """Return the bodies of a world: all vehicles and walkers, and the parked vehicles of its map.
 
-    Those that others than us have spawned are called `other` and CARLA's number.
+    Actors that are not `spawned` by this recording have the track `other` with CARLA's id.
     """
     import carla
 
@@ -128,22 +131,22 @@ def list_bodies(session: Session, spawned: Mapping[str, "carla.Actor"], frame: M
         things = session.world.get_environment_objects(getattr(carla.CityObjectLabel, category.capitalize()))
         for middle, size in (_read_box(thing.bounding_box, frame, category) for thing in things):
             parked.append((tuple(middle[:3, 3].tolist()), category, (middle, size)))
-    parked.sort(key=lambda each: each[:2])  # their numbers may differ when the map is loaded anew
+    parked.sort(key=lambda vehicle: vehicle[:2])  # their numbers may differ when the map is loaded anew
     bodies += [TrackedBody(0, f"parked{i}", kind, size, middle) for i, (_, kind, (middle, size)) in enumerate(parked)]
     return bodies
 
 
 def read_state(snapshot: "carla.WorldSnapshot", bodies: list[TrackedBody], frame: MapFrame) -> State:
-    """Return the bodies that a snapshot has, and the parked ones, with their boxes and motion."""
+    """Return the states of the bodies that exist in a snapshot, and of the parked vehicles."""
     present, middles, velocity, acceleration = [], [], [], []
     for body in bodies:
-        found = snapshot.find(body.number) if body.number else None
-        if body.number and found is None:
+        actor = snapshot.find(body.number) if body.number else None
+        if body.number and actor is None:
             continue
         present.append(body)
-        middles.append(body.middle if found is None else read_pose(found.get_transform(), frame) @ body.middle)
-        velocity.append((0.0, 0.0, 0.0) if found is None else read_vector(found.get_velocity()))
-        acceleration.append((0.0, 0.0, 0.0) if found is None else read_vector(found.get_acceleration()))
+        middles.append(body.middle if actor is None else read_pose(actor.get_transform(), frame) @ body.middle)
+        velocity.append((0.0, 0.0, 0.0) if actor is None else read_vector(actor.get_velocity()))
+        acceleration.append((0.0, 0.0, 0.0) if actor is None else read_vector(actor.get_acceleration()))
     placed = np.array(middles).reshape(-1, 4, 4)
     count = len(present)
     return State(
@@ -160,13 +163,14 @@ def read_state(snapshot: "carla.WorldSnapshot", bodies: list[TrackedBody], frame
 
 
 def read_pose(transform: "carla.Transform", frame: MapFrame) -> Array:
-    """Return the (4, 4) pose in the town's world, of a transform of CARLA's."""
-    at, turn = transform.location, transform.rotation
+    """Convert a CARLA transform to a (4, 4) pose of the world frame [m]."""
+    at = transform.location
+    turn = transform.rotation
     return frame.from_transform((at.x, at.y, at.z), (turn.pitch, turn.yaw, turn.roll))
 
 
 def make_transform(pose: Array, frame: MapFrame) -> "carla.Transform":
-    """Return CARLA's transform of a (4, 4) pose in the town's world."""
+    """Convert a (4, 4) pose of the world frame [m] to a CARLA transform."""
     import carla
 
     (x, y, z), (pitch, yaw, roll) = frame.to_transform(pose)
@@ -174,12 +178,12 @@ def make_transform(pose: Array, frame: MapFrame) -> "carla.Transform":
 
 
 def read_vector(vector: "carla.Vector3D") -> Array:
-    """Return a direction (3,) of CARLA's in our axes."""
+    """Convert a CARLA vector to an array (3,) in right-handed axes."""
     return mirror(np.array((vector.x, vector.y, vector.z)))
 
 
 def _read_box(box: "carla.BoundingBox", frame: MapFrame, category: str) -> tuple[Array, tuple[float, float, float]]:
-    """Return the (4, 4) middle and the size [m] of a box, which is in the map's frame or in its actor's."""
+    """Return the (4, 4) pose of the centre and the size [m] of a box, which is in the map's or its actor's frame."""
     import carla
 
     middle = read_pose(carla.Transform(box.location, box.rotation), frame)
@@ -189,11 +193,11 @@ def _read_box(box: "carla.BoundingBox", frame: MapFrame, category: str) -> tuple
 
 
 def _category(thing: "carla.Actor | carla.ActorBlueprint") -> str:
-    """Return the category of a vehicle or of its blueprint; empty where CARLA does not say one of CATEGORIES."""
+    """Return the category of a vehicle or its blueprint; empty if CARLA's base_type is not one of CATEGORIES."""
     import carla
 
     if isinstance(thing, carla.ActorBlueprint):
-        told = thing.get_attribute("base_type").as_str() if thing.has_attribute("base_type") else ""
+        base_type = thing.get_attribute("base_type").as_str() if thing.has_attribute("base_type") else ""
     else:
-        told = thing.attributes.get("base_type", "")
-    return told.lower() if told.lower() in CATEGORIES else ""
+        base_type = thing.attributes.get("base_type", "")
+    return base_type.lower() if base_type.lower() in CATEGORIES else ""

@@ -1,4 +1,4 @@
-"""The actors that clients know, each with its body in the live world, and how vehicles among them are driven."""
+"""Actors as clients see them, with their bodies in the live world, and the control of vehicles."""
 
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
@@ -27,77 +27,77 @@ STANDING, WAITING = wire.VehicleControl(), wire.WalkerControl()
 
 
 class Counters:
-    """The numbers of actors, streams, frames and episodes, which a server never uses twice."""
+    """Counters of actors, streams, frames and episodes: a server never reuses an id."""
 
     def __init__(self) -> None:
         self.actor = self.episode = self.frame = self.stream = 0
 
     def next_actor(self) -> int:
-        """Return a number for an actor."""
+        """Return a new actor id."""
         self.actor += 1
         return self.actor
 
     def next_stream(self) -> int:
-        """Return a number for a stream."""
+        """Return a new stream id."""
         self.stream += 1
         return self.stream
 
 
 class ActorPose(NamedTuple):
-    """Where an actor is, and how it moves."""
+    """The pose and motion of an actor, in the world frame and in CARLA's left-handed frame."""
 
-    pose: Array  # (4, 4) world from body
-    location: wire.Vector
-    rotation: wire.Vector
-    motion: Sequence[wire.Vector]  # velocity, angular velocity, acceleration
+    pose: Array  # (4, 4) world from body [m]
+    location: wire.Vector  # CARLA's frame [m]
+    rotation: wire.Vector  # CARLA's pitch, yaw, roll [deg]
+    motion: Sequence[wire.Vector]  # CARLA's velocity [m/s], angular velocity [deg/s], acceleration [m/s^2]
 
 
 @dataclass
 class ServedActor:
-    """An actor, as clients know it."""
+    """An actor as clients see it."""
 
     id: int
     description: wire.Description
-    transform: Transform
-    pose: Array  # (4, 4) world from actor: the ground under a vehicle's middle, a walker's middle
-    name: str = ""  # of its body in the live world; empty without one
+    transform: Transform  # CARLA's frame [m], [deg]
+    pose: Array  # (4, 4) world from actor [m]; origin: the ground below a vehicle's centre, a walker's centre
+    name: str = ""  # of its body in the live world; empty without a body
     category: str = ""  # of that body
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # length, width, height [m]
-    paint: wire.Vector | None = None  # linear RGB, of a vehicle that a client spawned
-    parent: int = 0
-    mount: Array | None = None  # (4, 4) parent from actor, of one that is attached
-    stream: int = 0  # of a sensor
+    paint: wire.Vector | None = None  # linear RGB of a vehicle that a client spawned
+    parent: int = 0  # id of the actor that it is attached to; 0: none
+    mount: Array | None = None  # (4, 4) parent from actor [m], of an attached actor
+    stream: int = 0  # id of a sensor's stream
     sensor: Sensor | None = None
     clock: SensorClock | None = None
-    light: int | None = None  # row of its approach, of a traffic light
-    sign: str = ""  # its id in the map, of a traffic sign
+    light: int | None = None  # row of a traffic light's approach
+    sign: str = ""  # id of a traffic sign in the map
     box: BoundingBox | None = None  # of a traffic light or sign
-    motion: Sequence[wire.Vector] = STILL  # CARLA's velocity, angular velocity, acceleration
+    motion: Sequence[wire.Vector] = STILL  # CARLA's velocity [m/s], angular velocity [deg/s], acceleration [m/s^2]
     control: wire.VehicleControl = STANDING
     walk: wire.WalkerControl = WAITING
     ackermann: wire.AckermannControl | None = None
-    sticky: bool = True  # keeps its control; else it has one for a tick alone
-    told: bool = False  # has got a control since the last tick
-    limit_kmh: float = FIRST_LIMIT_KMH  # of speed, by the last sign that it passed
+    sticky: bool = True  # it keeps its control; otherwise a control holds for one tick
+    told: bool = False  # it has received a control since the last tick
+    limit_kmh: float = FIRST_LIMIT_KMH  # speed limit by the last sign that it passed [km/h]
     lamps: int = 0  # flags of a vehicle's lamps
-    simulated: bool = True
-    falling: bool = True
-    guided_s: float = 0.0  # time at which its AI last placed a walker
-    constant: Array | None = None  # (3,) velocity that is kept up, in the body's frame [m/s]
+    simulated: bool = True  # with physics
+    falling: bool = True  # with gravity
+    guided_s: float = 0.0  # simulation time at which a walker was last placed by its AI [s]
+    constant: Array | None = None  # (3,) velocity that is kept constant, body frame [m/s]
     events: list[bytes] = field(default_factory=list)
 
     @property
     def kind(self) -> str:
-        """The first part of its blueprint's name."""
+        """The kind of actor: the first part of its blueprint's name."""
         return self.description.id.partition(".")[0]
 
     @property
     def lift(self) -> float:
-        """The height of its origin above its underside [m]: CARLA's walkers have theirs in the middle."""
+        """The height of its origin above its underside [m]: the origin of CARLA's walkers is their centre."""
         return self.size[2] / 2 if self.category == "pedestrian" else 0.0
 
     def bounding_box(self) -> BoundingBox:
-        """Return its box in its own frame."""
+        """Return its bounding box in the actor frame [m]."""
         if self.box is not None:
             return self.box._replace(actor_id=self.id)
         length, width, height = self.size
@@ -105,7 +105,7 @@ class ServedActor:
         return BoundingBox(middle, (length / 2, width / 2, height / 2), actor_id=self.id)
 
     def record(self, port: int) -> wire.ActorRecord:
-        """Return it as clients get it; `port` is that of the streams."""
+        """Return the record of the actor that clients receive; `port` is the streams' port."""
         token = wire.pack_token(self.stream, port) if self.stream else b""
         return wire.ActorRecord(self.id, self.parent, self.description, self.bounding_box(), self.tags(), token)
 
@@ -121,7 +121,7 @@ class ServedActor:
         return bytes([SEMANTICS[names.get(self.category, self.category)]])
 
     def take(self, place: ActorPose) -> None:
-        """Take a place; the origin of a walker is its middle, `lift` above its feet."""
+        """Take over a pose and motion; the origin of a walker is raised by `lift` to its centre."""
         self.pose, self.motion = place.pose, place.motion
         raised = self.lift * self.pose[:3, 2]
         self.pose[:3, 3] += raised
@@ -130,7 +130,7 @@ class ServedActor:
 
 
 def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[ActorPose]:
-    """Return the places of the first `count` actors of a snapshot; the parked ones are its last."""
+    """Return the poses and motions of the first `count` actors of a snapshot; parked vehicles are its last."""
     trace = snapshot.trace
     tilt, yaw, position = trace.tilts(0)[:count], trace.yaw[0, :count], trace.position[0, :count]
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -148,31 +148,34 @@ def list_places(snapshot: Snapshot, frame: MapFrame, count: int) -> list[ActorPo
     return [ActorPose(pose, location, rotation, motion) for pose, (location, rotation, *motion) in zip(poses, rows)]
 
 
-PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # accelerations that full pedals give
-SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # at which an automatic gearbox takes the next gear
-SETTLE_S = 0.5  # time in which a difference of speed is to be made up
+PULL_MPS2, BRAKE_MPS2 = 4.0, 8.0  # acceleration and deceleration at full pedals
+SHIFT_KMH = (20.0, 40.0, 60.0, 85.0, 115.0)  # speeds at which an automatic gearbox shifts up
+SETTLE_S = 0.5  # time constant of the speed controller
 STOPPED_MPS = 0.05
 
 
 def choose_gear(control: VehicleControl, speed_mps: float) -> int:
-    """Return the gear of a vehicle: the driver's, or that of an automatic gearbox at its speed."""
+    """Return the gear of a vehicle: the manual one, or that of an automatic gearbox at its speed [m/s]."""
     if control.manual:
         return control.gear
     return -1 if control.reverse else 1 + int(np.searchsorted(SHIFT_KMH, 3.6 * abs(speed_mps)))
 
 
 def find_grip(box: ServedActor, point: Array) -> float | None:
-    """Return the share of a dry road's friction in a box of friction; None where `point` (3,) is not in the box."""
-    told = {each.id: float(each.value) for each in box.description.attributes if each.type == FLOAT}
-    half = [told[f"extent_{axis}"] / 100 for axis in "xyz"]
+    """Return the friction, over that of a dry road, in a friction trigger; None if `point` (3,) [m] is outside."""
+    values = {
+        attribute.id: float(attribute.value) for attribute in box.description.attributes if attribute.type == FLOAT
+    }
+    half = [values[f"extent_{axis}"] / 100 for axis in "xyz"]
     inside = np.abs(box.pose[:3, :3].T @ (point - box.pose[:3, 3])) <= half
-    return min(told["friction"], 1.0) if inside.all() else None
+    return min(values["friction"], 1.0) if inside.all() else None
 
 
 def list_grips(actors: Collection[ServedActor], bodies: Iterable[ControlledBody]) -> list[Grip]:
-    """Return how the tyres of vehicles hold, by the last box of friction that each is in, where that has changed."""
+    """Return the changed grips of vehicles; a vehicle has that of the last friction trigger that contains it."""
     known = {actor.name: actor for actor in actors if actor.kind == "vehicle"}
-    boxes, changed = [actor for actor in actors if actor.description.id == TRIGGER], []
+    boxes = [actor for actor in actors if actor.description.id == TRIGGER]
+    changed = []
     for body in bodies:
         if (actor := known.get(body.name)) is not None:
             shares = [share for box in boxes if (share := find_grip(box, actor.pose[:3, 3])) is not None]
@@ -185,7 +188,10 @@ def list_grips(actors: Collection[ServedActor], bodies: Iterable[ControlledBody]
 def steer_towards(
     told: AckermannControl, now: VehicleControl, speed_mps: float, limit_rad: float, dt_s: float
 ) -> VehicleControl:
-    """Return the control of a vehicle with the greatest steering angle `limit_rad` at `speed_mps`, for one step."""
+    """Return a vehicle's control for one step of `dt_s` [s] that follows an Ackermann control (speed P controller).
+
+    `speed_mps` is the present speed [m/s], `limit_rad` the greatest steering angle [rad].
+    """
     steer = min(max(told.steer / limit_rad, -1.0), 1.0)
     if told.steer_speed > 0:
         most = told.steer_speed / limit_rad * dt_s
@@ -209,7 +215,7 @@ STEERING = [[0.0, 1.0], [20.0, 0.9], [120.0, 0.7]]  # share of the angle over th
 
 
 def describe_physics(vehicle: ServedActor, world: LiveWorld) -> list[Any]:
-    """Return a vehicle's physics: those of its size, and CARLA's defaults for what plays no part here."""
+    """Return a vehicle's physics control: values by its size, and CARLA's defaults for those without effect here."""
     made = make_blueprint(vehicle.category, 0, vehicle.size)
     steer = float(np.degrees(made.steer_limit_rad))
     wheels = []
@@ -227,7 +233,7 @@ def describe_physics(vehicle: ServedActor, world: LiveWorld) -> list[Any]:
 
 
 def describe_telemetry(vehicle: ServedActor, speed_mps: float) -> list[Any]:
-    """Return a vehicle's telemetry."""
+    """Return a vehicle's telemetry at its speed [m/s], as packed for clients."""
     control = vehicle.control
     wheel = [3.5] + [0.0] * 10
     return [speed_mps, control.steer, control.throttle, control.brake, 1000.0, max(control.gear, 1), 0.3, [wheel] * 4]

@@ -1,8 +1,8 @@
-"""Blueprints: the actors that can be spawned with their attributes, and the check of a client's description of one.
+"""Blueprints: the actors that can be spawned, with their attributes, and the check of a client's actor description.
 
 Names, attributes and their defaults are those of CARLA 0.9.16's documentation, "Blueprint library" and "Sensors
-reference", in the table `attributes.csv`; without limits a number is within a million. The table `bodies.csv` has what
-stands for vehicles and props here: half extents are those of CARLA's bounding boxes, but for the widths of
+reference", in the table `attributes.csv`; numbers without limits must be within a million. The table `bodies.csv` maps
+vehicles and props to shapes of flcav: half extents are those of CARLA's bounding boxes, except for the widths of
 two-wheelers, which CARLA makes too narrow or 0.
 """
 
@@ -22,19 +22,19 @@ from flcav.world.shapes import SHAPES
 
 
 class Quality(StrEnum):
-    """How colour images are drawn where clients do not choose."""
+    """Default rendering quality of colour images."""
 
     HIGH = "high"
-    LOW = "low"  # with a quarter of the rays: half of the columns and rows, between which colours are interpolated
+    LOW = "low"  # a quarter of the rays: every second column and row, with interpolated colours between
 
 
 class BodyShape(NamedTuple):
-    """What stands for a blueprint of a vehicle or prop: a shape of the town's actors, scaled to a size."""
+    """The body of a vehicle's or prop's blueprint: a shape of the town's actors, scaled to a size."""
 
     category: str  # of `flcav.world.shapes`, or "prop"
     shape: str  # its name among those of the category, of a prop among `CLUTTER`
     extent: tuple[float, float, float]  # half of length, width, height [m]
-    generation: str
+    generation: str  # CARLA's generation
     special: str  # CARLA's special_type
 
 
@@ -60,7 +60,7 @@ TYPES = {"bool": BOOL, "int": INT, "float": FLOAT, "string": STRING}
 
 
 class Field(NamedTuple):
-    """An attribute of a kind of sensor: its default, and the values that are served."""
+    """An attribute of a blueprint: its type, default, and range of served values."""
 
     type: int
     default: str
@@ -69,7 +69,7 @@ class Field(NamedTuple):
 
 
 def _read_fields(served: str) -> dict[str, dict[str, Field]]:
-    """Return the attributes of the blueprints that are "sensor", "other", or "no": not `served`."""
+    """Return blueprint -> attribute -> field from the rows of `attributes.csv` with this value of `served`."""
     found: dict[str, dict[str, Field]] = {}
     for row in _read_rows("attributes.csv"):
         if row["served"] == served:
@@ -81,8 +81,8 @@ def _read_fields(served: str) -> dict[str, dict[str, Field]]:
 
 
 SENSORS = _read_fields("sensor")
-OTHERS = _read_fields("other")  # an actor that nobody sees, and a box in which tyres hold by another friction
-NOT_SERVED = _read_fields("no")  # listed, so that scripts find them, and refused when one is to be spawned
+OTHERS = _read_fields("other")  # an invisible actor, and a trigger volume with another friction
+NOT_SERVED = _read_fields("no")  # listed, so that scripts find them, but refused when spawned
 TRIGGER = "static.trigger.friction"
 COLOURS = ("17,37,103", "107,18,14", "180,180,180", "25,25,25", "230,230,230")
 TRUE = ("true", "1")
@@ -91,28 +91,28 @@ LARGEST_INT = 2**31
 
 
 class CallRefused(ValueError):
-    """The error of a call that cannot be carried out; its text is the reply."""
+    """A call that cannot be carried out; the message is sent to the client."""
 
 
 @dataclass(frozen=True)
 class CarlaBlueprint:
-    """Something that can be spawned."""
+    """A blueprint: a kind of actor that can be spawned."""
 
     definition: wire.Definition
-    fields: dict[str, Field]  # the limits of a sensor's attributes
-    category: str = ""  # of the town's actors, or "prop"; empty for what has no body
-    shape: int = 0  # its row among those
+    fields: dict[str, Field]  # types and ranges of a sensor's attributes
+    category: str = ""  # of the town's actors, or "prop"; empty without a body
+    shape: int = 0  # row among the shapes of the category
     size: tuple[float, float, float] = (0.0, 0.0, 0.0)  # length, width, height [m]
 
     @property
     def kind(self) -> str:
-        """The first part of its name: vehicle, walker, static, sensor or controller."""
+        """The kind of actor, the first part of its name: vehicle, walker, static, sensor or controller."""
         return self.definition.id.partition(".")[0]
 
 
 @cache
 def list_blueprints(quality: Quality = Quality.HIGH) -> dict[str, CarlaBlueprint]:
-    """Return all blueprints by name; below high quality colour cameras have an attribute of that name."""
+    """Return all blueprints by name; below high quality, colour cameras have an attribute "quality"."""
     found: list[CarlaBlueprint] = []
 
     def add(name: str, variations: list[wire.Variation], fields: dict[str, Field] | None = None, **body) -> None:
@@ -132,10 +132,10 @@ def list_blueprints(quality: Quality = Quality.HIGH) -> dict[str, CarlaBlueprint
         add_body(f"walker.pedestrian.{number:04d}", _walker(number, kind), body)
     add("controller.ai.walker", [_free("role_name", STRING, "default")])
     for name, fields in (SENSORS | OTHERS | NOT_SERVED).items():
-        told = [_free("role_name", STRING, "front"), _free("ros_name", STRING, name)]
+        common = [_free("role_name", STRING, "front"), _free("ros_name", STRING, name)]
         if name == "sensor.camera.rgb" and quality != Quality.HIGH:
-            told.append(wire.Variation("quality", STRING, quality, tuple(Quality), True, True))
-        add(name, [*(_free(key, field.type, field.default) for key, field in fields.items()), *told], fields)
+            common.append(wire.Variation("quality", STRING, quality, tuple(Quality), True, True))
+        add(name, [*(_free(key, field.type, field.default) for key, field in fields.items()), *common], fields)
     for name, body in BODIES.items():
         if body.category == "prop":
             add_body(name, [_fixed("size", STRING, "medium"), _free("role_name", STRING, "prop")], body)
@@ -145,7 +145,10 @@ def list_blueprints(quality: Quality = Quality.HIGH) -> dict[str, CarlaBlueprint
 def check_description(
     description: wire.Description, quality: Quality = Quality.HIGH
 ) -> tuple[CarlaBlueprint, wire.Description]:
-    """Return the blueprint of a description and the description with all attributes; raises `CallRefused`."""
+    """Return the blueprint of a description, and the description completed with default attributes.
+
+    Raises `CallRefused` for an unknown blueprint, one that is not served, and an invalid value.
+    """
     known = list_blueprints(quality)
     blueprint = known.get(description.id)
     if blueprint is None:
@@ -182,11 +185,11 @@ def _check_value(name: str, variation: wire.Variation, field: Field | None, valu
 
 
 def read_paint(description: wire.Description) -> wire.Vector | None:
-    """Return the linear RGB of the attribute "color" of a checked description, of sRGB; None where it has none."""
-    told = next((each.value for each in description.attributes if each.type == COLOUR), None)
-    if told is None:
+    """Return the attribute "color" (sRGB) of a checked description as linear RGB in [0, 1]; None without one."""
+    colour = next((attribute.value for attribute in description.attributes if attribute.type == COLOUR), None)
+    if colour is None:
         return None
-    red, green, blue = ((int(part) / 255) ** GAMMA for part in told.split(","))
+    red, green, blue = ((int(part) / 255) ** GAMMA for part in colour.split(","))
     return red, green, blue
 
 
@@ -209,7 +212,7 @@ def _fixed(name: str, kind: int, value: str) -> wire.Variation:
 
 def _vehicle(name: str, body: BodyShape) -> list[wire.Variation]:
     two = body.category in ("motorcycle", "bicycle")
-    told = [
+    variations = [
         _free("role_name", STRING, "autopilot", "scenario", "ego_vehicle"),
         _free("ros_name", STRING, name),
         _free("sticky_control", BOOL, "true"),
@@ -223,10 +226,10 @@ def _vehicle(name: str, body: BodyShape) -> list[wire.Variation]:
         _fixed("has_dynamic_doors", BOOL, "false"),
     ]
     first = crc32(name.removeprefix("vehicle.").encode()) % len(COLOURS)  # makes differ where clients choose none
-    told.append(_free("color", COLOUR, *COLOURS[first:], *COLOURS[:first]))
+    variations.append(_free("color", COLOUR, *COLOURS[first:], *COLOURS[:first]))
     if two:
-        told.append(_free("driver_id", INT, "0"))
-    return told
+        variations.append(_free("driver_id", INT, "0"))
+    return variations
 
 
 def _walker(number: int, kind: str) -> list[wire.Variation]:

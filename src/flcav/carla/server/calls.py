@@ -1,7 +1,7 @@
 """The remote procedure calls of CARLA 0.9.16's clients.
 
-A method of `Calls` is the call of its name: its annotations are the types on the wire, and what it returns is the value
-of the reply. `CallRefused` is the reply's error.
+A method of `Calls` handles the call of the same name: its annotations are the types on the wire, and its result is the
+value of the reply. A `CallRefused` becomes the reply's error. Vectors are in CARLA's left-handed frame.
 """
 
 from collections.abc import Callable
@@ -29,19 +29,19 @@ TIMES = {"green": 0, "yellow": 1, "red": 2}
 
 
 class Calls:
-    """The calls on one server: its settings and its episode."""
+    """The calls that a server handles, with its settings and its episode."""
 
     def __init__(
         self, maps: Maps, name: str, *, seed: int, traffic: int, port: int, quality: Quality = Quality.HIGH
     ) -> None:
-        """Load the first map; raises `InputError` where there is none of this name."""
+        """Load the first map. Raises `InputError` for an unknown name."""
         self.maps, self._seed, self._traffic, self._port = maps, seed, traffic, port
         self._quality = quality
         self._counters = Counters()
         self._managers: dict[int, tuple[str, int]] = {}  # Traffic Managers of clients, by port
         self.settings = wire.EpisodeSettings()
-        self.ticks = 0  # cues that are not yet served
-        self.expected: set[int] = set()  # streams that a client is about to listen to
+        self.ticks = 0  # tick cues that are still to be executed
+        self.expected: set[int] = set()  # ids of streams that a client is about to subscribe to
         self.episode = self._start(name)
 
     def _start(self, name: str) -> Episode:
@@ -62,21 +62,21 @@ class Calls:
 
     @property
     def managed(self) -> bool:
-        """Whether a Traffic Manager of a client runs."""
+        """Whether a client's Traffic Manager is running."""
         return bool(self._managers)
 
     # ---- connection
 
     def version(self) -> str:
-        """Return the version of CARLA that is served."""
+        """Return the served version of CARLA."""
         return wire.VERSION
 
     def get_episode_info(self) -> wire.Packed:
-        """Return the episode's number and the token of the world's state."""
+        """Return the episode's id and the token of the stream of world states."""
         return [self.episode.id, [wire.pack_token(self.episode.stream, self._port + 1)]]
 
     def get_sensor_token(self, stream: int) -> wire.Packed:
-        """Return the token of a stream."""
+        """Return the token of a sensor's stream."""
         streams = {actor.stream for actor in self.episode.actors.values()} | {self.episode.stream}
         if stream not in streams:
             raise CallRefused(f"no sensor sends on stream {shorten(str(stream))}")
@@ -88,26 +88,26 @@ class Calls:
         return [f"Carla/Maps/{self.episode.served.name}", self.episode.spawn_points]
 
     def get_map_data(self) -> str:
-        """Return the map's OpenDRIVE text."""
+        """Return the map as OpenDRIVE text."""
         return self.episode.served.opendrive
 
     def get_required_files(self, folder: str, download: wire.Packed = None) -> wire.Packed:
-        """Return the files of a folder that a client should fetch: of "Nav" the navigation mesh."""
+        """Return the files of a folder that a client should download: for "Nav" the navigation mesh."""
         return [self._mesh_name()] if folder == "Nav" and self.episode.served.mesh else []
 
     def request_file(self, name: str) -> bytes:
-        """Return such a file."""
+        """Return the content of a required file."""
         if name != self._mesh_name():
             raise CallRefused(f"no file {shorten(name)} on this server")
         return self.episode.served.mesh
 
     def _mesh_name(self) -> str:
-        """Return the mesh's name in the clients' cache, another one for another mesh."""
+        """Return the mesh's file name in the clients' cache, which contains a hash of the mesh."""
         served = self.episode.served
         return f"Nav/{served.name}-{sha256(served.mesh).hexdigest()[:16]}.bin"
 
     def get_navigation_mesh(self) -> bytes:
-        """Return the mesh on which the client's walkers walk."""
+        """Return the navigation mesh of the client's walkers."""
         return self.episode.served.mesh
 
     def get_available_maps(self) -> wire.Packed:
@@ -115,7 +115,7 @@ class Calls:
         return [f"/Game/Carla/Maps/{name}" for name in self.maps.names()]
 
     def load_new_episode(self, name: str, reset: bool, layers: int) -> None:
-        """Load a map; an empty name loads the present one again."""
+        """Load a map; an empty name reloads the current one."""
         wanted = name.rpartition("/")[2] or self.episode.served.name
         try:
             episode = self._start(wanted)
@@ -127,24 +127,24 @@ class Calls:
             self.settings = wire.EpisodeSettings()
 
     def copy_opendrive_to_file(self, text: str, parameters: wire.Packed) -> None:
-        """Take the text of a map that is to be loaded next."""
+        """Receive the OpenDRIVE text of the map that is loaded next."""
         try:
             self.maps.receive(text)
         except InputError as error:
             raise CallRefused(f"this OpenDRIVE map cannot be driven: {error}") from None
 
     def load_map_layer(self, layers: int) -> None:
-        """Show layers of the map: all always show."""
+        """Show map layers: no effect, all are always shown."""
 
     def unload_map_layer(self, layers: int) -> None:
-        """Hide layers of the map: the town has one, which always shows."""
+        """Hide map layers: no effect, all are always shown."""
 
     def get_episode_settings(self) -> wire.Packed:
-        """Return the settings."""
+        """Return the episode settings."""
         return self.settings.packed()
 
     def set_episode_settings(self, settings: wire.EpisodeSettings) -> int:
-        """Change the settings; return the frame."""
+        """Change the episode settings; return the current frame number."""
         low, high = DT_RANGE_S
         if settings.fixed_dt_s is not None and settings.fixed_dt_s and not low <= settings.fixed_dt_s <= high:
             raise CallRefused(f"fixed_delta_seconds = {settings.fixed_dt_s:g}: must be within {low} and {high}")
@@ -152,7 +152,7 @@ class Calls:
         return self._counters.frame
 
     def tick_cue(self) -> int:
-        """Cue a tick; return the frame that it leads to."""
+        """Request a tick; return the frame number that it leads to."""
         self.ticks += 1
         return self._counters.frame + self.ticks
 
@@ -167,7 +167,7 @@ class Calls:
         return self._record(self.episode.spectator)
 
     def get_actors_by_id(self, numbers: tuple[int, ...]) -> wire.Packed:
-        """Return actors; those that are no more are left out."""
+        """Return the records of actors by id; destroyed ones are left out."""
         known = self.episode.actors
         return [self._record(known[number]) for number in numbers if number in known]
 
@@ -175,7 +175,7 @@ class Calls:
         return actor.record(self._port + 1)
 
     def spawn_actor(self, description: wire.Description, transform: Transform) -> wire.Packed:
-        """Spawn an actor."""
+        """Spawn an actor; return its record."""
         return self._record(self.episode.spawn(description, transform))
 
     def spawn_actor_with_parent(
@@ -186,7 +186,7 @@ class Calls:
         attachment: int,
         socket: wire.Packed = "",
     ) -> wire.Packed:
-        """Spawn an actor on another one; it is always rigid."""
+        """Spawn an actor attached to another one; the attachment is always rigid."""
         return self._record(self.episode.spawn(description, transform, parent))
 
     def destroy_actor(self, actor: int) -> bool:
@@ -195,16 +195,16 @@ class Calls:
         return True
 
     def set_actor_location(self, actor: int, location: Vector) -> None:
-        """Move an actor."""
+        """Set an actor's location [m], keeping its rotation."""
         found = self.episode.find(actor)
         self.episode.place(found, found.transform._replace(location=location))
 
     def set_actor_transform(self, actor: int, transform: Transform) -> None:
-        """Place an actor."""
+        """Set an actor's transform."""
         self.episode.place(self.episode.find(actor), transform)
 
     def set_walker_state(self, actor: int, transform: Transform, speed: float) -> None:
-        """Place a walker that walks at a speed; its location is that of its feet, which the ground is put under."""
+        """Set the transform and speed [m/s] of a walker; the location is that of its feet, moved onto the ground."""
         walker = self.episode.body(actor, "walker")
         east, north, height = self.episode.served.frame.from_location(transform.location).tolist()
         x, y, z = transform.location
@@ -216,49 +216,49 @@ class Calls:
         walker.guided_s = self.episode.time_s
 
     def set_actor_target_velocity(self, actor: int, velocity: Vector) -> None:
-        """Give an actor a velocity [m/s]."""
+        """Set an actor's velocity [m/s]."""
         self.episode.push(self.episode.body(actor, *BODIES), mirror(np.array(velocity)))
 
     def set_actor_target_angular_velocity(self, actor: int, rate: Vector) -> None:
-        """Give an actor an angular velocity [deg/s]; about the vertical axis alone."""
+        """Set an actor's yaw rate: the vertical component of the angular velocity `rate` [deg/s]."""
         self._turn(self.episode.body(actor, *BODIES), float(mirror_spin(np.radians(rate))[2]))
 
     def enable_actor_constant_velocity(self, actor: int, velocity: Vector) -> None:
-        """Keep up a vehicle's velocity [m/s] in its own frame."""
+        """Keep a vehicle's velocity [m/s], in the vehicle frame, constant."""
         self.episode.body(actor, "vehicle").constant = mirror(np.array(velocity))
 
     def disable_actor_constant_velocity(self, actor: int) -> None:
-        """Let a vehicle be driven again."""
+        """Return a vehicle to its controls."""
         self.episode.body(actor, "vehicle").constant = None
 
     def add_actor_impulse(self, actor: int, impulse: Vector) -> None:
-        """Apply an impulse [N s]."""
+        """Apply an impulse [N s] to an actor."""
         body = self.episode.body(actor, *BODIES)
         velocity, _ = self.episode.motion(body)
         self.episode.push(body, velocity + mirror(np.array(impulse)) / self._mass(body))
 
     def add_actor_force(self, actor: int, force: Vector) -> None:
-        """Apply a force [N] during a tick."""
+        """Apply a force [N] to an actor for one tick."""
         x, y, z = force
         self.add_actor_impulse(actor, (x * self.dt_s, y * self.dt_s, z * self.dt_s))
 
     def add_actor_impulse_at_location(self, actor: int, impulse: Vector, location: Vector) -> None:
-        """Apply an impulse, as if in the middle of the actor."""
+        """Apply an impulse [N s] at the centre of the actor, whatever the location."""
         self.add_actor_impulse(actor, impulse)
 
     def add_actor_force_at_location(self, actor: int, force: Vector, location: Vector) -> None:
-        """Apply a force, as if in the middle of the actor."""
+        """Apply a force [N] at the centre of the actor, whatever the location."""
         self.add_actor_force(actor, force)
 
     def add_actor_angular_impulse(self, actor: int, impulse: Vector) -> None:
-        """Apply an angular impulse; about the vertical axis alone."""
+        """Apply the vertical component of an angular impulse [N m s] to an actor."""
         body = self.episode.body(actor, *BODIES)
         inertia = self.episode.world.bodies.find(body.name).blueprint.inertia_kgm2
         _, rate = self.episode.motion(body)
         self._turn(body, rate + float(mirror_spin(np.array(impulse))[2]) / inertia)
 
     def add_actor_torque(self, actor: int, torque: Vector) -> None:
-        """Apply a torque during a tick."""
+        """Apply the vertical component of a torque [N m] to an actor for one tick."""
         x, y, z = torque
         self.add_actor_angular_impulse(actor, (x * self.dt_s, y * self.dt_s, z * self.dt_s))
 
@@ -274,24 +274,24 @@ class Calls:
         self.episode.simulate(self.episode.body(actor, *BODIES), physics=on)
 
     def set_actor_enable_gravity(self, actor: int, on: bool) -> None:
-        """Switch an actor's weight on or off."""
+        """Switch an actor's gravity on or off."""
         self.episode.simulate(self.episode.body(actor, *BODIES), gravity=on)
 
     def set_actor_collisions(self, actor: int, on: bool) -> None:
-        """Switch collisions on; off is not served, but for walkers, for whom their AI asks: they go on colliding."""
+        """Switch collisions on; off is refused, except for walkers, whose AI requests it: they keep colliding."""
         if not on and self.episode.find(actor).kind != "walker":
             raise CallRefused("set_collisions(False) is not served: actors always collide")
 
     def set_actor_dead(self, actor: int) -> None:
-        """Let an actor stop for good."""
+        """Stop an actor permanently."""
         self.episode.simulate(self.episode.body(actor, *BODIES), physics=False)
 
     def set_actor_autopilot(self, actor: int, on: bool, port: wire.Packed = None) -> None:
-        """Note that a Traffic Manager of a client drives a vehicle."""
+        """Accept that a client's Traffic Manager drives a vehicle."""
         self.episode.find(actor, "vehicle", "walker")
 
     def get_actor_bounding_box(self, actor: int) -> BoundingBox:
-        """Return an actor's box; an empty one of who is no more, as a client's Traffic Manager asks for some time."""
+        """Return an actor's bounding box; an empty one if it is destroyed, since Traffic Managers still ask for it."""
         found = self.episode.actors.get(actor)
         return BoundingBox(NOTHING, NOTHING) if found is None else found.bounding_box()
 
@@ -330,12 +330,12 @@ class Calls:
         self.episode.walk(self.episode.body(actor, "walker"), control)
 
     def get_physics_control(self, actor: int) -> wire.Packed:
-        """Return a vehicle's physics."""
+        """Return a vehicle's physics control."""
         vehicle = self.episode.find(actor, "vehicle")
         return describe_physics(vehicle, self.episode.world)
 
     def apply_physics_control(self, actor: int, physics: wire.Packed) -> None:
-        """Set a vehicle's physics, which stays that of its size."""
+        """Set a vehicle's physics control: no effect, the physics follows from its size."""
         self.episode.find(actor, "vehicle")
 
     def get_telemetry_data(self, actor: int) -> wire.Packed:
@@ -344,7 +344,7 @@ class Calls:
         return describe_telemetry(vehicle, self.episode.speed(vehicle))
 
     def show_vehicle_debug_telemetry(self, actor: int, on: bool) -> None:
-        """Show a vehicle's telemetry, for which there is no window."""
+        """Show a vehicle's telemetry: no effect, there is no window."""
         self.episode.find(actor, "vehicle")
 
     def get_vehicle_light_state(self, actor: int) -> wire.Packed:
@@ -361,15 +361,15 @@ class Calls:
         return [[actor.id, actor.lamps] for actor in self.episode.actors.values() if actor.kind == "vehicle"]
 
     def open_vehicle_door(self, actor: int, door: int) -> None:
-        """Open a door, which vehicles here do not have."""
+        """Open a door: refused, vehicles here have none that open."""
         raise CallRefused("open_door is not served: vehicles here have no doors that open")
 
     def close_vehicle_door(self, actor: int, door: int) -> None:
-        """Close a door."""
+        """Close a door: no effect."""
         self.episode.find(actor, "vehicle")
 
     def set_wheel_steer_direction(self, actor: int, wheel: int, angle_deg: float) -> None:
-        """Turn a wheel for show, which is not served."""
+        """Turn a wheel visually: refused."""
         raise CallRefused("set_wheel_steer_direction is not served: wheels follow the steering")
 
     def get_wheel_steer_angle(self, actor: int, wheel: int) -> float:
@@ -389,46 +389,46 @@ class Calls:
         return row
 
     def set_traffic_light_state(self, actor: int, state: int) -> None:
-        """Set a light's state."""
+        """Set a traffic light's state."""
         self.episode.lights.set_state(self.episode.world, self._light(actor), state)
 
     def set_traffic_light_green_time(self, actor: int, seconds: float) -> None:
-        """Set the time that a green light keeps after it was set."""
+        """Set the time [s] for which a light stays green after it was set."""
         self.episode.lights.times_s[self._light(actor)][TIMES["green"]] = seconds
 
     def set_traffic_light_yellow_time(self, actor: int, seconds: float) -> None:
-        """Set the time that a yellow light keeps after it was set."""
+        """Set the time [s] for which a light stays yellow after it was set."""
         self.episode.lights.times_s[self._light(actor)][TIMES["yellow"]] = seconds
 
     def set_traffic_light_red_time(self, actor: int, seconds: float) -> None:
-        """Set the time that a red light keeps after it was set."""
+        """Set the time [s] for which a light stays red after it was set."""
         self.episode.lights.times_s[self._light(actor)][TIMES["red"]] = seconds
 
     def freeze_traffic_light(self, actor: int, frozen: bool) -> None:
-        """Let all lights stand still, as CARLA does."""
+        """Freeze all traffic lights, not only this one, as CARLA does."""
         self._light(actor)
         self.freeze_all_traffic_lights(frozen)
 
     def freeze_all_traffic_lights(self, frozen: bool) -> None:
-        """Let all lights stand still, or go on."""
+        """Freeze or unfreeze all traffic lights."""
         self.episode.lights.frozen = frozen
         self.episode.world.apply(FreezeLights(frozen))
 
     def reset_traffic_light_group(self, actor: int) -> None:
-        """Let the lights of a junction go on with their program."""
+        """Return the lights of a junction to their program."""
         row = self._light(actor)
         self.episode.lights.release(self.episode.world, self.episode.lights.approaches[row].junction)
 
     def reset_all_traffic_lights(self) -> None:
-        """Let all lights go on with their programs."""
+        """Return all lights to their programs."""
         self.episode.lights.release(self.episode.world)
 
     def get_group_traffic_lights(self, actor: int) -> wire.Packed:
-        """Return the numbers of the lights of a junction."""
+        """Return the actor ids of the lights of a junction."""
         return [self.episode.light_number(row) for row in self.episode.lights.group(self._light(actor))]
 
     def get_light_boxes(self, actor: int) -> wire.Packed:
-        """Return the boxes of a light's heads."""
+        """Return the bounding boxes of a traffic light's heads."""
         actor_found = self.episode.find(actor)
         self._light(actor)
         place = to_vector(self.episode.served.frame.to_location(actor_found.pose[:3, 3] + (0.0, 0.0, 2.9)))
@@ -437,19 +437,19 @@ class Calls:
     # ---- Traffic Manager
 
     def is_traffic_manager_running(self, port: int) -> bool:
-        """Return whether a Traffic Manager runs at a port."""
+        """Return whether a Traffic Manager is registered at a port."""
         return port in self._managers
 
     def get_traffic_manager_running(self, port: int) -> wire.Packed:
-        """Return where the Traffic Manager of a port runs."""
+        """Return the host and port of the Traffic Manager at a port."""
         return self._managers.get(port, ("", 0))
 
     def add_traffic_manager_running(self, place: tuple[str, int]) -> bool:
-        """Note where a Traffic Manager runs; return whether its port was free."""
+        """Register a Traffic Manager by host and port; return whether the port was free."""
         return self._managers.setdefault(place[1], place) is place
 
     def destroy_traffic_manager(self, port: int) -> bool:
-        """Forget the Traffic Manager of a port."""
+        """Unregister the Traffic Manager at a port."""
         return self._managers.pop(port, None) is not None
 
     # ---- the world
@@ -467,33 +467,33 @@ class Calls:
         return 9.81
 
     def set_imui_gravity(self, value: float) -> None:
-        """Set the acceleration that an IMU measures at rest, which is not served."""
+        """Set the acceleration that an IMU measures at rest: refused."""
         raise CallRefused("set_imui_sensor_gravity is not served: gravity is 9.81 m/s^2")
 
     def get_all_level_BBs(self, tag: int) -> wire.Packed:
-        """Return the boxes of the town's things with a semantic tag."""
+        """Return the bounding boxes of the town's objects with a semantic tag."""
         return find_boxes(self.episode, tag)
 
     def get_environment_objects(self, tag: int) -> wire.Packed:
-        """Return the town's things with a semantic tag."""
+        """Return the town's objects with a semantic tag."""
         return list_objects(self.episode, tag)
 
     def enable_environment_objects(self, numbers: wire.Packed, on: bool) -> None:
-        """Show things of the town; hiding them is not served."""
+        """Show objects of the town; hiding them is refused."""
         if not on:
             raise CallRefused("enable_environment_objects(False) is not served: the town's things stay")
 
     def get_names_of_all_objects(self) -> wire.Packed:
-        """Return the names of the town's things."""
+        """Return the names of the town's objects."""
         return [row[3] for row in list_objects(self.episode, 0xFF)]
 
     def project_point(self, location: Vector, direction: Vector, distance: float) -> wire.Packed:
-        """Return where a ray meets the town, as an optional labelled point."""
+        """Return the first hit of a ray up to `distance` [m], as an optional labelled point."""
         found = project_ray(self.episode, location, direction, distance)
         return [True, found[0]] if found else [False, [NOTHING, 0]]
 
     def cast_ray(self, start: Vector, end: Vector) -> wire.Packed:
-        """Return where a ray meets the town, as labelled points."""
+        """Return the hits of a ray between two points [m], as labelled points."""
         way = np.subtract(end, start)
         length = float(np.linalg.norm(way))
         return project_ray(self.episode, start, tuple(way.tolist()), length) if length else []
@@ -503,16 +503,16 @@ class Calls:
         return []
 
     def update_lights_state(self, client: wire.Packed, lights: wire.Packed, discard: wire.Packed = None) -> None:
-        """Change lights of CARLA's light manager, of which there are none."""
+        """Change lights of CARLA's light manager: no effect, there are none."""
 
     def update_day_night_cycle(self, client: wire.Packed, on: bool) -> None:
-        """Let lamps follow the sun: they always do."""
+        """Switch lamps with the day: no effect, they always follow the sun."""
 
     def draw_debug_shape(self, shape: wire.Packed) -> None:
-        """Draw into the view of the engine's window, which does not exist here."""
+        """Draw a debug shape: no effect, there is no window."""
 
     def start_recorder(self, name: str, additional: bool) -> str:
-        """Begin to record the traffic; return the file on the server."""
+        """Start recording the traffic; return the path of the file on the server."""
         return self.episode.recorder.start(name)
 
     def stop_recorder(self) -> None:
@@ -525,38 +525,38 @@ class Calls:
         return [[]]
 
     def set_bones_transform(self, actor: int, bones: wire.Packed) -> None:
-        """Set a walker's bones, which is not served."""
+        """Set a walker's bones: refused."""
         raise CallRefused("set_bones is not served: walkers here have no bones")
 
     def blend_pose(self, actor: int, share: float) -> None:
-        """Blend a walker's pose, which is not served."""
+        """Blend a walker's pose: refused."""
         raise CallRefused("blend_pose is not served: walkers here have no bones")
 
     def enable_sensor_for_ros(self, sensor: wire.Packed) -> None:
-        """Publish a sensor on ROS 2, which is not served."""
+        """Publish a sensor on ROS 2: refused."""
         raise CallRefused("enable_for_ros is not served")
 
     def disable_sensor_for_ros(self, sensor: wire.Packed) -> None:
-        """Do not publish a sensor on ROS 2."""
+        """Stop publishing a sensor on ROS 2: no effect."""
 
     def is_sensor_enabled_for_ros(self, sensor: wire.Packed) -> bool:
         """Return whether a sensor is published on ROS 2: never."""
         return False
 
     def are_gbuffers_enabled(self, sensor: int) -> bool:
-        """Return whether a camera's G-buffer is sent: never."""
+        """Return whether a camera sends its G-buffer: never."""
         return False
 
     # ---- batches
 
     def apply_batch(self, commands: wire.Packed, tick: bool) -> wire.Packed:
-        """Carry out commands; return an actor's number or an error for each."""
+        """Execute commands in order; return an actor id or an error for every command."""
         answers = [self._carry_out(command) for command in commands] if isinstance(commands, list) else []
         self.ticks += tick
         return answers
 
     def _carry_out(self, command: Any) -> list[Any]:
-        """Return the response to a command of a batch, [[number, fields]]."""
+        """Execute a command of a batch, packed as [[number, fields]], and return its response."""
         try:
             match command:
                 case [[int(number), [int() | list(), *_] as fields]] if 0 <= number < len(wire.COMMANDS):
@@ -592,7 +592,7 @@ def _read_spawn(fields: list[Any]) -> tuple[wire.Description, Transform, int | N
 
 @lru_cache(maxsize=256)
 def _signature(name: str) -> tuple[Callable[..., Any], tuple[Any, ...], int]:
-    """Return a call's method, the types of its arguments, and how many it needs; raises `CallRefused` for no call."""
+    """Return a call's method, argument types and number of required arguments. Raises `CallRefused` if unknown."""
     method = getattr(Calls, name, None)
     if name.startswith("_") or not callable(method) or "return" not in (hints := get_type_hints(method)):
         raise CallRefused(f"{shorten(name)} is not served here")
@@ -601,7 +601,7 @@ def _signature(name: str) -> tuple[Callable[..., Any], tuple[Any, ...], int]:
 
 
 def invoke(calls: Calls, name: str, arguments: tuple[wire.Packed, ...]) -> wire.Packed:
-    """Carry out the call of a name; raises `CallRefused`, `InputError` or `WireError` where that cannot be."""
+    """Execute a call by name. Raises `CallRefused`, `InputError` or `WireError` where it is refused or malformed."""
     method, kinds, least = _signature(name)
     if not least <= len(arguments) <= len(kinds):
         raise wire.WireError(

@@ -1,7 +1,7 @@
-"""The connections of clients: calls out of their bytes, what they may hold of the server, and who listens to streams.
+"""Connections of clients: parsing of calls, limits on a server's resources, and subscribers of streams.
 
-Of connections with unfinished calls the largest one is closed where all are too large; a full server closes the
-connection that has been idle longest; readers who do not keep up are waited for, all at once, and dropped.
+If unfinished calls exceed their total limit, the connection with the largest one is closed; a full server closes the
+connection that has been idle longest; slow readers are awaited together, and dropped if they stay behind.
 """
 
 import asyncio
@@ -17,15 +17,15 @@ import msgpack
 
 from flcav.carla.server.wire import WireError
 
-STUCK_S = 10.0
+STUCK_S = 10.0  # time after which a reader that is behind is dropped
 MOST_CONNECTIONS = 512
-IDLE_S = 10.0  # a full server keeps who has sent or got something since
-MOST_UNFINISHED = 64 << 20  # bytes of calls that have not come to their end, of all connections
-MOST_UNSENT = 1 << 30  # bytes in the buffers of all connections
+IDLE_S = 10.0  # a full server keeps connections that were used within this time
+MOST_UNFINISHED = 64 << 20  # bytes of incomplete calls, of all connections
+MOST_UNSENT = 1 << 30  # bytes in the send buffers of all connections
 LARGEST = 32 << 20  # bytes of a call; the text of a map is the largest
 MOST_ARRAYS = 200_000  # in one call
 
-BACKLOG = 1 << 20  # bytes in a connection's buffer from which its reader is waited for
+BACKLOG = 1 << 20  # bytes in a connection's send buffer from which its reader is awaited
 
 log = logging.getLogger("flcav.carla")
 
@@ -34,19 +34,19 @@ class Connections:
     """The connections of all clients."""
 
     def __init__(self) -> None:
-        self._active: dict[asyncio.StreamWriter, float] = {}  # and when they last sent or got something
-        self._unfinished: dict[asyncio.StreamWriter, int] = {}  # bytes of calls that have not come to their end
+        self._active: dict[asyncio.StreamWriter, float] = {}  # connection -> time of its last use
+        self._unfinished: dict[asyncio.StreamWriter, int] = {}  # bytes of incomplete calls
         self._streams: dict[int, set[asyncio.StreamWriter]] = {}
-        self._told: set[str] = set()  # what the log has told once
+        self._told: set[str] = set()  # keys of refusals that were logged
 
     def tell(self, key: str, message: str) -> None:
-        """Tell the log what was refused, once for each key."""
+        """Log a refusal, once per key."""
         if key not in self._told and len(self._told) < 1000:
             self._told.add(key)
             log.warning("refused: %s", message[:300])
 
     def admit(self, writer: asyncio.StreamWriter) -> bool:
-        """Return whether there is room for a connection, and take it."""
+        """Register a connection; return False, and close it, if the server is full."""
         if len(self._active) >= MOST_CONNECTIONS:
             idlest = min(self._active, key=self._active.__getitem__)
             if time.monotonic() - self._active[idlest] < IDLE_S:
@@ -60,11 +60,11 @@ class Connections:
         return True
 
     def listen(self, writer: asyncio.StreamWriter, stream: int) -> None:
-        """Let a connection get what is published on a stream."""
+        """Subscribe a connection to a stream."""
         self._streams.setdefault(stream, set()).add(writer)
 
     def note_active(self, writer: asyncio.StreamWriter) -> None:
-        """Note that a connection is in use."""
+        """Record that a connection is in use."""
         self._active[writer] = time.monotonic()
 
     def _drop(self, writer: asyncio.StreamWriter) -> None:
@@ -72,7 +72,7 @@ class Connections:
         self.forget(writer)
 
     def forget(self, writer: asyncio.StreamWriter) -> None:
-        """Close a connection that is over."""
+        """Close a connection and unsubscribe it from all streams."""
         self._active.pop(writer, None)
         self._unfinished.pop(writer, None)
         for stream in [stream for stream, writers in self._streams.items() if writer in writers]:
@@ -82,7 +82,7 @@ class Connections:
         writer.close()
 
     def note_unfinished(self, writer: asyncio.StreamWriter, size: int) -> None:
-        """Note how many bytes of an unfinished call a connection holds; close the largest where they are too many."""
+        """Record the bytes of a connection's incomplete call; close the largest while all together are too many."""
         self._unfinished[writer] = size
         while sum(self._unfinished.values()) > MOST_UNFINISHED:
             largest = max(self._unfinished, key=self._unfinished.__getitem__)
@@ -90,15 +90,15 @@ class Connections:
             self._drop(largest)
 
     def is_heard(self, stream: int) -> bool:
-        """Return whether anybody listens to a stream."""
+        """Return whether a stream has a subscriber."""
         return bool(self._streams.get(stream))
 
     async def await_readers(self, writers: Iterable[asyncio.StreamWriter] | None = None) -> None:
-        """Wait for all readers, or those of `writers`, who are behind, at once; drop those who read nothing more."""
+        """Wait until all slow readers, or those of `writers`, have caught up; drop them after `STUCK_S`."""
         drains = {
-            asyncio.ensure_future(each.drain()): each
-            for each in writers or list(self._active)
-            if _unsent(each) > BACKLOG
+            asyncio.ensure_future(writer_behind.drain()): writer_behind
+            for writer_behind in writers or list(self._active)
+            if _unsent(writer_behind) > BACKLOG
         }
         if not drains:
             return
@@ -111,7 +111,7 @@ class Connections:
                 self._drop(writer)
 
     async def publish(self, stream: int, payload: bytes) -> None:
-        """Send a payload to all who listen to a stream; wait for readers where too much is unsent."""
+        """Send a payload to all subscribers of a stream; wait for readers if too much is unsent."""
         unsent = sum(map(_unsent, self._active))
         for writer in list(self._streams.get(stream, ())):
             unsent += len(payload)
@@ -123,7 +123,7 @@ class Connections:
                 self.note_active(writer)
 
     async def close(self) -> None:
-        """Close all, and wait until each is forgotten: its reader has come to the end."""
+        """Close all connections, and wait until their readers have ended."""
         for writer in self._active:
             writer.transport.abort()
         while self._active:
@@ -135,34 +135,35 @@ def _unsent(writer: asyncio.StreamWriter) -> int:
 
 
 def send_payload(writer: asyncio.StreamWriter, payload: bytes) -> None:
-    """Send a payload of a stream."""
+    """Send a payload of a stream, prefixed by its length."""
     write(writer, struct.pack("<I", len(payload)) + payload)
 
 
 def write(writer: asyncio.StreamWriter, data: bytes) -> None:
-    """Send bytes, if the client is still there."""
+    """Send bytes if the client is still connected."""
     with suppress(ConnectionError, RuntimeError):
         writer.write(data)
 
 
 class Unpacker:
-    """Reads the calls of one connection: feed it bytes, and iterate; `WireError` and `ValueError` end it.
+    """An incremental parser of one connection's calls: feed it bytes, and iterate over complete calls.
 
-    Of an unfinished call it keeps the bytes alone; `waiting` tells how many. Values are made of whole calls.
+    Of an incomplete call only the bytes are kept, and counted by `waiting`; values are created once it is complete, so
+    that a client cannot make the server hold large nested values. Iteration raises `WireError` or `ValueError`.
     """
 
     def __init__(self) -> None:
-        self._bytes = bytearray()  # of the calls that are not yet read
-        self._begun = 0  # place of the first of them in all that was fed
-        self._skipper = msgpack.Unpacker(max_buffer_size=LARGEST)  # finds where calls end
+        self._bytes = bytearray()  # of calls that are not parsed yet
+        self._begun = 0  # offset of the first of them in the whole input
+        self._skipper = msgpack.Unpacker(max_buffer_size=LARGEST)  # finds the ends of calls
 
     @property
     def waiting(self) -> int:
-        """The number of bytes that belong to calls which are not yet read."""
+        """The number of bytes of calls that are not parsed yet."""
         return len(self._bytes)
 
     def feed(self, data: bytes) -> None:
-        """Add bytes; raises `WireError` for a call beyond `LARGEST`."""
+        """Add bytes. Raises `WireError` for a call beyond `LARGEST`."""
         if len(self._bytes) + len(data) > LARGEST:
             raise WireError(f"a call of more than {LARGEST} bytes")
         self._bytes += data
@@ -184,7 +185,7 @@ class Unpacker:
 
 
 def _unpack(call: bytes) -> Any:
-    """Return the value of a whole call, within bounds of its memory."""
+    """Return the value of a complete call, with bounded memory."""
     arrays = 0
 
     def count(values: list[Any]) -> list[Any]:

@@ -1,6 +1,6 @@
-"""An episode: one map with its live world and actors, from loading it until the next is loaded.
+"""An episode: one map with its live world and actors, until the next map is loaded.
 
-Every tick the world makes a step; then all actors take their places, and the sensors measure.
+In every tick the world makes a step; then all actors take their new poses, and the sensors measure.
 """
 
 import time
@@ -57,7 +57,7 @@ from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.trace import Trace
 
-TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
+TRAFFIC_OF = {  # category -> blueprint of SUMO's traffic for clients
     "car": "vehicle.seat.leon",
     "van": "vehicle.mercedes.sprinter",
     "truck": "vehicle.carlamotors.carlacola",
@@ -66,23 +66,23 @@ TRAFFIC_OF = {  # category -> blueprint by which clients know SUMO's traffic
     "bicycle": "vehicle.gazelle.omafiets",
     "pedestrian": "walker.pedestrian.0001",
 }
-UNGUIDED_S = 0.5  # a walker whose AI has not placed it for so long stands
-PARKED = "parked"  # begins the names of parked vehicles, which are no actors to clients
+UNGUIDED_S = 0.5  # a walker that its AI has not placed for so long stops
+PARKED = "parked"  # prefix of the names of parked vehicles, which are not actors for clients
 NOWHERE = Transform((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
 class Measurement(NamedTuple):
     """A message of a sensor at one tick."""
 
-    stream: int
+    stream: int  # id
     header: bytes
-    body: bytes | Callable[[], bytes]  # or how it is measured
-    rays: bool = False  # it takes rays to measure
-    late: bool = False  # it takes so long that the client need not wait
+    body: bytes | Callable[[], bytes]  # or a function that measures it
+    rays: bool = False  # measured by ray casting
+    late: bool = False  # measured asynchronously: ticks do not wait for it
 
 
 class Episode:
-    """One map, from loading it until the next is loaded."""
+    """One map with its live world and actors, until the next map is loaded."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class Episode:
         port: int,
         quality: Quality = Quality.HIGH,
     ) -> None:
-        """Start the world of a map; `port` is that of the streams, which actors' tokens name."""
+        """Start the world of a map; `port` is the streams' port, which is part of sensors' tokens."""
         self.served, self.counters, self.seed, self.port = served, counters, seed, port
         self._quality = quality
         counters.episode += 1
@@ -119,50 +119,50 @@ class Episode:
         for row, approach in enumerate(self.lights.approaches):
             light = self._add(wire.Description(0, "traffic.traffic_light", ()), approach.pose)
             light.light, light.box = row, approach.box()
-        for each in list_signs(served, signals):
-            sign = self._add(wire.Description(0, each.blueprint, ()), each.pose)
-            sign.sign, sign.box = each.id, each.box
+        for placed in list_signs(served, signals):
+            sign = self._add(wire.Description(0, placed.blueprint, ()), placed.pose)
+            sign.sign, sign.box = placed.id, placed.box
         self.lights.follow(self.world, 0.0)
         self._follow(self.world.snapshot, 0.0)
 
     def warm_up(self) -> None:
-        """Load the compiled code of vehicles, so that no client waits for it."""
+        """Compile the code of vehicle dynamics, so that no client waits for it."""
         with LiveWorld(self.served.town, Settings(parked=False)) as world:
             world.apply(Spawn("car", "car", 0, *self.spectator.pose[:2, 3].tolist(), anywhere=True))
             world.step({"car": Controls(throttle=1.0)})
 
     def prepare(self) -> None:
-        """Build the scenes in which sensors look, and load the compiled code of cameras, so that none need wait.
+        """Build the scenes of the sensors, and compile the code of cameras, so that no client waits for them.
 
-        It may run beside the ticks: pictures are taken in a scene of its own.
+        It may run concurrently with ticks, since it renders in a separate scene.
         """
         for scene in ("images", "rays"):
             build_appearance(self.look(scene)().scene)
-        told = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
-        camera, look = Sensor("sensor.camera.depth", told, 0, self.spectator.pose), self.look("first")
+        attributes = {"image_size_x": "32", "image_size_y": "32", "fov": "90"}
+        camera, look = Sensor("sensor.camera.depth", attributes, 0, self.spectator.pose), self.look("first")
         for sense in (sense_depth, sense_instance, sense_rgb):
             sense(look(), camera)
         self.served.keep()
 
     @property
     def age_s(self) -> float:
-        """The time since the map was loaded [s], by the clock."""
+        """The wall-clock time since the map was loaded [s]."""
         return time.monotonic() - self._begun_s
 
     @cached_property
     def spawn_points(self) -> list[Transform]:
-        """Poses at which there is room for every vehicle while nobody else is there."""
+        """Poses at which there is room for every vehicle in the empty town."""
         return self.served.list_spawn_points(self.world.obstacles.boxes)
 
     def close(self) -> None:
-        """End the world, and write what is recorded."""
+        """Close the world, and write the recording."""
         self.recorder.stop()
         self.world.close()
 
     # ---- actors
 
     def find(self, number: int, *kinds: str) -> ServedActor:
-        """Return an actor; raises `CallRefused` where there is none of this number, or where it is of another kind."""
+        """Return the actor with an id. Raises `CallRefused` for an unknown id or an actor of another kind."""
         actor = self.actors.get(number)
         if actor is None:
             raise CallRefused(f"actor {number} not found")
@@ -171,7 +171,7 @@ class Episode:
         return actor
 
     def spawn(self, description: wire.Description, transform: Transform, parent: int | None = None) -> ServedActor:
-        """Return a new actor, attached to a parent where one is given; raises `CallRefused` where that cannot be."""
+        """Spawn an actor, attached to `parent` if given. Raises `CallRefused` if it is invalid or obstructed."""
         blueprint, description = check_description(description, self._quality)
         carrier = self.find(parent) if parent else None
         if carrier is not None:
@@ -188,7 +188,7 @@ class Episode:
         else:
             actor.parent, actor.mount = carrier.id, from_mount(*transform)
         if blueprint.kind == "sensor":
-            values = {each.id: each.value for each in description.attributes}
+            values = {attribute.id: attribute.value for attribute in description.attributes}
             name = carrier.name if carrier is not None else ""
             actor.sensor = Sensor(description.id, values, self._spawned, pose, name)
             actor.clock = SensorClock(float(values.get("sensor_tick", 0.0)))
@@ -217,7 +217,9 @@ class Episode:
         actor = self._add(description, pose)
         actor.name, actor.category, actor.size = name, blueprint.category, blueprint.size
         actor.parent, actor.paint = parent, read_paint(description)
-        actor.sticky = all(each.id != "sticky_control" or each.value.lower() in TRUE for each in description.attributes)
+        actor.sticky = all(
+            attribute.id != "sticky_control" or attribute.value.lower() in TRUE for attribute in description.attributes
+        )
         self._bodies[name] = actor
         snapshot = self.world.snapshot
         row = snapshot.row(name)
@@ -225,7 +227,7 @@ class Episode:
         return actor
 
     def destroy(self, actor: ServedActor) -> None:
-        """Remove an actor; sensors that it carries stay where they are."""
+        """Remove an actor; attached sensors stay where they are."""
         if actor is self.spectator or actor.kind == "traffic":
             raise CallRefused(f"actor {actor.id} is a {actor.description.id} of the town, which cannot be destroyed")
         del self.actors[actor.id]
@@ -241,17 +243,18 @@ class Episode:
         return actor.name.startswith("c")
 
     def body(self, number: int, *kinds: str) -> ServedActor:
-        """Return an actor that has a body, which clients move from now on; raises `CallRefused` for others."""
+        """Return an actor with a body, and let clients move it from now on. Raises `CallRefused` as `find` does."""
         actor = self.find(number, *kinds)
         self._take_over(actor)
         return actor
 
     def _take_over(self, actor: ServedActor) -> None:
-        """Take an actor out of SUMO's traffic, if it is in it: it goes on as it moves, and clients drive it."""
+        """Turn an actor of SUMO's traffic into a controlled body, with unchanged pose and velocity."""
         if not actor.name or self.is_own(actor):
             return
         snapshot = self.world.snapshot
-        trace, row = snapshot.trace, snapshot.row(actor.name)
+        trace = snapshot.trace
+        row = snapshot.row(actor.name)
         (x, y, z), velocity = trace.position[0, row].tolist(), trace.velocity[0, row]
         yaw, (length, width, height) = float(trace.yaw[0, row]), trace.size[row].tolist()
         shape, size = int(trace.shape[row]), (length, width, height)
@@ -266,7 +269,7 @@ class Episode:
     # ---- motion
 
     def place(self, actor: ServedActor, transform: Transform) -> None:
-        """Move an actor to another pose."""
+        """Move an actor to a transform, which is relative to the parent if it is attached."""
         self._take_over(actor)
         pose = self.served.frame.from_transform(*transform)
         if actor.parent and actor.mount is not None:
@@ -283,7 +286,7 @@ class Episode:
             self.world.apply(commands.Place(actor.name, x, y, -yaw, z - actor.lift, -pitch, roll))
 
     def drive(self, actor: ServedActor, control: wire.VehicleControl) -> None:
-        """Set a vehicle's pedals and steering wheel."""
+        """Set a vehicle's throttle, brakes, steering and gear."""
         actor.control, actor.told = control, True
         self.world.apply(
             Drive(
@@ -299,7 +302,7 @@ class Episode:
         )
 
     def walk(self, actor: ServedActor, control: wire.WalkerControl) -> None:
-        """Set a walker's direction and speed; it walks by them also where its AI had switched its physics off."""
+        """Set a walker's direction and speed; this switches on its physics if its AI has switched them off."""
         if not actor.simulated:
             self.simulate(actor, physics=True)
         actor.walk = control
@@ -313,18 +316,18 @@ class Episode:
         self.world.apply(commands.Place(actor.name, x, y, yaw, z - actor.lift))
 
     def motion(self, actor: ServedActor) -> tuple[Array, float]:
-        """Return the velocity (3,) [m/s], in the town's frame, and the yaw rate [rad/s] that an actor has by now."""
+        """Return the current velocity (3,) [m/s], world frame, and yaw rate [rad/s] of an actor with a body."""
         bodies = self.world.bodies
         row = bodies.row(actor.name)
         return bodies.velocity[row].copy(), float(bodies.yaw_rate[row])
 
     def push(self, actor: ServedActor, velocity: Array, yaw_rate: float | None = None) -> None:
-        """Give an actor another velocity (3,) [m/s] in the town's frame."""
+        """Set the velocity (3,) [m/s], world frame, and the yaw rate [rad/s], None: unchanged, of an actor."""
         x, y, z = velocity.tolist()
         self.world.apply(Push(actor.name, (x, y, z), yaw_rate))
 
     def simulate(self, actor: ServedActor, *, physics: bool | None = None, gravity: bool | None = None) -> None:
-        """Switch an actor's physics or weight on or off."""
+        """Switch an actor's physics or gravity on or off; None keeps it."""
         actor.simulated = actor.simulated if physics is None else physics
         actor.falling = actor.falling if gravity is None else gravity
         self.world.apply(Simulate(actor.name, actor.simulated, actor.falling))
@@ -332,7 +335,7 @@ class Episode:
     # ---- ticks
 
     def step(self, dt_s: float) -> None:
-        """Let the world go on by one tick of `dt_s`."""
+        """Advance the world by one tick of `dt_s` [s]."""
         for actor in self._bodies.values():
             if actor.constant is not None:
                 self.push(actor, actor.pose[:3, :3] @ actor.constant)
@@ -369,7 +372,7 @@ class Episode:
         return float(mirror(np.array(actor.motion[0])) @ actor.pose[:3, 0])
 
     def _follow(self, snapshot: Snapshot, dt_s: float) -> None:
-        """Take the places of all actors from the world."""
+        """Update the poses and motions of all actors, and the set of SUMO's actors, from a snapshot."""
         names = [name for name in snapshot.trace.actor.tolist() if not name.startswith(PARKED)]
         places = list_places(snapshot, self.served.frame, len(names))
         for row, name in enumerate(names):
@@ -390,12 +393,18 @@ class Episode:
                     actor.sensor.spin, actor.sensor.acceleration = mirror_spin(np.radians(spin)), mirror(acceleration)
 
     def _meet(self, snapshot: Snapshot, row: int) -> ServedActor:
-        """Return the actor of one of SUMO's traffic, which has come into the town."""
+        """Add the actor of a vehicle or pedestrian of SUMO that has entered the town."""
         category = str(snapshot.trace.category[row])
         blueprint = list_blueprints()[TRAFFIC_OF[category]]
-        told = tuple(wire.Attribute(each.id, each.type, each.value) for each in blueprint.definition.attributes)
-        told = tuple(each._replace(value="traffic") if each.id == "role_name" else each for each in told)
-        actor = self._add(wire.Description(blueprint.definition.uid, blueprint.definition.id, told), np.eye(4))
+        attributes = tuple(
+            wire.Attribute(attribute.id, attribute.type, attribute.value)
+            for attribute in blueprint.definition.attributes
+        )
+        attributes = tuple(
+            attribute._replace(value="traffic") if attribute.id == "role_name" else attribute
+            for attribute in attributes
+        )
+        actor = self._add(wire.Description(blueprint.definition.uid, blueprint.definition.id, attributes), np.eye(4))
         actor.name, actor.category = str(snapshot.trace.actor[row]), category
         length, width, height = snapshot.trace.size[row].tolist()
         actor.size = (length, width, height)
@@ -405,7 +414,7 @@ class Episode:
     # ---- what is sent
 
     def describe_world(self, dt_s: float) -> bytes:
-        """Return the payload of the world's state."""
+        """Return the payload of the world state."""
         header = wire.pack_header(wire.Stream.WORLD, self.counters.frame, self.time_s, NOWHERE)
         vehicles = [actor for actor in self.actors.values() if actor.kind == "vehicle"]
         states = dict(zip((actor.id for actor in vehicles), self._find_lights(vehicles)))
@@ -416,7 +425,7 @@ class Episode:
         return header + wire.pack_world(self.id, time.time(), dt_s, rows)
 
     def _find_lights(self, vehicles: list[ServedActor]) -> list[int]:
-        """Return the rows of the lights at which vehicles stand; -1: none."""
+        """Return the rows of the traffic lights at which vehicles are; -1: none."""
         if not vehicles:
             return []
         poses = np.array([actor.pose for actor in vehicles])
@@ -438,16 +447,17 @@ class Episode:
             return wire.pack_sign(actor.sign)
         if (row := actor.light) is not None:
             green, yellow, red = self.lights.times_s[row]
-            sign, elapsed = self.lights.approaches[row].sign, self.lights.elapsed_s[row]
+            sign = self.lights.approaches[row].sign
+            elapsed = self.lights.elapsed_s[row]
             return wire.pack_light(sign, (green, yellow, red), elapsed, 0, self.lights.frozen, self.lights.state[row])
         return b""
 
     def light_number(self, row: int) -> int:
-        """Return the number of the actor of an approach; lights follow the spectator."""
+        """Return the actor id of an approach's traffic light; the lights' ids follow the spectator's."""
         return self.spectator.id + 1 + row
 
     def measure(self, dt_s: float, is_heard: Callable[[int], bool]) -> Iterator[Measurement]:
-        """Yield what each sensor that is due and heard sends, in the order in which they were spawned."""
+        """Yield the messages of all sensors that are due and subscribed to, in the order of their spawning."""
         looks: dict[str, Callable[[], TownSight]] = {}
         collisions = find_collisions(self.world.snapshot.collisions, self._describe)
         for actor in list(self.actors.values()):
@@ -473,13 +483,13 @@ class Episode:
                 yield Measurement(actor.stream, header, found)
 
     def _describe(self, name: str) -> wire.ActorRecord:
-        """Return the record of an actor, or of a thing of the town, such as "building:3", by its name in the world."""
+        """Return the record of an actor or of an object of the town, such as "building:3", by name in the world."""
         if name in self._bodies:
             return self._bodies[name].record(self.port)
         return describe_thing("vehicle" if name.startswith(PARKED) else name.partition(":")[0])
 
     def look(self, scene: str) -> Callable[[], TownSight]:
-        """Return how to look at the town as it is now, once or more often, later too, with the scene of that name."""
+        """Return a function that renders the town's present state in the named scene; it may be called later."""
         trace, weather, tick = self.world.snapshot.trace, to_weather(self.weather), self.tick
         numbers = [self._bodies[name].id if name in self._bodies else 0 for name in trace.actor.tolist()]
 
@@ -491,11 +501,13 @@ class Episode:
         return sight
 
     def survey(self) -> Scene:
-        """Return the town as calls see it now: a scene of its own, since sensors may be looking at theirs."""
+        """Return the present scene for calls; it is separate, since sensors may be rendering in theirs."""
         return self._follow_with("calls", self.world.snapshot.trace)
 
     def _follow_with(self, name: str, trace: Trace) -> Scene:
-        paints = {own: actor.paint for own, actor in list(self._bodies.items()) if actor.paint is not None}
+        paints = {
+            name_in_world: actor.paint for name_in_world, actor in list(self._bodies.items()) if actor.paint is not None
+        }
         return self._scenes.follow(name, trace, paints)
 
 

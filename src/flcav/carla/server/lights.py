@@ -1,6 +1,6 @@
-"""Traffic lights as CARLA's actors, one for each approach to a light, and signs with their speed limits.
+"""Traffic lights as CARLA's actors, one per approach to a signalised junction, and traffic signs with speed limits.
 
-A light that a client sets keeps its state for the time of that state, then its junction goes on with its program.
+A light that a client sets keeps its state for the time of that state; then its junction returns to its program.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -29,21 +29,21 @@ from flcav.world.opendrive.reference_line import ReferenceLine
 RED, YELLOW, GREEN, OFF, UNKNOWN = 0, 1, 2, 3, 4
 LETTERS_OF = {GREEN: "Gg", YELLOW: "yYu", RED: "rRs", OFF: "oO"}
 STATES = {letter: state for state, letters in LETTERS_OF.items() for letter in letters}
-TIMES_S = (10.0, 3.0, 2.0)  # CARLA's of green, yellow and red
-BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light where its front is so near to the stop line
-ALIGNED_RAD = 1.0
-SIGNS = {"205": "traffic.yield", STOP_SIGN: "traffic.stop"}  # by their types in CARLA's maps, which are Germany's
-LANE_M = 3.5  # width of the volume in which a sign counts
-PASSED_M, BESIDE_M = 10.0, 12.0  # a vehicle that is so far beyond a sign, and beside it, has just passed it
+TIMES_S = (10.0, 3.0, 2.0)  # CARLA's times of green, yellow and red
+BEFORE_M, BEYOND_M = 8.0, 1.0  # a vehicle is at a light if its front is within this of the stop line
+ALIGNED_RAD = 1.0  # largest difference of a vehicle's heading from the direction of a sign or light
+SIGNS = {"205": "traffic.yield", STOP_SIGN: "traffic.stop"}  # by type in CARLA's maps, which use Germany's sign numbers
+LANE_M = 3.5  # width of a sign's trigger volume
+PASSED_M, BESIDE_M = 10.0, 12.0  # a vehicle has just passed a sign within these longitudinal and lateral distances
 
 
 class MapSignal(NamedTuple):
-    """A signal of a map."""
+    """A signal of an OpenDRIVE map: a traffic light or sign, in world coordinates."""
 
     id: str
-    row: ElementTree.Element
+    row: ElementTree.Element  # of the map
     place: Array  # (3,) x, y [m], and the heading of its road [rad]
-    entries: Array  # (K, 2) where roads refer to it, at the beginning of the lanes that it is for [m]
+    entries: Array  # (K, 2) x, y [m] of references to it, at the beginning of the lanes that it controls
 
 
 def list_signals(served: ServedMap) -> list[MapSignal]:
@@ -65,44 +65,45 @@ def list_signals(served: ServedMap) -> list[MapSignal]:
                 signals.append((row, at))
             elif row.tag == "signalReference":
                 entries.setdefault(row.get("id", ""), []).append(at[:2])
-    found = []
+    map_signals = []
     for row, at in signals:
         name = row.get("id", "")
-        found.append(MapSignal(name, row, at, np.array(entries.get(name, [])).reshape(-1, 2)))
-    return found
+        map_signals.append(MapSignal(name, row, at, np.array(entries.get(name, [])).reshape(-1, 2)))
+    return map_signals
 
 
 @dataclass(frozen=True)
 class Approach:
-    """An approach to a traffic light: the lanes of one edge."""
+    """An approach to a signalised junction: the lanes of one edge. World frame."""
 
     junction: str
-    link: str  # "junction:link" of the signal that stands for it
-    links: tuple[int, ...]  # all its links in the junction's letters
+    link: str  # "junction:link" of its representative signal
+    links: tuple[int, ...]  # indices of all its links in the junction's state string
     sign: str  # id of its signal in the map
-    pose: Array  # (4, 4) world from actor: its x axis points across the road
-    stop: Array  # (3,) middle of the stop line: x, y [m] and direction of driving [rad]
+    pose: Array  # (4, 4) world from actor [m]; the x axis points across the road
+    stop: Array  # (3,) middle of the stop line: x, y [m], and driving direction [rad]
     half_width: float  # of its lanes [m]
 
     def box(self) -> BoundingBox:
-        """Return the volume before the stop line in which the light counts, in the frame of its actor."""
+        """Return the light's trigger volume before the stop line, in the actor frame."""
         return _box_before(self.stop, self.half_width, self.pose)
 
 
 def _box_before(line: Array, half_width: float, pose: Array) -> BoundingBox:
-    """Return the volume before a line across the road, x, y [m] and direction of driving [rad], in an actor's frame."""
+    """Return the trigger volume before a line, x, y [m] and driving direction [rad], in the actor frame at `pose`."""
     middle = np.append(line[:2] - 3.0 * heading_vectors(line[2]), pose[2, 3] + 1.0)
     x, y, z = mirror((inverse(pose) @ np.append(middle, 1.0))[:3]).tolist()
     return BoundingBox((x, y, z), (half_width, 2.5, 1.5))
 
 
 def find_approaches(served: ServedMap, signals: Sequence[MapSignal]) -> list[Approach]:
-    """Return the approaches to all lights of a map with these signals, in the net's order."""
+    """Return the approaches to all traffic lights of a map, in the net's order; `signals` are those of the map."""
     imported = served.town.parameters.source is not None  # towns of flcav name their lights by their links
-    mapped = [each for each in signals if imported and each.row.get("type") == TRAFFIC_LIGHT]
-    net, lights = served.net, served.town.signals
+    mapped = [signal for signal in signals if imported and signal.row.get("type") == TRAFFIC_LIGHT]
+    net = served.net
+    lights = served.town.signals
     place = {link: row for row, link in reversed(list(enumerate(lights.link)))}
-    found = []
+    approaches = []
     for name, link in list_approaches(net).items():
         edge = net.edges[name]
         x, y, heading, half_width = _find_stop(edge)
@@ -112,22 +113,22 @@ def find_approaches(served: ServedMap, signals: Sequence[MapSignal]) -> list[App
         head = lights.position[place[link], :2] if link in place else np.array((x, y))
         sign = min(mapped, key=partial(_measure_off, head, np.array((x, y)))).id if mapped else name_signal(link)
         ground = served.town.ground(float(foot[0]), float(foot[1]))
-        found.append(
+        approaches.append(
             Approach(
                 junction=link.rpartition(":")[0],
                 link=link,
-                links=tuple(sorted(int(each.rpartition(":")[2]) for each in ruled)),
+                links=tuple(sorted(int(controlled.rpartition(":")[2]) for controlled in ruled)),
                 sign=sign,
                 pose=pose(float(foot[0]), float(foot[1]), ground, heading - np.pi / 2),
                 stop=np.array((x, y, heading)),
                 half_width=half_width,
             )
         )
-    return found
+    return approaches
 
 
 def _find_stop(edge: Edge) -> tuple[float, float, float, float]:
-    """Return the middle of an edge's stop line x, y, the direction of driving, and half its width."""
+    """Return the middle of an edge's stop line x, y [m], the driving direction [rad], and half its width [m]."""
     lanes = edge.lanes_of("driving")
     ends = np.array([lane.shape[-1] for lane in lanes])
     ahead = lanes[0].shape[-1] - lanes[0].shape[-2]
@@ -136,9 +137,9 @@ def _find_stop(edge: Edge) -> tuple[float, float, float, float]:
 
 
 def _measure_off(head: Array, stop: Array, signal: MapSignal) -> float:
-    """Return how far a signal is from a light [m]: its entries from the stop line, or itself from the light's head.
+    """Return the distance of a signal from a light [m]: of its entries from the stop line, or of itself from the head.
 
-    Lights may hang beyond the junction, next to another stop line.
+    The heads may hang beyond the junction, next to another stop line.
     """
     return float(
         np.hypot(*(signal.entries - stop).T).min() if len(signal.entries) else np.hypot(*(signal.place[:2] - head))
@@ -147,13 +148,13 @@ def _measure_off(head: Array, stop: Array, signal: MapSignal) -> float:
 
 @dataclass(frozen=True)
 class SpeedLimits:
-    """The N speed-limit signs of a map."""
+    """The N speed-limit signs of a map, world frame."""
 
-    place: Array  # (N, 3) x, y [m], and the direction [rad] of those for whom the sign is
-    kmh: Array  # (N,)
+    place: Array  # (N, 3) x, y [m], and driving direction that the sign applies to [rad]
+    kmh: Array  # (N,) limits [km/h]
 
     def find_passed(self, pose: Array) -> float | None:
-        """Return the limit [km/h] of the sign that a vehicle at `pose` (4, 4) has just passed, if any."""
+        """Return the limit [km/h] of the sign that a vehicle at `pose` (4, 4) [m] has just passed, if any."""
         if not len(self.kmh):
             return None
         off = pose[:2, 3] - self.place[:, :2]
@@ -165,7 +166,7 @@ class SpeedLimits:
 
 
 def find_limits(signals: Sequence[MapSignal]) -> SpeedLimits:
-    """Return the speed-limit signs among a map's signals; one that is for both directions stands twice."""
+    """Return the speed-limit signs among a map's signals; a sign for both directions is listed twice."""
     place, kmh = [np.zeros((0, 3))], []
     for _, row, at, _ in signals:
         if (limit := read_limit(row)) is None:
@@ -177,25 +178,25 @@ def find_limits(signals: Sequence[MapSignal]) -> SpeedLimits:
 
 
 def _list_turns(signal: ElementTree.Element) -> tuple[float, ...]:
-    """Return the directions of driving that a signal is for, from that of its road [rad]."""
+    """Return the driving directions that a signal applies to, relative to the road's [rad]."""
     return {"+": (0.0,), "-": (np.pi,)}.get(signal.get("orientation", "none"), (0.0, np.pi))
 
 
 @dataclass(frozen=True)
 class Sign:
-    """A traffic sign that CARLA has as an actor."""
+    """A traffic sign that is an actor in CARLA."""
 
     blueprint: str
     id: str  # in the map
-    pose: Array  # (4, 4) world from actor: its x axis points across the road
-    box: BoundingBox  # in which it counts, in its own frame
+    pose: Array  # (4, 4) world from actor [m]; the x axis points across the road
+    box: BoundingBox  # trigger volume, actor frame
 
 
 def list_signs(served: ServedMap, signals: Sequence[MapSignal]) -> list[Sign]:
-    """Return those of a map's signals that tell to stop or to give way, or a speed limit, in its order."""
+    """Return the stop, yield and speed-limit signs among a map's signals, in its order."""
     lanes = [lane for edge in served.net.streets for lane in edge.lanes_of("driving")]
     lines = shapely.STRtree([LineString(lane.shape) for lane in lanes])
-    found = []
+    signs = []
     for name, signal, at, entries in signals:
         limit, kind = read_limit(signal), SIGNS.get(signal.get("type", ""))
         blueprint = kind if limit is None else f"traffic.speed_limit.{3.6 * limit:.0f}"
@@ -207,12 +208,12 @@ def list_signs(served: ServedMap, signals: Sequence[MapSignal]) -> list[Sign]:
         spots = [_project(lanes[row], here) for row in lines.query(Point(here), "dwithin", BESIDE_M).tolist()]
         ahead = [spot for spot in spots if len(entries) or abs(wrap_angle(spot[2] - heading)) < ALIGNED_RAD]
         line = min(ahead, key=lambda spot: float(np.hypot(*(spot[:2] - here))), default=np.append(here, heading))
-        found.append(Sign(blueprint, name, place, _box_before(line, LANE_M / 2, place)))
-    return found
+        signs.append(Sign(blueprint, name, place, _box_before(line, LANE_M / 2, place)))
+    return signs
 
 
 def _project(lane: Lane, place: Array) -> Array:
-    """Return the nearest place on a lane's middle: x, y [m] and the direction of driving [rad] (3,)."""
+    """Project a point on a lane's centre line: (3,) x, y [m], and driving direction [rad]."""
     line = LineString(lane.shape)
     along = min(line.project(Point(place)), line.length - 0.1)
     here, there = (np.array(line.interpolate(at).coords[0]) for at in (along, along + 0.1))
@@ -221,12 +222,12 @@ def _project(lane: Lane, place: Array) -> Array:
 
 @dataclass
 class LightActors:
-    """The lights of a live world, as clients see and set them."""
+    """The traffic lights of a live world, as clients see and set them."""
 
     approaches: list[Approach]
-    state: list[int] = field(default_factory=list)  # of each approach
-    elapsed_s: list[float] = field(default_factory=list)  # in that state
-    times_s: list[list[float]] = field(default_factory=list)  # of green, yellow and red
+    state: list[int] = field(default_factory=list)  # per approach
+    elapsed_s: list[float] = field(default_factory=list)  # time in that state, per approach [s]
+    times_s: list[list[float]] = field(default_factory=list)  # times of green, yellow and red, per approach [s]
     frozen: bool = False
     _held: dict[str, dict[int, tuple[int, float]]] = field(default_factory=dict)  # junction -> row -> state, until [s]
 
@@ -236,7 +237,7 @@ class LightActors:
         self.times_s = [list(TIMES_S) for _ in self.approaches]
 
     def follow(self, world: LiveWorld, dt_s: float) -> None:
-        """Take the states of the world, after a step of `dt_s`; release what was set long enough."""
+        """Read the states from the world after a step of `dt_s` [s], and release junctions whose set times are over."""
         for junction in [name for name, rows in self._held.items() if not self.frozen and self._is_over(rows, world)]:
             del self._held[junction]
             world.apply(SetLight(junction, None))
@@ -252,7 +253,7 @@ class LightActors:
         return all(until <= world.snapshot.time_s for _, until in rows.values())
 
     def set_state(self, world: LiveWorld, row: int, state: int) -> None:
-        """Set the state of an approach, for the time of that state."""
+        """Set the state of the approach in a row, for the time of that state."""
         approach = self.approaches[row]
         held = self._held.setdefault(approach.junction, {})
         green, yellow, red = self.times_s[row]
@@ -265,7 +266,7 @@ class LightActors:
         self.state[row], self.elapsed_s[row] = state, 0.0
 
     def release(self, world: LiveWorld, junction: str | None = None) -> None:
-        """Let a junction, or all, go on with its program."""
+        """Return a junction, or all junctions, to its program."""
         for name in [junction] if junction is not None else list(self._held):
             if self._held.pop(name, None) is not None:
                 world.apply(SetLight(name, None))
@@ -276,7 +277,10 @@ class LightActors:
         return (other for other, approach in enumerate(self.approaches) if approach.junction == junction)
 
     def find_at(self, fronts: Array, yaw: Array) -> NDArray[np.int64]:
-        """Return the approach at whose light each vehicle stands (N,), by its front (N, 2) and yaw (N,); -1: none."""
+        """Return (N,) the approaches at whose lights vehicles are; -1: none.
+
+        `fronts` (N, 2) [m] are the middles of the vehicles' fronts, `yaw` (N,) [rad] their headings, world frame.
+        """
         if not self.approaches or not len(fronts):
             return np.full(len(fronts), -1)
         stop = np.array([approach.stop for approach in self.approaches])

@@ -1,4 +1,7 @@
-"""The maps that are served: towns with the OpenDRIVE text that clients get, and where cars may be spawned."""
+"""Served maps: towns with their OpenDRIVE text, spawn points of vehicles, and navigation meshes of walkers.
+
+A navigation mesh is written in the file format of Recast's Detour library, as a single tile.
+"""
 
 import os
 import shutil
@@ -32,10 +35,10 @@ from flcav.world.opendrive.exporting import export_town
 from flcav.world.opendrive.importing import import_town
 from flcav.world.static import recall_static_world, save_static_world
 
-SPAWN_EVERY_M, SPAWN_FROM_END_M = 20.0, 7.0  # between spawn points of a lane, and to its ends
-ABOVE_M = 0.3  # of spawn points above the road
-SPAWN_LEAST_M = 11.0  # between spawn points of a lane, for the longest bus
-SPAWN_POINTS = {  # of CARLA's own maps; where these lie only its engine's files tell
+SPAWN_EVERY_M, SPAWN_FROM_END_M = 20.0, 7.0  # distance of spawn points of a lane, and to its ends
+ABOVE_M = 0.3  # height of spawn points above the road
+SPAWN_LEAST_M = 11.0  # least distance of spawn points of a lane, for the longest bus
+SPAWN_POINTS = {  # number in CARLA's maps; their places are only in its engine's files
     "Town01": 255,
     "Town02": 101,
     "Town03": 265,
@@ -51,16 +54,16 @@ OPTIMISED = "_Opt"  # ending of CARLA's names of layered maps
 
 @dataclass(frozen=True)
 class ServedMap:
-    """A town as clients see it."""
+    """A town as a map of CARLA's protocol."""
 
     name: str
     town: Town
-    opendrive: str  # the map's text
+    opendrive: str  # text of the map
     frame: MapFrame
-    lacking: Path | None = None  # file in which the next server seeks the town's mesh, and which is not there yet
+    lacking: Path | None = None  # cache file of the town's mesh, if it is not written yet
 
     def keep(self) -> None:
-        """Write the town's mesh, where there is a place for it and it is not there yet."""
+        """Write the town's mesh to the cache, if it is missing there."""
         if self.lacking is not None:
             with suppress(OSError):
                 save_static_world(self.town, self.lacking)
@@ -71,25 +74,28 @@ class ServedMap:
         return read_net(self.town.net)
 
     def list_spawn_points(self, standing: Footprints) -> list[Transform]:
-        """Return poses on driving lanes where each vehicle has room beside what is standing and those at other poses.
+        """Return poses on driving lanes with room for every vehicle between obstacles and vehicles at other poses.
 
-        CARLA's own maps have as many as CARLA has there.
+        CARLA's maps have as many as in CARLA. Transforms are in CARLA's frame; `standing` are the obstacles.
         """
         wanted = SPAWN_POINTS.get(self.name.removesuffix(OPTIMISED))
         if wanted is None:
             return self._pick_free(SPAWN_EVERY_M, standing)
-        found: list[Transform] = []
+        points: list[Transform] = []
         for every in np.arange(SPAWN_EVERY_M, SPAWN_LEAST_M, -0.5):
-            if len(found := self._pick_free(every, standing)) >= wanted:
-                return [found[row] for row in np.linspace(0, len(found) - 1, wanted).round().astype(int)]
-        return found
+            if len(points := self._pick_free(every, standing)) >= wanted:
+                return [points[row] for row in np.linspace(0, len(points) - 1, wanted).round().astype(int)]
+        return points
 
     def _pick_free(self, every_m: float, standing: Footprints) -> list[Transform]:
-        """Return the poses, so far apart, at which the largest vehicle meets nothing, nor itself at an earlier one."""
+        """Return the poses, `every_m` apart, where the largest vehicle is free of obstacles and of earlier poses."""
         places = list(self._places(every_m))
         poses = np.array([self.frame.from_transform(*place) for place in places]).reshape(-1, 4, 4)
         length, width, height = (
-            max(sides) for sides in zip(*(each.size for each in list_blueprints().values() if each.kind == "vehicle"))
+            max(sides)
+            for sides in zip(
+                *(blueprint.size for blueprint in list_blueprints().values() if blueprint.kind == "vehicle")
+            )
         )
         bottom = poses[:, 2, 3] - ABOVE_M + CLEARANCE_M
         boxes = Footprints(
@@ -117,18 +123,18 @@ class ServedMap:
 
     @cached_property
     def mesh(self) -> bytes:
-        """The file of the navigation mesh of walkers."""
+        """The navigation mesh of walkers, as a file; empty without footpaths."""
         return build_navigation_mesh(self.net, self.town, self.frame)
 
 
 def _find_cache() -> Path:
-    """Return the folder of imported maps, in that of the user's caches."""
+    """Return the cache folder of imported maps."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "flcav" / "maps"
 
 
 def _hash_import(path: Path) -> str:
-    """Return a name for the town of a map: another one for another map, and for another import of it."""
-    code = b"".join(each.read_bytes() for each in sorted(Path(world.__file__).parent.rglob("*.py")))
+    """Return a cache name for the town of a map: a hash of the map, its name and the code that imports it."""
+    code = b"".join(module.read_bytes() for module in sorted(Path(world.__file__).parent.rglob("*.py")))
     return f"map-{sha256(sha256(code).digest() + path.name.encode() + path.read_bytes()).hexdigest()[:24]}"
 
 
@@ -137,10 +143,10 @@ def _driving_lanes(net: RoadNet) -> Iterator[Lane]:
 
 
 class Maps:
-    """The maps by name: towns of flcav, folders of towns, and OpenDRIVE files, which are imported when asked for."""
+    """Maps by name: towns of flcav, folders of towns, and OpenDRIVE files, which are imported on first use."""
 
     def __init__(self, files: Path | None = None) -> None:
-        """Take the maps of all .xodr files in the folder `files`; raises `InputError` where it has none."""
+        """Add the maps of all .xodr files in the folder `files`. Raises `InputError` where it has none."""
         self._files: dict[str, Path] = {}
         self._loaded: dict[str, ServedMap] = {}
         if files is not None:
@@ -153,7 +159,7 @@ class Maps:
         self._sent = 0
 
     def discard_files(self) -> None:
-        """Remove the files that were made for these maps."""
+        """Remove the temporary files of these maps."""
         self._scratch.cleanup()
 
     def names(self) -> list[str]:
@@ -161,9 +167,9 @@ class Maps:
         return [*self._files, *(name for name in PACKAGED if name not in self._files)]
 
     def load(self, name: str) -> ServedMap:
-        """Return the map of a name, or of the folder of a town; raises `InputError` where there is none.
+        """Return the map with a name, or of the folder of a town. Raises `InputError` for an unknown one.
 
-        CARLA's name of a layered map, such as Town10HD_Opt, is that of the map without layers.
+        CARLA's name of a layered map, such as Town10HD_Opt, gives the map without layers.
         """
         if name not in self._loaded:
             self._loaded[name] = self._read(name)
@@ -180,16 +186,16 @@ class Maps:
         return ServedMap(town.name, town, export_town(town), MapFrame())
 
     def receive(self, text: str) -> None:
-        """Take the text of an OpenDRIVE map as `OPENDRIVE_MAP`; raises `InputError` where it cannot be driven."""
+        """Import an OpenDRIVE text as `OPENDRIVE_MAP`. Raises `InputError` where it cannot be driven."""
         self._sent += 1
         path = Path(self._scratch.name) / f"sent-{self._sent}.xodr"
         path.write_text(text, encoding="utf-8", errors="surrogateescape")
         self._loaded[OPENDRIVE_MAP] = replace(self._import(OPENDRIVE_MAP, path, self._find_scratch()), lacking=None)
 
     def _import(self, name: str, path: Path, cache: Path) -> ServedMap:
-        """Return the map of a file, whose town is in a folder of `cache`, or is written there.
+        """Return the map of a file; its town is read from the folder `cache`, or imported and written there.
 
-        The town has the map's name: its houses are drawn by it.
+        The town has the map's name, since the name seeds its random houses.
         """
         town, folder, mesh = None, cache / path.stem, cache / "mesh.npz"
         with suppress(OSError, InputError):  # no such folder yet, or one that is damaged
@@ -199,8 +205,8 @@ class Maps:
             town = import_town(path, made).town
             with suppress(OSError):  # no place for a cache, or another server was faster
                 cache.mkdir(parents=True, exist_ok=True)
-                with tempfile.TemporaryDirectory(dir=cache) as beside:
-                    shutil.copytree(made, Path(beside) / path.stem).rename(folder)
+                with tempfile.TemporaryDirectory(dir=cache) as staging:
+                    shutil.copytree(made, Path(staging) / path.stem).rename(folder)
         lacking = mesh if folder.exists() else None
         with suppress(OSError, ValueError):  # not there yet, or damaged
             recall_static_world(town, mesh)
@@ -211,15 +217,15 @@ class Maps:
         return ServedMap(name, town, text, MapFrame(offset), lacking)
 
     def _find_scratch(self) -> Path:
-        """Return a new folder for a town that is kept as long as this server runs."""
+        """Return a new temporary folder, which is kept as long as this server runs."""
         return Path(tempfile.mkdtemp(dir=self._scratch.name))
 
 
-GRID_M = 0.01  # of corners
-JOINED_M = 0.15  # paths so near to each other are one
-SMOOTHED_M = 0.08  # most that outlines move
-SMALLEST_M2 = 0.5  # of a face that is walked on
-MOST_CORNERS = 0xFFFE  # that the format can number
+GRID_M = 0.01  # precision grid of corners
+JOINED_M = 0.15  # paths within twice this distance are joined
+SMOOTHED_M = 0.08  # tolerance of simplified outlines
+SMALLEST_M2 = 0.5  # smallest face that is kept
+MOST_CORNERS = 0xFFFE  # largest number of corners that the format can index
 SET = struct.Struct("<3i3f2f2iIi")  # "MSET", version, tiles; origin, size and capacities of the mesh; reference, bytes
 TILE = struct.Struct("<5iI9i10f")  # "DNAV", version, place; user; counts; walkers; bounds; factor of a tree
 POLYGON = np.dtype(
@@ -246,7 +252,7 @@ class Area(IntEnum):
 
 
 def build_navigation_mesh(net: RoadNet, town: Town, frame: MapFrame) -> bytes:
-    """Return the file of a town's navigation mesh; empty without footpaths, and beyond `MOST_CORNERS`."""
+    """Return a town's navigation mesh as a file; empty without footpaths, and beyond `MOST_CORNERS`."""
     corners, triangles, areas = triangulate(*list_footpaths(net))
     if not len(triangles) or len(corners) > MOST_CORNERS:
         return b""
@@ -256,7 +262,7 @@ def build_navigation_mesh(net: RoadNet, town: Town, frame: MapFrame) -> bytes:
 
 
 def list_footpaths(net: RoadNet) -> tuple[BaseGeometry, BaseGeometry]:
-    """Return what of a net are footpaths, and what are crossings between them [m]."""
+    """Return the areas of footpaths, and of crossings between them, x, y [m], world frame."""
     paths, crossings = list[BaseGeometry](), list[BaseGeometry]()
     for lane in (lane for edge in net.edges.values() for lane in edge.lanes):
         if lane.kind == "walkingarea" and len(lane.shape) > 2:
@@ -271,7 +277,7 @@ def list_footpaths(net: RoadNet) -> tuple[BaseGeometry, BaseGeometry]:
 
 
 def triangulate(walked: BaseGeometry, crossed: BaseGeometry) -> tuple[NDArray, NDArray, NDArray]:
-    """Return corners (V, 2) [m], counter-clockwise triangles (T, 3) that share whole edges, and their areas (T,)."""
+    """Return corners (V, 2) [m], counter-clockwise triangles (T, 3) that share whole edges, and their `Area` (T,)."""
     lines = shapely.union_all([walked.boundary, crossed.boundary], grid_size=GRID_M)
     faces = shapely.polygonize(shapely.get_parts(lines))
     rings, areas = list[NDArray](), list[int]()
@@ -290,7 +296,7 @@ def triangulate(walked: BaseGeometry, crossed: BaseGeometry) -> tuple[NDArray, N
 
 
 def find_neighbours(triangles: NDArray) -> NDArray:
-    """Return for each edge (T, 3) of triangles, from a corner to the next, 1 + the triangle beyond it; 0 for none."""
+    """Return (T, 3) 1 + the triangle beyond every edge, from a corner to the next; 0 for none."""
     start, end = triangles, np.roll(triangles, -1, axis=1)
     rows = {edge: row for row, edge in enumerate(zip(start.ravel().tolist(), end.ravel().tolist(), strict=True))}
     beyond = [rows.get((b, a), -3) // 3 + 1 for a, b in zip(start.ravel().tolist(), end.ravel().tolist(), strict=True)]
@@ -298,7 +304,7 @@ def find_neighbours(triangles: NDArray) -> NDArray:
 
 
 def pack_mesh(points: NDArray, triangles: NDArray, areas: NDArray) -> bytes:
-    """Return the file of a mesh: points (V, 3) in CARLA's frame [m], triangles (T, 3) clockwise there by x and y."""
+    """Return a navigation mesh as a file; `points` (V, 3) [m] and clockwise `triangles` (T, 3) are in CARLA's frame."""
     places = points[:, (0, 2, 1)].astype("<f4")
     low, high = places.min(axis=0), places.max(axis=0)
     count, bits = len(triangles), max(int(len(triangles) - 1).bit_length(), 1)
@@ -318,5 +324,5 @@ def pack_mesh(points: NDArray, triangles: NDArray, areas: NDArray) -> bytes:
     body = (places, polygons, np.zeros(links * LINK_BYTES, np.uint8), details, faces)
     tile = head + b"".join(part.tobytes() for part in body)
     size = (high - low)[[0, 2]].tolist()
-    told = (int.from_bytes(b"MSET", "big"), 1, 1)
-    return SET.pack(*told, *low.tolist(), *size, 1, 1 << bits, 1 << bits, len(tile)) + tile
+    header = (int.from_bytes(b"MSET", "big"), 1, 1)
+    return SET.pack(*header, *low.tolist(), *size, 1, 1 << bits, 1 << bits, len(tile)) + tile

@@ -1,4 +1,4 @@
-"""The recorder that clients start and stop: the traffic of an episode as a trace, a Parquet file of flcav."""
+"""The recorder that clients start and stop: it writes an episode's traffic as a trace, in a Parquet file."""
 
 import logging
 import re
@@ -13,27 +13,28 @@ log = logging.getLogger("flcav.carla")
 
 
 class Recorder:
-    """Collects the snapshots of one recording."""
+    """A recorder of the world's snapshots."""
 
     def __init__(self) -> None:
         self._path: Path | None = None
         self._snapshots: list[Snapshot] = []
 
     def start(self, name: str) -> str:
-        """Begin a recording; return its file. Of the client's `name` only letters, digits, -, _ and . remain."""
+        """Start a recording; return its path. Only letters, digits, -, _ and . of the client's `name` are kept."""
         stem = re.sub(r"[^A-Za-z0-9_.-]", "_", name.replace("\\", "/").rpartition("/")[2]).strip(".")[:100]
         self._path = FOLDER / f"{stem or 'recording'}.parquet"
         self._snapshots = []
         return str(self._path.absolute())
 
     def add(self, snapshot: Snapshot) -> None:
-        """Take the world after a tick, while a recording is under way; the first `MOST_SNAPSHOTS` of it."""
+        """Record the world after a tick, up to `MOST_SNAPSHOTS`; without a recording, do nothing."""
         if self._path is not None and len(self._snapshots) < MOST_SNAPSHOTS:
             self._snapshots.append(snapshot)
 
     def stop(self) -> None:
         """Write the recording, if there is one."""
-        path, snapshots = self._path, self._snapshots
+        path = self._path
+        snapshots = self._snapshots
         self._path, self._snapshots = None, []
         if path is None or not snapshots:
             return

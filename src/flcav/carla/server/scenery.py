@@ -14,17 +14,17 @@ from flcav.world.static import find_lowest_ground
 if TYPE_CHECKING:
     from flcav.carla.server.episode import Episode
 
-ANY = 0xFF  # CARLA's tag of everything
+ANY = 0xFF  # CARLA's tag for all objects
 UP_M = 0.5  # a trunk's half width, for boxes of poles
 
 
 def find_boxes(episode: "Episode", tag: int) -> list[BoundingBox]:
-    """Return the boxes of the town's things with a tag, in the map's frame."""
+    """Return the bounding boxes of the town's objects with a semantic tag, in CARLA's map frame [m]."""
     return [box for number, box, _ in _list_things(episode) if tag in (number, ANY)]
 
 
 def list_objects(episode: "Episode", tag: int) -> list[list[Any]]:
-    """Return the town's things with a tag: transform, box, number, name and tag."""
+    """Return the town's objects with a semantic tag, as rows: transform, box, id, name and tag."""
     return [
         [[box.location, box.rotation], box, row, name, number]
         for row, (number, box, name) in enumerate(_list_things(episode), start=1)
@@ -33,14 +33,15 @@ def list_objects(episode: "Episode", tag: int) -> list[list[Any]]:
 
 
 def _list_things(episode: "Episode") -> list[tuple[int, BoundingBox, str]]:
-    """Return tag, box and name of each building, tree, lamp, sign, pole and parked vehicle."""
-    town, found = episode.served.town, []
+    """Return tag, box and name of all buildings, trees, lamps, signs, poles, traffic lights and parked vehicles."""
+    town = episode.served.town
+    objects = []
 
     def add(kind: str, x: float, y: float, z: float, size: tuple[float, float, float], yaw: float = 0.0) -> None:
         place = to_vector(episode.served.frame.to_location(np.array((x, y, z + size[2] / 2))))
         length, width, height = size
         box = BoundingBox(place, (length / 2, width / 2, height / 2), to_vector(to_rotation(np.array((yaw, 0.0, 0.0)))))
-        found.append((SEMANTICS[kind], box, f"{kind}_{len(found)}"))
+        objects.append((SEMANTICS[kind], box, f"{kind}_{len(objects)}"))
 
     ground = find_lowest_ground(town, town.buildings) if len(town.buildings) else []
     for (x, y, yaw, length, width, height), foot in zip(town.buildings.tolist(), ground):
@@ -60,11 +61,11 @@ def _list_things(episode: "Episode") -> list[tuple[int, BoundingBox, str]]:
             length, width, height = trace.size[row].tolist()
             category = {"van": "car"}.get(str(trace.category[row]), str(trace.category[row]))
             add(category, x, y, z, (length, width, height), float(trace.yaw[0, row]))
-    return found
+    return objects
 
 
 def project_ray(episode: "Episode", location: Vector, direction: Vector, distance: float) -> list[list[Any]]:
-    """Return location and tag of the first thing that a ray from `location` meets within `distance` [m], if any."""
+    """Return location and tag of the first hit of a ray within `distance` [m], in CARLA's frame, if there is one."""
     way = mirror(np.array(direction))
     length = float(np.linalg.norm(way))
     if not length or distance <= 0:

@@ -1,13 +1,13 @@
-"""The sensors of CARLA's clients: when each is due, and the bytes that it sends then.
+"""Sensors of CARLA's clients: when they measure, and the bytes that they send.
 
-Cameras send images of blue, green, red and alpha, row after row from the top. Depth is coded in 24 bits from red to
-blue, of 1000 m, along the optical axis. The semantic tag is red; an instance image adds the two lower bytes of the
-actor's number as green and blue.
+Cameras send blue, green, red and alpha, row by row from the top. Depth along the optical axis is coded in 24 bits from
+red (lowest) to blue, in units of 1000 m / (2^24 - 1). The semantic tag is in red; an instance image has the two lower
+bytes of the actor's id in green and blue.
 
 LiDARs and the radar send points in the sensor's left-handed frame. A LiDAR fires points_per_second over its channels,
 from the highest, evenly over the angle that it turns by in the time since its last sweep. Its intensity is
 exp(-a distance), and it loses returns as in `flcav.sensors.lidar.lidar`. The radar's rays are random within its field
-of view; each gives the range rate of what it meets.
+of view; a detection has the range rate of the surface that its ray hits.
 
 GNSS, IMU, and the events of collision and obstacle sensors are MessagePack records.
 """
@@ -43,12 +43,12 @@ from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.rays.packets import Hits
 from flcav.world.snapshot import Collision
 
-FAR_M = 1000.0
-DEPTH_STEPS = 2**24 - 1
+FAR_M = 1000.0  # greatest coded depth
+DEPTH_STEPS = 2**24 - 1  # code of that depth
 
 
 def sense_rgb(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return a colour image."""
+    """Render a colour image; return its bytes."""
     rgb, lens = sight.photograph(sensor).rgb, lens_of(sensor)
     if rgb.shape[:2] != (lens.height, lens.width):  # of low quality
         rgb = np.asarray(Image.fromarray(rgb).resize((lens.width, lens.height), Resampling.BILINEAR))
@@ -58,7 +58,7 @@ def sense_rgb(sight: TownSight, sensor: Sensor) -> bytes:
 
 
 def sense_depth(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return a depth image."""
+    """Render a depth image; return its bytes."""
     lens = lens_of(sensor)
     rays = compute_pixel_rays(lens)
     pose = sensor.pose @ BODY_FROM_OPTICAL
@@ -69,18 +69,18 @@ def sense_depth(sight: TownSight, sensor: Sensor) -> bytes:
 
 
 def sense_semantic(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return an image of semantic tags."""
+    """Render a semantic image; return its bytes."""
     tags, instance = sight.label(sensor)
     return _pack_picture(sensor, _draw_labels(tags, instance, np.zeros(len(sight.actors), np.uint32)))
 
 
 def sense_instance(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return an image of semantic tags and actors."""
+    """Render an instance image, of semantic tags and actor ids; return its bytes."""
     return _pack_picture(sensor, _draw_labels(*sight.label(sensor), sight.actors))
 
 
 def _draw_labels(tags: NDArray[np.uint8], instance: NDArray[np.int32], actors: NDArray[np.uint32]) -> NDArray[np.uint8]:
-    """Return an image of tags (H, W), with the numbers of the trace's `actors` (A,) where they are seen."""
+    """Return an image of tags (H, W), with the ids of the trace's `actors` (A,) where they are visible."""
     image = np.empty((*tags.shape, 4), np.uint8)
     _write_labels(tags, instance, np.append(np.uint32(0), actors), image)
     return image
@@ -120,9 +120,9 @@ GRAVITY = np.array((0.0, 0.0, 9.81))  # CARLA's [m/s^2]
 
 
 def sense_gnss(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return latitude [deg], longitude [deg] and altitude [m].
+    """Measure latitude [deg], longitude [deg] and altitude [m]; return their bytes.
 
-    As `Map.transform_to_geolocation` of CARLA 0.9.16 does, it takes CARLA's y for north, though the map's is mirrored.
+    Like `Map.transform_to_geolocation` of CARLA 0.9.16, it takes CARLA's y as north, although the map's is mirrored.
     """
     x, y, z = sight.frame.to_location(sensor.pose[:3, 3])
     dx, dy = sight.frame.offset_m
@@ -136,7 +136,7 @@ def sense_gnss(sight: TownSight, sensor: Sensor) -> bytes:
 
 
 def sense_imu(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return specific force [m/s^2], angular velocity [rad/s] in the sensor's frame, and compass [rad] from north."""
+    """Measure specific force [m/s^2], angular velocity [rad/s], sensor frame, and compass [rad] from north."""
     turn = sensor.pose[:3, :3].T
     rng = sight.draw(sensor)
 
@@ -150,11 +150,11 @@ def sense_imu(sight: TownSight, sensor: Sensor) -> bytes:
     return pack_record([force.tolist(), rate.tolist(), float((yaw + np.pi / 2) % (2 * np.pi))])
 
 
-MOST_RAYS = 4_000_000  # of one sweep
+MOST_RAYS = 4_000_000  # of a sweep
 
 
 def sense_lidar(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return the sweep of a LiDAR: x, y, z [m] and intensity."""
+    """Measure a LiDAR sweep, x, y, z [m], sensor frame, and intensity; return its bytes."""
     directions, channels = _fire(sensor)
     hits = sight.cast(sensor, directions, sensor.number_of("range"))
     rng = sight.draw(sensor)
@@ -172,7 +172,7 @@ def sense_lidar(sight: TownSight, sensor: Sensor) -> bytes:
 
 
 def sense_semantic_lidar(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return the sweep of a semantic LiDAR: x, y, z [m], cosine of incidence, actor and tag."""
+    """Measure a semantic LiDAR sweep: x, y, z [m], sensor frame, cosine of incidence, actor id and tag."""
     directions, channels = _fire(sensor)
     hits = sight.cast(sensor, directions, sensor.number_of("range"))
     rays = np.flatnonzero(np.isfinite(hits.distance))
@@ -185,7 +185,7 @@ def sense_semantic_lidar(sight: TownSight, sensor: Sensor) -> bytes:
 
 
 def sense_radar(sight: TownSight, sensor: Sensor) -> bytes:
-    """Return the detections of a radar: range rate [m/s], azimuth, altitude [rad] and depth [m]."""
+    """Measure radar detections: range rate [m/s], azimuth, altitude [rad] and range [m]; return their bytes."""
     rng = sight.draw(sensor)
     count = min(max(1, round(sensor.number_of("points_per_second") * sensor.elapsed_s)), MOST_RAYS)
     wide, high = (
@@ -204,7 +204,7 @@ def sense_radar(sight: TownSight, sensor: Sensor) -> bytes:
 
 
 def _fire(sensor: Sensor) -> tuple[NDArray[np.float32], int]:
-    """Return the rays of a sweep (channels * columns, 3), channel after channel, and the number of channels."""
+    """Return the unit rays of a sweep (channels * columns, 3), sensor frame, channel by channel, and the channels."""
     channels, field = int(sensor.number_of("channels")), sensor.number_of("horizontal_fov")
     columns = _count_columns(sensor, channels)
     turn = sensor.number_of("rotation_frequency") * field * sensor.elapsed_s
@@ -216,13 +216,13 @@ def _fire(sensor: Sensor) -> tuple[NDArray[np.float32], int]:
 
 
 def _count_columns(sensor: Sensor, channels: int) -> int:
-    """Return the number of rays of each channel in a sweep; halves are rounded up, as CARLA does."""
+    """Return the number of rays per channel in a sweep; halves are rounded up, as in CARLA."""
     wanted = int(sensor.number_of("points_per_second") * sensor.elapsed_s / channels + 0.5 + 1e-6)
     return min(max(1, wanted), MOST_RAYS // channels)
 
 
 def _incidence(sight: TownSight, sensor: Sensor, directions: NDArray[np.float32], met: Hits) -> NDArray[np.float32]:
-    """Return the cosine of the angle of incidence of each hit."""
+    """Return the cosines of the angles of incidence of hits (N,)."""
     surfaces = sight.scene.surfaces
     normal = surfaces.normal[surfaces.first[met.instance] + met.face]
     turn = (sensor.pose[:3, :3].T @ sight.scene.world_from_instance()).astype(np.float32)
@@ -238,9 +238,9 @@ class Kind(NamedTuple):
     """How a kind of sensor measures."""
 
     stream: Stream
-    measure: Callable[[TownSight, Sensor], bytes] | None  # None: it sends what happens, not what it sees
-    rays: bool = False  # it casts rays, which takes its time
-    late: bool = False  # it draws an image, which takes longer
+    measure: Callable[[TownSight, Sensor], bytes] | None  # None: it sends events, not measurements
+    rays: bool = False  # it casts rays, which takes some time
+    late: bool = False  # it renders an image, which takes longer
 
 
 KINDS: dict[str, Kind] = {
@@ -254,25 +254,25 @@ KINDS: dict[str, Kind] = {
     "sensor.other.imu": Kind(Stream.IMU, sense_imu),
     "sensor.other.radar": Kind(Stream.RADAR, sense_radar, True),
     "sensor.other.collision": Kind(Stream.COLLISION, None),
-    "sensor.other.lane_invasion": Kind(Stream.LANE_INVASION, None),  # clients find these themselves, from the map
+    "sensor.other.lane_invasion": Kind(Stream.LANE_INVASION, None),  # clients compute these from the map
     "sensor.other.obstacle": Kind(Stream.OBSTACLE, None),
 }
 EARLY_S = 1e-6  # rounding of times
 
 
 class SensorClock:
-    """When a sensor measures: at its first tick, and then every `sensor_tick`, or every tick where that is 0."""
+    """The clock of a sensor: it measures at its first tick, then every `sensor_tick`, or every tick if that is 0."""
 
     def __init__(self, tick_s: float) -> None:
-        """Take the sensor's `sensor_tick` [s]."""
+        """Set the period `sensor_tick` [s]."""
         self._tick_s = tick_s
         self._next_s: float | None = None
         self._last_s: float | None = None
 
     def take(self, time_s: float, dt_s: float) -> float | None:
-        """Return the time since the last measurement [s] where one is due at `time_s`, `dt_s` after the last tick.
+        """Return the time since the last measurement [s] if one is due at `time_s` [s], `dt_s` [s] after the last tick.
 
-        The first one stands for a whole `sensor_tick`. None where none is due.
+        The first measurement covers a whole `sensor_tick`. None if none is due.
         """
         if self._next_s is not None and time_s < self._next_s - EARLY_S:
             return None
@@ -283,12 +283,12 @@ class SensorClock:
         return elapsed
 
 
-RING = 8  # rays around the middle one, on the circle of the radius
+RING = 8  # rays on the circle of the hit radius, around the central one
 AHEAD = np.array([[1.0, 0.0, 0.0]], np.float32)
 TAG_NAMES = {number: name for name, number in SEMANTICS.items()}
 
 
-TAG_OF = {  # kind of a thing -> its semantic class
+TAG_OF = {  # kind of object -> semantic class
     "tree": "vegetation",
     "clutter": "static",
     "post": "pole",
@@ -300,34 +300,38 @@ TAG_OF = {  # kind of a thing -> its semantic class
 
 
 def describe_thing(kind: str) -> ActorRecord:
-    """Return the record of a thing of the town, such as a building, by CARLA's name of its class."""
+    """Return the record of an object of the town, such as a building, named after CARLA's class."""
     kind = TAG_OF.get(kind, kind).replace("_", "")
     nowhere = BoundingBox((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     return ActorRecord(0, 0, Description(0, f"static.{kind}", ()), nowhere, b"", b"")
 
 
 def find_collisions(collisions: Sequence[Collision], describe: Callable[[str], ActorRecord]) -> dict[str, list[bytes]]:
-    """Return what collision sensors on each actor send, by its name; `describe` gives the record of a name."""
-    found: dict[str, list[bytes]] = {}
-    for each in collisions:
-        impulse = np.array((*each.impulse, 0.0))
-        for name, other, share in ((each.name, each.other, impulse), (each.other, each.name, -impulse)):
+    """Return the messages of collision sensors by the name of their carrier; `describe` gives the record of a name."""
+    messages: dict[str, list[bytes]] = {}
+    for collision in collisions:
+        impulse = np.array((*collision.impulse, 0.0))
+        for name, other, share in (
+            (collision.name, collision.other, impulse),
+            (collision.other, collision.name, -impulse),
+        ):
             x, y, z = mirror(share).tolist()
             record = CollisionRecord(describe(name), describe(other), (x, y, z))
-            found.setdefault(name, []).append(pack_record(record))
-    return found
+            messages.setdefault(name, []).append(pack_record(record))
+    return messages
 
 
 def _sweep_actors(sight: TownSight, sensor: Sensor) -> tuple[float, str] | None:
-    """Return distance [m] and name of the first vehicle or walker whose box, grown by the radius, the ray ahead meets.
+    """Return distance [m] and name of the first vehicle or walker whose box, plus the radius, the ray ahead hits.
 
-    Parked vehicles, props and the town neither count nor hide what is behind them.
+    Parked vehicles, props and the town are ignored, and do not occlude.
     """
     trace, radius, best = sight.scene.trace, sensor.number_of("hit_radius"), None
     moves = (sight.actors > 0) & (trace.category != "prop") & (trace.actor != sensor.carrier) & trace.present[0]
     for row in np.flatnonzero(moves).tolist():
         to_box = inverse(sight.scene.world_from_actor(row)) @ sensor.pose
-        start, way = to_box[:3, 3], to_box[:3, 0]
+        start = to_box[:3, 3]
+        way = to_box[:3, 0]
         length, width, height = trace.size[row]
         low = np.array((-length / 2, -width / 2, 0.0)) - radius
         high = np.array((length / 2, width / 2, height)) + radius
@@ -343,7 +347,7 @@ def _sweep_actors(sight: TownSight, sensor: Sensor) -> tuple[float, str] | None:
 def find_obstacle(
     sight: TownSight, sensor: Sensor, carrier: ActorRecord, describe: Callable[[str], ActorRecord]
 ) -> bytes | None:
-    """Return what an obstacle sensor on `carrier` sends: what is nearest ahead of it within its radius, or None."""
+    """Return the message of an obstacle sensor on `carrier`, on the nearest object ahead within its radius, or None."""
     if sensor.attributes["only_dynamics"].lower() in ("true", "1"):
         met = _sweep_actors(sight, sensor)
         return None if met is None else pack_record(ObstacleEvent(carrier, describe(met[1]), met[0]))

@@ -1,12 +1,13 @@
-"""The server: remote procedure calls at one port, streams at the next, one loop.
+"""The server: remote procedure calls at one port, streams at the next, in one event loop.
 
-In synchronous mode a tick follows a cue; otherwise ticks follow the clock. A tick sends what sensors measure, in order,
-then the world's state, then the cameras' images, which take longest, and the answer to its cue, upon which a client
-goes on. The answer waits for the images no longer than `DELIVERY_S`; they are then drawn beside the next ticks, as they
-are when ticks follow the clock, and the next images wait for them. Cameras are prepared beside the ticks, too.
+In synchronous mode a tick follows a client's cue; otherwise ticks follow the clock. A tick sends the measurements of
+the sensors in order, then the world state, then the cameras' images, which take longest, and finally the reply to its
+cue, upon which the client continues. The reply waits for the images at most `DELIVERY_S`; they are then rendered
+concurrently with the next ticks, as in asynchronous mode, and the next images wait for them. Cameras are prepared
+concurrently, too.
 
-What strangers may ask for is bounded: a connection with many cues that wait for their ticks is read no further; other
-bounds are those of `Connections`.
+The resources of a client are bounded: a connection with many cues that wait for their ticks is not read further; the
+other bounds are in `Connections`.
 """
 
 import asyncio
@@ -29,23 +30,24 @@ from flcav.carla.server.connections import Connections, Unpacker, send_payload, 
 from flcav.carla.server.episode import Episode, Measurement
 from flcav.config import InputError
 
-# A client's Traffic Manager misses its wake-up, and waits for ever, where the next tick comes before its thread sleeps
-# (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are not closer than this while one runs.
+# A client's Traffic Manager misses its wake-up, and deadlocks, if the next tick comes before its thread sleeps
+# (`TrafficManagerLocal::SynchronousTick` notifies without the lock): so ticks are at least this far apart while one
+# runs.
 PACE_S = 0.008
-MOST_UNDRAWN = 100  # cued ticks whose images wait while cameras are prepared, for longer than clients give a tick
-DELIVERY_S = 1.5  # clients give a tick 2 s at least
+MOST_UNDRAWN = 100  # cued ticks whose images may wait for the cameras' preparation, longer than clients' timeouts
+DELIVERY_S = 1.5  # clients' timeouts of a tick are at least 2 s
 PREPARING_S = 3.0  # a server waits so long for its cameras; the first one on a machine compiles for longer
-LEARNT_S = 3.0  # clients have learnt of a new map by then
-# While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread crashes if it goes on:
-# so that thread's calls, which are all others, are answered when the client listens to the new world.
+LEARNT_S = 3.0  # time within which clients have learnt of a new map
+# While a client that has loaded a map learns of it by these calls, its Traffic Manager's thread would crash if it
+# continued: so that thread's calls, which are all others, are answered once the client subscribes to the new world.
 LEARNING = ("version", "get_episode_info", "get_sensor_token")
-MANAGER_S = 1.0  # the client that has loaded a map is told so when that thread waits for its next call, or by then
-LISTENER_S = 0.3  # a tick waits so long for the connection of a stream whose token a client has just asked for
-MOST_CUES, MOST_CUES_IN_ALL = 8, 256  # of a connection that wait for their ticks, and of all; clients have one each
-UNFINISHED_S = 30.0  # a call has come to its end by then, and the number of a stream
-ENDING_S = 3.0  # a server that is terminated ends by then, whatever it is at
-# In asynchronous mode, so that a client has a state with the new actor when it learns of it, as with CARLA, which
-# answers few calls a frame: a walker's AI that a client starts ends where its walker is in no state.
+MANAGER_S = 1.0  # the reply to a client that has loaded a map waits for that thread's next call, at most so long
+LISTENER_S = 0.3  # a tick waits so long for the subscription to a stream whose token a client has just requested
+MOST_CUES, MOST_CUES_IN_ALL = 8, 256  # waiting cues of a connection, and of all; a regular client has one
+UNFINISHED_S = 30.0  # time limit for the rest of an incomplete call, and for a stream's id
+ENDING_S = 3.0  # a terminated server ends within this time, whatever it is doing
+# In asynchronous mode their replies wait for the next tick, so that a client has a world state with the new actor when
+# it learns of it, as with CARLA: the AI of a walker that is in no state yet would stop.
 SPAWNS = ("spawn_actor", "spawn_actor_with_parent")
 CHUNK = 1 << 16
 
@@ -53,28 +55,31 @@ log = logging.getLogger("flcav.carla")
 
 
 class CarlaServer:
-    """Serves the clients of one `Calls`."""
+    """A server of remote procedure calls and streams for clients of CARLA."""
 
     def __init__(self, calls: Calls) -> None:
-        """Take the calls to be served."""
+        """Set the handlers of calls."""
         self._calls = calls
         self._links = Connections()
         self._cue, self._room = asyncio.Event(), asyncio.Event()
-        self._worlds: set[int] = set()  # streams of the world's state, of earlier episodes too
-        self._published_s = 0.0  # when the world's state was last sent
-        self._state = b""  # the last one of the world, for clients that come between two ticks
-        # A client that has the answer to its cue waits for the state by polling, which takes a core from the sensors.
-        self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # answers that wait for the next ticks
-        self._preparing: asyncio.Task[None] | None = None  # the scenes of a map that was loaded
-        self._loaded: dict[asyncio.StreamWriter, bytes] = {}  # replies to clients that have loaded a map
-        self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # replies to managers of who learns of a new map
-        self._drawing: asyncio.Task[None] | None = None  # the images of an earlier tick, after those before
-        self._undrawn = 0  # ticks whose images are yet to be drawn
+        self._worlds: set[int] = set()  # streams of world states, also of earlier episodes
+        self._published_s = 0.0  # time at which the world state was last sent
+        self._state = b""  # the last world state, for clients that subscribe between two ticks
+        # A client with the reply to its cue waits for the state by polling, which takes a core from the sensors: so
+        # replies are sent after the state.
+        self._cued: deque[tuple[asyncio.StreamWriter, bytes]] = deque()  # replies that wait for the next ticks
+        self._preparing: asyncio.Task[None] | None = None  # preparation of a newly loaded map
+        self._loaded: dict[asyncio.StreamWriter, bytes] = {}  # pending replies to clients that have loaded a map
+        self._held: dict[asyncio.StreamWriter, list[bytes]] = {}  # pending replies to their Traffic Managers
+        self._drawing: asyncio.Task[None] | None = None  # rendering of the last images, which awaits earlier ones
+        self._undrawn = 0  # ticks whose images are not rendered yet
 
     async def run(self, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
-        """Serve until cancelled, calls at the first of two bound sockets and streams at the second."""
+        """Serve until cancelled: calls at the first of two bound sockets, streams at the second."""
         connected = self._serve_calls, self._serve_stream
-        servers = [await asyncio.start_server(each, sock=door) for each, door in zip(connected, doors, strict=True)]
+        servers = [
+            await asyncio.start_server(callback, sock=door) for callback, door in zip(connected, doors, strict=True)
+        ]
         await asyncio.wait({self._prepare()}, timeout=PREPARING_S)
         ready()
         try:
@@ -89,14 +94,14 @@ class CarlaServer:
             self._calls.episode.close()
 
     def _prepare(self) -> asyncio.Task[None]:
-        """Prepare for the sensors of the episode, beside all else."""
+        """Prepare the sensors of the episode concurrently."""
         self._preparing = asyncio.create_task(self._prepare_episode(self._calls.episode))
         return self._preparing
 
     async def _prepare_episode(self, episode: Episode) -> None:
         try:
             await asyncio.to_thread(episode.prepare)
-        except Exception:  # what fails here fails again, and is told, where it is needed
+        except Exception:  # what fails here fails again, with a report, when a sensor needs it
             log.debug("preparing failed", exc_info=True)
 
     # ---- ticks
@@ -128,7 +133,7 @@ class CarlaServer:
 
     async def _tick(self) -> None:
         await self._await_listeners()
-        await asyncio.sleep(0)  # calls, and the end, have their turn between two ticks
+        await asyncio.sleep(0)  # lets calls and cancellation run between two ticks
         try:
             await self._step()
         except Exception:  # a server that fails one tick serves the next
@@ -139,16 +144,16 @@ class CarlaServer:
         episode.step(dt_s)
         self._state = episode.describe_world(dt_s)
         measurements = list(episode.measure(dt_s, self._links.is_heard))
-        for each in measurements:
-            if not each.late:
-                await self._measure(each, episode)
+        for measurement in measurements:
+            if not measurement.late:
+                await self._measure(measurement, episode)
         if episode is not self._calls.episode:  # another map was loaded meanwhile
             return
         if self._calls.managed:
             await asyncio.sleep(self._published_s + PACE_S - time.monotonic())
         await self._publish_state(episode)
         self._published_s = time.monotonic()
-        if images := [each for each in measurements if each.late]:
+        if images := [measurement for measurement in measurements if measurement.late]:
             synchronous = self._calls.settings.synchronous
             unprepared = synchronous and self._preparing is not None and not self._preparing.done()
             if self._drawing is not None and not (unprepared and self._undrawn < MOST_UNDRAWN):
@@ -161,13 +166,13 @@ class CarlaServer:
         await self._links.await_readers()
 
     async def _draw(self, images: list[Measurement], episode: Episode, before: asyncio.Task[None] | None) -> None:
-        """Draw and send the images of a tick, once those of the tick before are drawn."""
+        """Render and send the images of a tick, after those of the tick before."""
         try:
             if before is not None:
                 await before
-            for each in images:
+            for measurement in images:
                 if episode is self._calls.episode:
-                    await self._measure(each, episode)
+                    await self._measure(measurement, episode)
             await self._links.await_readers()
         except Exception:  # a server that fails one image draws the next
             log.exception("an image failed")
@@ -175,24 +180,24 @@ class CarlaServer:
             self._undrawn -= 1
 
     def _answer_cues(self, most: int | None = None) -> None:
-        """Answer what waits for the ticks that were made; all that waits, where none is to come."""
+        """Send the first `most` replies that wait for ticks, or all."""
         for _ in range(len(self._cued) if most is None else min(most, len(self._cued))):
             writer, reply = self._cued.popleft()
             write(writer, reply)
         self._room.set()
 
-    async def _measure(self, each: Measurement, episode: Episode) -> None:
-        """Send what a sensor measures, beside this thread where it casts rays, so that calls are answered meanwhile."""
-        body = each.body
+    async def _measure(self, measurement: Measurement, episode: Episode) -> None:
+        """Measure and send, in another thread if rays are cast, so that calls are answered meanwhile."""
+        body = measurement.body
         if not isinstance(body, bytes):
-            body = await asyncio.to_thread(body) if each.rays else body()
+            body = await asyncio.to_thread(body) if measurement.rays else body()
         if episode is self._calls.episode:
-            await self._links.publish(each.stream, each.header + body)
+            await self._links.publish(measurement.stream, measurement.header + body)
 
     async def _publish_state(self, episode: Episode) -> None:
-        """Send the world's state; after a map was loaded, at first only to those who have learnt of it.
+        """Send the world state; after a map is loaded, at first only to clients that have subscribed to the new world.
 
-        A client that loads a map closes the stream of the one before, and crashes if something arrives meanwhile.
+        A client that loads a map closes the stream of the old world, and crashes if a message arrives meanwhile.
         """
         self._worlds = {stream for stream in self._worlds if self._links.is_heard(stream)}
         for stream in self._worlds:
@@ -200,8 +205,9 @@ class CarlaServer:
                 await self._links.publish(stream, self._state)
 
     async def _await_listeners(self) -> None:
-        """Wait for the streams that clients are about to listen to, so that these miss no tick."""
-        expected, until = self._calls.expected, time.monotonic() + LISTENER_S
+        """Wait for clients that are about to subscribe to streams, so that they miss no tick."""
+        expected = self._calls.expected
+        until = time.monotonic() + LISTENER_S
         while expected and time.monotonic() < until:
             await asyncio.sleep(0.001)
         expected.clear()
@@ -235,7 +241,7 @@ class CarlaServer:
             self._links.forget(writer)
 
     async def _serve_call(self, call: wire.Call, writer: asyncio.StreamWriter) -> None:
-        """Answer a call: at once, or after the tick that it cues."""
+        """Answer a call, immediately or after the tick that it cues."""
         while not writer.is_closing() and self._is_full(writer):
             self._room.clear()
             await self._room.wait()
@@ -257,26 +263,26 @@ class CarlaServer:
         elif not waits:
             writer.write(reply)
         await self._links.await_readers([writer])
-        await asyncio.sleep(0)  # others have their turn
+        await asyncio.sleep(0)  # lets other connections run
 
     def _is_full(self, writer: asyncio.StreamWriter) -> bool:
-        """Return whether a connection has to wait with its next call until cues are served."""
-        waiting = sum(each is writer for each, _ in self._cued)
+        """Return whether a connection's next call has to wait until cues are served."""
+        waiting = sum(cue_writer is writer for cue_writer, _ in self._cued)
         return waiting >= MOST_CUES or len(self._cued) >= MOST_CUES_IN_ALL
 
     def _tell_loaded(self, writer: asyncio.StreamWriter, reply: bytes | None = None) -> None:
-        """Send the reply to who has loaded a map, if it is this one."""
+        """Send the pending reply to a client that has loaded a map; with `reply`, only if it is this one."""
         if writer in self._loaded and reply in (None, self._loaded[writer]):
             write(writer, self._loaded.pop(writer))
 
     def _release(self, writer: asyncio.StreamWriter, held: list[bytes] | None = None) -> None:
-        """Send the replies that were held for a client that learnt of a new map, if they are these."""
+        """Send the held replies of a client that has learnt of a new map; with `held`, only if they are these."""
         if writer in self._held and (held is None or held is self._held[writer]):
             for reply in self._held.pop(writer):
                 write(writer, reply)
 
     def _answer(self, call: wire.Call) -> wire.Packed:
-        """Return the response to a call."""
+        """Execute a call and return the response."""
         log.debug("%s %.200s", call.method, call.arguments)
         try:
             value = invoke(self._calls, call.method, call.arguments)
@@ -317,13 +323,13 @@ class CarlaServer:
 
 
 async def _read(reader: asyncio.StreamReader, until: float | None) -> bytes:
-    """Return what comes next; raises `TimeoutError` where nothing does until then, on the clock."""
+    """Return the next bytes. Raises `TimeoutError` if none arrive until `until`, a time of the loop's clock [s]."""
     async with asyncio.timeout_at(until):
         return await reader.read(CHUNK)
 
 
 def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
-    """Return sockets at `port` and the next one; raises `InputError` where one is in use."""
+    """Return bound sockets at `port` and the next one. Raises `InputError` where one is in use."""
     doors = []
     for number in (port, port + 1):
         try:
@@ -337,9 +343,9 @@ def open_doors(host: str, port: int) -> tuple[socket.socket, socket.socket]:
 
 
 def serve_clients(calls: Calls, doors: tuple[socket.socket, socket.socket], ready: Callable[[], None]) -> None:
-    """Serve clients until interrupted or terminated (SIGTERM), at the sockets of `open_doors`.
+    """Serve clients at the sockets of `open_doors` until interrupted or terminated (SIGTERM).
 
-    Raises `KeyboardInterrupt` once it has ended after Ctrl-C.
+    Raises `KeyboardInterrupt` after Ctrl-C.
     """
     interrupted = False
 
@@ -356,7 +362,7 @@ def serve_clients(calls: Calls, doors: tuple[socket.socket, socket.socket], read
         def end(number: int, _: object) -> None:
             nonlocal interrupted
             interrupted = number == signal.SIGINT
-            last = threading.Timer(ENDING_S, leave)  # a map that is loaded, or an image, may take longer
+            last = threading.Timer(ENDING_S, leave)  # loading a map, or an image, may take longer
             last.daemon = True
             last.start()
             loop.call_soon_threadsafe(task.cancel)

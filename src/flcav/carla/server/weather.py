@@ -1,4 +1,4 @@
-"""Weather of CARLA as the town's, and back: percentages are rain rates, visibilities and the wetness of the road."""
+"""Conversion of CARLA's weather percentages to rain rate, visibility and road wetness, and back."""
 
 from typing import TYPE_CHECKING
 
@@ -15,7 +15,7 @@ HALF_FOG = 4.5  # fog density at which the visibility is halved; at 100 it is 40
 
 
 def to_weather(told: WeatherParameters) -> Weather:
-    """Return the weather that cameras see; wind, the colour of the air and dust's colour are not shown."""
+    """Return the weather for rendering; wind and the colours of air and dust have no effect."""
     share = [min(max(value / 100, 0.0), 1.0) for value in told[:3]]
     clouds, rain, puddles = share
     haze = max(told.fog_density, told.dust_storm, 0.0) / HALF_FOG
@@ -30,7 +30,7 @@ def to_weather(told: WeatherParameters) -> Weather:
 
 
 def make_weather(weather: Weather) -> "carla.WeatherParameters":
-    """Return CARLA's parameters, percentages and degrees; rain above MOST_RAIN_MM_H is 100 %, as the densest fog is."""
+    """Return CARLA's parameters, percentages and degrees; rain above `MOST_RAIN_MM_H` and the densest fog are 100 %."""
     import carla
 
     wet = 100 * weather.wetness

@@ -1,9 +1,9 @@
 """The wire format of CARLA 0.9.16: values of remote procedure calls, batch commands and sensor streams.
 
 A call is the MessagePack array [0, id, method, [[is async], argument, ...]], its reply [1, id, nil, response]; messages
-follow each other without a length. Records are arrays of their fields, so the named tuples here are packed as they are.
-An optional is [false] or [true, value], a variant [index, value]; a response is [[1, value]], [[false]] where there is
-none, or [[0, [message]]]. Streams are little-endian: u32 size and payload, beginning with a header of 48 bytes.
+have no length prefix. Records are arrays of their fields, so the named tuples here are packed as they are. An optional
+is [false] or [true, value], a variant [index, value]; a response is [[1, value]], [[false]] without a value, or
+[[0, [message]]] for an error. Streams are little-endian: u32 size and payload, beginning with a header of 48 bytes.
 Locations are in metres, rotations pitch, yaw and roll in degrees, both in CARLA's left-handed frame.
 """
 
@@ -27,9 +27,9 @@ VEHICLE = struct.Struct("<3f3?ifB?IB")
 WALKER = struct.Struct("<4f?")
 LIGHT = struct.Struct("<32s4fI?B")
 TOKEN = struct.Struct("<IHBB16s")
-ACTOR = struct.Struct("<IB6f3f3f3f54s")  # the last are of its kind: `VEHICLE`, `WALKER` or `LIGHT`
+ACTOR = struct.Struct("<IB6f3f3f3f54s")  # the last field is `VEHICLE`, `WALKER` or `LIGHT`, by kind
 SEMANTIC_POINT = np.dtype([("xyz", "<f4", 3), ("cosine", "<f4"), ("actor", "<u4"), ("tag", "<u4")])
-FARTHEST = 1e9  # numbers beyond are refused
+FARTHEST = 1e9  # greater numbers are refused
 ACTIVE, TCP = 1, 1
 
 Vector = tuple[float, float, float]
@@ -37,7 +37,7 @@ Packed = Json | bytes  # a value on the wire
 
 
 class WireError(ValueError):
-    """A message that is none of CARLA 0.9.16."""
+    """A message that violates the protocol of CARLA 0.9.16."""
 
 
 class Stream(IntEnum):
@@ -59,23 +59,23 @@ class Stream(IntEnum):
 
 
 class Transform(NamedTuple):
-    """A pose."""
+    """A pose in CARLA's left-handed frame."""
 
-    location: Vector
-    rotation: Vector
+    location: Vector  # x, y, z [m]
+    rotation: Vector  # pitch, yaw, roll [deg]
 
 
 class BoundingBox(NamedTuple):
-    """A box in the frame of its actor, or of the world."""
+    """A bounding box in the frame of its actor, or of the world."""
 
-    location: Vector
-    extent: Vector  # half of its length, width and height
-    rotation: Vector = (0.0, 0.0, 0.0)
+    location: Vector  # of its centre [m]
+    extent: Vector  # half of its length, width and height [m]
+    rotation: Vector = (0.0, 0.0, 0.0)  # pitch, yaw, roll [deg]
     actor_id: int = 0
 
 
 class Attribute(NamedTuple):
-    """The value of an attribute of an actor."""
+    """An attribute of an actor with its value."""
 
     id: str
     type: int  # 1 Bool, 2 Int, 3 Float, 4 String, 5 RGB
@@ -83,7 +83,7 @@ class Attribute(NamedTuple):
 
 
 class Description(NamedTuple):
-    """The blueprint of an actor with its attributes."""
+    """The description of an actor: its blueprint and attributes."""
 
     uid: int
     id: str
@@ -91,7 +91,7 @@ class Description(NamedTuple):
 
 
 class Variation(NamedTuple):
-    """An attribute of a blueprint."""
+    """An attribute of a blueprint with its default and recommended values."""
 
     id: str
     type: int
@@ -106,12 +106,12 @@ class Definition(NamedTuple):
 
     uid: int
     id: str
-    tags: str  # with commas
+    tags: str  # comma-separated
     attributes: tuple[Variation, ...]
 
 
 class ActorRecord(NamedTuple):
-    """An actor."""
+    """The record of an actor that clients receive."""
 
     id: int
     parent: int
@@ -122,7 +122,7 @@ class ActorRecord(NamedTuple):
 
 
 class EpisodeSettings(NamedTuple):
-    """The settings of an episode."""
+    """The settings of an episode; times in [s], distances in [m]."""
 
     synchronous: bool = False
     no_rendering: bool = False
@@ -137,7 +137,7 @@ class EpisodeSettings(NamedTuple):
     spectator_ego: bool = True
 
     def packed(self) -> list[Any]:
-        """Return the array on the wire."""
+        """Return the settings as the array on the wire."""
         fixed = [False] if self.fixed_dt_s is None else [True, self.fixed_dt_s]
         return [self.synchronous, self.no_rendering, fixed, *self[3:]]
 
@@ -162,7 +162,7 @@ class WeatherParameters(NamedTuple):
 
 
 class VehicleControl(NamedTuple):
-    """The pedals and the steering wheel of a vehicle."""
+    """The control of a vehicle; throttle and brake are 0 to 1."""
 
     throttle: float = 0.0
     steer: float = 0.0  # -1 to 1, positive to the right
@@ -174,17 +174,17 @@ class VehicleControl(NamedTuple):
 
 
 class AckermannControl(NamedTuple):
-    """A steering angle and a speed to be reached."""
+    """An Ackermann control: target steering angle and speed."""
 
     steer: float  # [rad], positive to the right
-    steer_speed: float
+    steer_speed: float  # greatest rate of the angle [rad/s]; 0: unlimited
     speed: float  # [m/s]
-    acceleration: float
-    jerk: float
+    acceleration: float  # greatest acceleration [m/s^2]; 0: unlimited
+    jerk: float  # [m/s^3], without effect here
 
 
 class WalkerControl(NamedTuple):
-    """Direction and speed of a walker."""
+    """The control of a walker: direction and speed."""
 
     direction: Vector = (1.0, 0.0, 0.0)
     speed: float = 0.0  # [m/s]
@@ -192,22 +192,22 @@ class WalkerControl(NamedTuple):
 
 
 class CollisionEvent(NamedTuple):
-    """What a collision sensor sends."""
+    """The message of a collision sensor."""
 
     actor: ActorRecord
     other: ActorRecord
-    impulse: Vector  # [N s]
+    impulse: Vector  # on the actor [N s]
 
 
 class ObstacleEvent(NamedTuple):
-    """What an obstacle sensor sends."""
+    """The message of an obstacle sensor."""
 
     actor: ActorRecord
     other: ActorRecord
     distance: float  # [m]
 
 
-# The calls that the commands of a batch stand for, by number; their fields are the arguments.
+# The calls that batch commands correspond to, by index; their fields are the arguments.
 COMMANDS: tuple[str, ...] = (
     "spawn",
     "destroy_actor",
@@ -240,20 +240,20 @@ COMMANDS: tuple[str, ...] = (
 class Call(NamedTuple):
     """A remote procedure call."""
 
-    number: int | None  # of its reply; None: a notification, without one
+    number: int | None  # id of its reply; None: a notification, which has no reply
     method: str
     arguments: tuple[Any, ...]
 
 
 def pack_value(value: Any) -> bytes:
-    """Return a value as MessagePack."""
+    """Serialise a value as MessagePack."""
     packed = msgpack.packb(value, unicode_errors="surrogateescape")
     assert packed is not None, "it returns bytes; its types say that it may not"
     return packed
 
 
 def read_call(message: Any) -> Call:
-    """Return the call of an unpacked message; raises `WireError` where it is none."""
+    """Parse an unpacked message as a call. Raises `WireError` where it is none."""
     match message:
         case [0, int(number), str(method), [_, *arguments]]:
             return Call(number, method, tuple(arguments))
@@ -267,7 +267,7 @@ def succeed(value: Any) -> list[Any]:
     return [[1, value]]
 
 
-DONE: list[Any] = [[False]]  # the response without one
+DONE: list[Any] = [[False]]  # the response without a value
 
 
 def fail(message: str) -> list[Any]:
@@ -276,21 +276,21 @@ def fail(message: str) -> list[Any]:
 
 
 def pack_reply(number: int, response: Any) -> bytes:
-    """Return the bytes of a reply."""
+    """Serialise a reply."""
     return pack_value([1, number, None, response])
 
 
 def read(kind: Any, value: Any) -> Any:
-    """Return an unpacked value as the type `kind`: a number, text, bytes, named tuple, tuple or optional of these.
+    """Validate an unpacked value as the type `kind`: a number, text, bytes, named tuple, tuple or optional of these.
 
-    Raises `WireError` where it is none. `Any` and `Packed` take everything.
+    `Any` and `Packed` accept every value. Raises `WireError` for a value of another type.
     """
     return _reader(kind)(value)
 
 
 @lru_cache(maxsize=256)
 def _reader(kind: Any) -> Any:
-    """Return the function that reads values of a type."""
+    """Return the function that validates values of a type."""
     if kind in (Any, Packed):
         return lambda value: value
     if kind is float:
@@ -300,13 +300,13 @@ def _reader(kind: Any) -> Any:
     if kind in (bool, str, bytes):
         return lambda value: _read_plain(kind, value)
     if get_origin(kind) in (Union, UnionType):
-        inner = _reader(next(each for each in get_args(kind) if each is not type(None)))
+        inner = _reader(next(element for element in get_args(kind) if element is not type(None)))
         return lambda value: _read_optional(inner, value)
     if get_origin(kind) is tuple:
         parts = get_args(kind)
         if parts[-1] is Ellipsis:
-            each = _reader(parts[0])
-            return lambda value: tuple(each(part) for part in _array(value))
+            element = _reader(parts[0])
+            return lambda value: tuple(element(part) for part in _array(value))
         return lambda value: _read_fields(tuple, tuple(map(_reader, parts)), value)
     fields = tuple(_reader(hint) for hint in get_type_hints(kind).values())
     return lambda value: _read_fields(kind._make, fields, value)
@@ -360,54 +360,57 @@ def pack_token(stream: int, port: int) -> bytes:
 
 
 def pack_header(kind: Stream, frame: int, time_s: float, transform: Transform) -> bytes:
-    """Return the header of a payload: the frame, its time and the sensor's pose."""
+    """Serialise the header of a payload: frame number, simulation time [s] and pose of the sensor."""
     return HEADER.pack(kind, frame, time_s, *transform.location, *transform.rotation)
 
 
 def pack_world(episode: int, platform_s: float, dt_s: float, actors: Sequence[bytes]) -> bytes:
-    """Return the body of the world's state."""
+    """Serialise the body of the world state.
+
+    `platform_s` is the wall-clock time [s], `dt_s` the length of the tick [s].
+    """
     return WORLD.pack(episode, platform_s, dt_s, 0, 0, 0, 0) + b"".join(actors)
 
 
 def pack_actor(actor: int, transform: Transform, motion: Sequence[Vector], union: bytes = b"") -> bytes:
-    """Return the state of one actor; `motion` is velocity [m/s], angular velocity [deg/s] and acceleration [m/s^2]."""
+    """Serialise an actor's state; `motion` is velocity [m/s], angular velocity [deg/s] and acceleration [m/s^2]."""
     return ACTOR.pack(
         actor, ACTIVE, *transform.location, *transform.rotation, *motion[0], *motion[1], *motion[2], union
     )
 
 
 def pack_vehicle(control: VehicleControl, gear: int, limit_kmh: float, light: int, at_light: bool, by: int) -> bytes:
-    """Return the state of a vehicle: its control, the speed limit, and the light that it stands at (actor `by`)."""
+    """Serialise a vehicle's state: control, speed limit [km/h], and the traffic light it is at (actor `by`)."""
     return VEHICLE.pack(*control[:6], gear, limit_kmh, light, at_light, by, 0)
 
 
 def pack_walker(control: WalkerControl) -> bytes:
-    """Return the state of a walker."""
+    """Serialise a walker's state."""
     return WALKER.pack(*control.direction, control.speed, control.jump)
 
 
 def pack_light(
     sign: str, times_s: tuple[float, float, float], elapsed_s: float, pole: int, frozen: bool, state: int
 ) -> bytes:
-    """Return the state of a traffic light: its id in OpenDRIVE, the times of green, yellow and red, its colour."""
+    """Serialise a traffic light's state: OpenDRIVE id, times of green, yellow and red [s], time in its state [s]."""
     return LIGHT.pack(sign.encode()[:31], *times_s, elapsed_s, pole, frozen, state)
 
 
 def pack_sign(sign: str) -> bytes:
-    """Return the state of a traffic sign: its id in OpenDRIVE."""
+    """Serialise a traffic sign's state: its OpenDRIVE id."""
     return sign.encode()[:31]
 
 
 def pack_image(width: int, height: int, fov_deg: float, bgra: NDArray[np.uint8]) -> bytes:
-    """Return the body of an image (H, W, 4) of blue, green, red and alpha."""
+    """Serialise an image (H, W, 4) of blue, green, red and alpha."""
     return struct.pack("<IIf", width, height, fov_deg) + bgra.tobytes()
 
 
 def pack_lidar(angle_rad: float, per_channel: NDArray[np.integer], points: NDArray[Any]) -> bytes:
-    """Return the body of a sweep: points channel after channel, as rows of float32 or of `SEMANTIC_POINT`."""
+    """Serialise a LiDAR sweep: points channel by channel, as rows of float32 or of `SEMANTIC_POINT`."""
     return struct.pack("<fI", angle_rad, len(per_channel)) + per_channel.astype("<u4").tobytes() + points.tobytes()
 
 
 def pack_record(record: Any) -> bytes:
-    """Return the body of what is sent as MessagePack: GNSS, IMU, collisions and obstacles."""
+    """Serialise a message that is sent as MessagePack: of GNSS, IMU, collision and obstacle sensors."""
     return pack_value(record)

@@ -1,1 +1,1 @@
-"""LiDAR simulation: beam patterns, ray casting, returns and their intensity, fog and rain, rolling spins, occlusion."""
+"""LiDAR simulation: beam patterns, ray casting, returns and their intensity, fog and rain, rolling spins."""

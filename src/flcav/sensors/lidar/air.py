@@ -1,8 +1,8 @@
-"""Fog and rain in front of a LiDAR: extinction, backscatter of fog, returns from drops, noise of ranges.
+"""Fog and rain in front of a LiDAR: extinction, backscatter of fog, returns from drops, range noise.
 
 Fog after Hahner et al., "Fog Simulation on Real LiDAR Point Clouds for 3D Object Detection in Adverse Weather", ICCV
 2021. With the extinction a = ln 20 / MOR and the backscattering b = 0.046 / MOR (MOR: meteorological optical range),
-the return of a surface at R0 is weaker by exp(-2 a R0) (eq. 7), and the fog before it returns (eqs. 9 and 10)
+the return of a surface at R0 is attenuated by exp(-2 a R0) (eq. 7), and the fog in front of it returns (eqs. 9 and 10)
 
     P(R) / P0' = b / b0 * integral over t in 0..2T of sin^2(pi t / 2T) x(r) exp(-2 a r) / r^2 U(R0 - r) dt,
     r = R - c t / 2,
@@ -33,27 +33,27 @@ from flcav.world.weather import Weather
 PULSE_S = 20e-9  # T, half-power width of the pulse
 SEEN_FROM_M, SEEN_WHOLLY_M = 0.9, 1.0  # ranges where the receiver's overlap x(r) leaves 0 and reaches 1
 SURFACE_PER_SR = 1e-6 / np.pi  # b0
-STEP_M = 0.1  # of ranges in the tables of fog
-REACH_M = 16.0  # fog beyond this does not raise the peak
+STEP_M = 0.1  # step of ranges in the tables of fog
+REACH_M = 16.0  # range beyond which fog does not raise the peak
 QUANTILES = 256  # of the tabulated distribution below
 SPREAD_M = (10.0 * betaincinv(2.0, 20.0, (np.arange(QUANTILES) + 0.5) / QUANTILES)).astype(np.float32)
 """Quantiles of how far behind the peak a soft return is reported: 10 m * Beta(2, 20), as published with the paper."""
 
-N0 = 8000.0  # of Marshall and Palmer [1 / m^3 / mm]
+N0 = 8000.0  # intercept of Marshall and Palmer's drop sizes [1 / m^3 / mm]
 DROP_REFLECTANCE = ((1.328 - 1) / (1.328 + 1)) ** 2  # Fresnel reflectance of water at normal incidence, 905 nm
 NEAREST_M = 1.5  # nearer drops are outside the receiver's field of view
-FARTHEST_M = 40.0  # no drop farther away is ever bright enough
+FARTHEST_M = 40.0  # drops farther away are never bright enough
 POWERS = 64  # rows of the table of powers
-SHARES = 32  # quantiles of range for each power
+SHARES = 32  # quantiles of range per power
 NO_FOG = np.zeros(1, np.float32), np.zeros(1, np.float32)
 
 
 @lru_cache(maxsize=64)
 def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Array32, Array32]:
-    """Return the peak power of the fog's return before a surface and the range [m] of that peak, by range of surface.
+    """Return the peak power of the return of fog in front of a surface, and the peak's range [m], by surface range.
 
     Both are (K,) float32; entry k is for a surface at k * STEP_M, the last for all ranges beyond. Power is relative to
-    that of a white surface at 1 m. `fog_per_m` is the extinction of the fog alone, `extinction_per_m` of fog and rain.
+    that of a white surface at 1 m. `fog_per_m` is the extinction [1/m] of fog only, `extinction_per_m` of fog and rain.
     Source: Hahner et al., eqs. 9 and 10.
     """
     r = np.arange(0.0, REACH_M + STEP_M / 2, STEP_M)
@@ -62,7 +62,7 @@ def compute_fog_returns(fog_per_m: float, extinction_per_m: float) -> tuple[Arra
     delay = 2 * (r[:, None] - r) / speed_of_light  # (received R, scattered r)
     pulse = np.where((delay >= 0) & (delay <= 2 * PULSE_S), np.sin(np.pi * delay / (2 * PULSE_S)) ** 2, 0.0)
     received = np.cumsum(pulse * answer, axis=1) * (2 * STEP_M / speed_of_light)  # (R, R0), integrated over t
-    received = np.triu(received)  # no fog is seen behind the surface
+    received = np.triu(received)  # fog behind the surface does not return
     backscatter = 0.046 * fog_per_m / np.log(20.0)
     power = received.max(axis=0) * backscatter / SURFACE_PER_SR
     return power.astype(np.float32), r[received.argmax(axis=0)].astype(np.float32)
@@ -82,14 +82,14 @@ def rain_extinction(rain_mm_h: float) -> float:
 
 
 def rain_range_noise(rain_mm_h: float) -> float:
-    """Return the standard deviation of the measured range over the range (Goodin et al., eq. 8)."""
+    """Return the standard deviation of the measured range, relative to the range (Goodin et al., eq. 8)."""
     return 0.02 * (1 - np.exp(-rain_mm_h)) ** 2
 
 
 def compute_drops(rain_mm_h: float, extinction_per_m: float, divergence_rad: float, least_power: float) -> Drops:
-    """Return the distribution of the brightest drop in rain of `rain_mm_h` > 0, for powers of `least_power` and more.
+    """Return the distribution of the brightest drop in rain, `rain_mm_h` > 0 [mm/h], for powers from `least_power` on.
 
-    `extinction_per_m` is that of fog and rain; the beam is `divergence_rad` times the range wide. Source: LISA.
+    `extinction_per_m` [1/m] is that of fog and rain, the beam's width is `divergence_rad` times the range (LISA).
     """
     slope = 4.1 * rain_mm_h**-0.21  # L [1/mm]
     edges = np.linspace(NEAREST_M, FARTHEST_M, 512)
@@ -112,21 +112,21 @@ NO_DROPS = Drops(np.zeros(1, np.float32), np.zeros(1, np.float32), np.zeros((1, 
 
 
 class Air(NamedTuple):
-    """Extinction, fog and rain along a LiDAR's beams; powers are relative to that of a white surface at 1 m."""
+    """The effect of fog and rain on a LiDAR's beams; powers are relative to that of a white surface at 1 m."""
 
     two_way_per_m: float  # twice the extinction coefficient
-    range_noise: float  # standard deviation of the measured range over the range
-    soft_power: Array32  # (K,) peak of the fog's return before a surface at k * STEP_M; zero without fog
-    soft_range_m: Array32  # (K,) range of that peak
+    range_noise: float  # standard deviation of the measured range, relative to the range
+    soft_power: Array32  # (K,) peak of the return of fog in front of a surface at k * STEP_M; zero without fog
+    soft_range_m: Array32  # (K,) range of that peak [m]
     drop_number: Array32  # (L,) mean number of drops in a beam brighter than `drop_power`; zero without rain
     drop_power: Array32  # (L,) descending
-    drop_range_m: Array32  # (L, SHARES) quantiles of a drop's range
+    drop_range_m: Array32  # (L, SHARES) quantiles of a drop's range [m]
 
 
 def compute_air(weather: Weather, divergence_rad: float, least_power: float) -> Air | None:
-    """Return the extinction, fog and rain of `weather`; None where there is neither fog nor rain.
+    """Return the effect of fog and rain in `weather`; None without fog and rain.
 
-    A beam is `divergence_rad` times the range wide; drops whose return is below `least_power` are left out.
+    A beam's width is `divergence_rad` times the range; drops with a return below `least_power` are left out.
     """
     rain, fog = weather.rain_mm_h, weather.fog_per_m
     if rain == 0 and fog == 0:
@@ -140,13 +140,15 @@ def compute_air(weather: Weather, divergence_rad: float, least_power: float) -> 
 def add_air_returns(
     distance: Array32, brightness: Array32, air: Air, rng: np.random.Generator
 ) -> tuple[Array32, Array32, Mask]:
-    """Return the strongest return of each of N rays: distance [m], brightness, whether fog or rain sent it; each (N,).
+    """Return (N,) distances [m] and brightnesses of the strongest returns of N rays, and whether fog or rain sent them.
 
-    `distance` and `brightness` (N,) are those in clear air: inf and 0 where a ray meets nothing. Brightness is power
-    times the squared distance: 1 for a white surface at normal incidence.
+    `distance` and `brightness` (N,) are those in clear air: inf and 0 for a ray without a hit. Brightness is power
+    times squared distance: 1 for a white surface at normal incidence.
     """
     rays = len(distance)
-    brightest = rng.standard_exponential(rays, np.float32)  # m(P) of the brightest drop's power P
+    # The number of drops brighter than P is Poisson with the mean m(P), so m of the brightest drop's power is
+    # exponentially distributed: no drop needs to be drawn.
+    brightest = rng.standard_exponential(rays, np.float32)
     place = rng.integers(SHARES, size=rays, dtype=np.uint8)
     behind = rng.integers(QUANTILES, size=rays, dtype=np.uint8)
     distance, brightness, aerial = distance.copy(), brightness.copy(), np.zeros(rays, np.bool_)

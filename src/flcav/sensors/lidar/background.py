@@ -1,9 +1,9 @@
-"""The static background of a LiDAR that stands still, and the returns in front of it.
+"""Background filtering for a stationary LiDAR: the static background by direction, and the returns in front of it.
 
-The background of a direction is the farthest return that was ever seen there: whatever is nearer at another time has
-come between. An object that stands at its place in every sweep, such as a car parked there all the time, becomes
-background. That sweeps of roadside LiDARs are filtered first: Zhao et al., "Detection and tracking of pedestrians and
-vehicles using roadside LiDAR sensors", Transportation Research Part C 100, 2019.
+The background of a direction is the farthest return ever observed there; a nearer return at another time is in the
+foreground. An object that is in the same place in all sweeps, such as a permanently parked car, becomes background.
+Background filtering of roadside LiDARs: Zhao et al., "Detection and tracking of pedestrians and vehicles using roadside
+LiDAR sensors", Transportation Research Part C 100, 2019.
 """
 
 from collections.abc import Iterable
@@ -13,23 +13,21 @@ import numpy as np
 
 from flcav.arrays import Array32, Ints, Mask
 
-STEP_DEG = 0.1  # edge of a direction's bin: smaller than the angle between two beams
-OFFSET_DEG = 0.037  # of the bins' edges, so that beams at round angles do not fall on an edge
+STEP_DEG = 0.1  # side of a direction's bin: smaller than the angle between two beams
+OFFSET_DEG = 0.037  # offset of the bins' edges, so that beams at round angles do not fall on an edge
 COLUMNS = round(360 / STEP_DEG)
-MARGIN_M = (
-    0.15  # a return must be this much nearer than the background: several standard deviations of the range's error
-)
+MARGIN_M = 0.15  # margin in front of the background: several standard deviations of the range error
 
 
 @dataclass(frozen=True)
 class Background:
-    """The range of the background by direction, of D directions that had a return; sensor frame."""
+    """The range of the background by direction, for the D directions with a return; sensor frame."""
 
-    direction: Ints  # (D,) ascending numbers of bins of STEP_DEG in azimuth and elevation
-    range_m: Array32  # (D,) the farthest return
+    direction: Ints  # (D,) ascending indices of bins of STEP_DEG in azimuth and elevation
+    range_m: Array32  # (D,) farthest return [m]
 
     def in_front(self, points: Array32) -> Mask:
-        """Return (N,) whether each point (N, >= 3) lies before the background, or where none was ever seen."""
+        """Return (N,) whether points (N, >= 3) [m] are in front of the background, or in a direction without any."""
         direction, range_m = _to_polar(points)
         row = np.searchsorted(self.direction, direction)
         row[row == len(self.direction)] = 0
@@ -39,15 +37,15 @@ class Background:
 
 
 def learn_background(sweeps: Iterable[Array32]) -> Background:
-    """Return the background of a LiDAR from its sweeps (N, >= 3) x, y, z [m], sensor frame, all from the same pose.
+    """Learn the background of a LiDAR from its sweeps (N, >= 3) x, y, z [m], sensor frame, all from the same pose.
 
-    With sweeps of eight scenes or more hardly any place is occupied in all of them.
+    With sweeps of eight scenes or more, hardly any place is occupied in all of them.
     """
-    found = Background(np.zeros(0, np.int64), np.zeros(0, np.float32))
+    background = Background(np.zeros(0, np.int64), np.zeros(0, np.float32))
     for sweep in sweeps:
         direction, range_m = _to_polar(sweep)
-        found = _farthest(np.append(found.direction, direction), np.append(found.range_m, range_m))
-    return found
+        background = _farthest(np.append(background.direction, direction), np.append(background.range_m, range_m))
+    return background
 
 
 def _farthest(direction: Ints, range_m: Array32) -> Background:
@@ -57,7 +55,7 @@ def _farthest(direction: Ints, range_m: Array32) -> Background:
 
 
 def _to_polar(points: Array32) -> tuple[Ints, Array32]:
-    """Return the bins (N,) and ranges (N,) [m] of points (N, >= 3)."""
+    """Return the bins (N,) and ranges (N,) [m] of points (N, >= 3) [m], sensor frame."""
     x, y, z = points[:, :3].astype(np.float64).T
     flat = np.hypot(x, y)
     azimuth = np.degrees(np.arctan2(y, x)) % 360 + OFFSET_DEG

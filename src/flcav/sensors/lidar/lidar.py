@@ -2,18 +2,16 @@
 
 The power received from a surface, relative to that of a white one at normal incidence at 1 m, is
 P = reflectivity * cos(incidence) / R^2; it is detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
-Rain, fog and wet roads change P; in clear weather they cost nothing and draw no random numbers.
+Rain, fog and wet roads change P; clear weather needs no computation for them and draws no random numbers.
 
-Beam patterns of LiDAR models, from their makers' data sheets, and the LiDAR returns of CARLA.
-
-Patterns are for `beams: <name>` in a rig: Velodyne VLP-16 (63-9229), HDL-32E (97-0038), VLP-32C (63-9378),
-HDL-64E (63-HDL64E), VLS-128 "Alpha Prime" (63-9679) at 10 spins a second, and Ouster OS1-128 in its mode 1024x10.
-Elevations are nominal: those of a unit differ by some hundredths of a degree.
+Beam patterns for `beams: <name>` in a rig are from the makers' data sheets: Velodyne VLP-16 (63-9229), HDL-32E
+(97-0038), VLP-32C (63-9378), HDL-64E (63-HDL64E), VLS-128 "Alpha Prime" (63-9679) at 10 spins per second, and Ouster
+OS1-128 in its mode 1024x10. Elevations are nominal: those of a unit differ by some hundredths of a degree.
 
 CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
-intensity exp(-a d), whatever the surface. A share of all rays is lost; of the rest, returns with an intensity below a
-limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather plays no
-part.
+intensity exp(-a d), independent of the surface. A share of all rays is lost; of the rest, returns with an intensity
+below a limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather
+has no effect.
 """
 
 from functools import lru_cache
@@ -43,9 +41,9 @@ from flcav.world.weather import Weather
 class Beams(NamedTuple):
     """The beam pattern and range of a LiDAR model."""
 
-    elevations_deg: tuple[float, ...]  # of each channel, from the highest
+    elevations_deg: tuple[float, ...]  # per channel, from the highest
     azimuth_steps: int  # firings per spin
-    range_m: float  # largest range
+    range_m: float  # maximum range [m]
 
 
 def _even(high: float, low: float, count: int) -> tuple[float, ...]:
@@ -86,10 +84,10 @@ class CarlaReturns(Config):
 def carla_returns(
     settings: CarlaReturns, directions: Array32, distance: Array32, noise_m: Array32, rng: np.random.Generator
 ) -> tuple[Array32, Ints]:
-    """Return the point cloud of CARLA's LiDAR and the ray (M,) of each point.
+    """Return the point cloud of CARLA's LiDAR, and the rays (M,) of its points.
 
-    Points (M, 4) are x, y, z [m] in the sensor's frame and intensity. `directions` (N, 3) are unit rays, `distance`
-    (N,) leads to the surfaces met (inf where none), `noise_m` (N,) are the errors of the measured ranges.
+    Points (M, 4) are x, y, z [m], sensor frame, and intensity. `directions` (N, 3) are unit rays, `distance` (N,) [m]
+    the distances of the hits (inf where none), `noise_m` (N,) the errors of the measured ranges.
     """
     intensity = np.exp(-settings.atmosphere_attenuation_rate * distance)
     at_zero, limit = settings.dropoff_zero_intensity, settings.dropoff_intensity_limit
@@ -164,18 +162,18 @@ class Lidar(Config):
 
 
 class Scan(NamedTuple):
-    """The point cloud of one spin, and the rays behind it."""
+    """The point cloud of one spin, and its rays."""
 
-    points: Array32  # (M, 4) x, y, z [m] in the sensor's frame, intensity in [0, 1]
-    actor: Ints32  # (M,) the trace's actor that each point comes from; -1 for the town, rain and fog
-    passes: Mask  # (N,) whether each ray of the pattern passes the panes of glass that it meets
-    returns: Returns  # the surface that each ray returns from
+    points: Array32  # (M, 4) x, y, z [m], sensor frame, intensity in [0, 1]
+    actor: Ints32  # (M,) row of the trace's actor that the point is on; -1 for the town, rain and fog
+    passes: Mask  # (N,) whether the ray passes the panes of glass that it meets
+    returns: Returns  # the surfaces that the N rays return from
 
 
 def build_ray_pattern(lidar: Lidar) -> Array32:
     """Return the ray directions of one spin: (channels * azimuth_steps, 3) unit vectors, sensor frame; read-only.
 
-    Channel after channel from the highest; within a channel, azimuth runs counter-clockwise from straight ahead.
+    They are ordered by channel from the highest; within a channel, azimuth runs counter-clockwise from straight ahead.
     """
     return _build_ray_pattern(lidar.channels, lidar.up_deg, lidar.down_deg, lidar.elevations_deg, lidar.azimuth_steps)
 
@@ -193,15 +191,15 @@ def _build_ray_pattern(
 
 
 def draw_passes(lidar: Lidar, rng: np.random.Generator) -> Mask:
-    """Return for each ray of the pattern whether it passes all panes of glass that it meets: (N,), drawn at random."""
+    """Draw (N,) whether rays of the pattern pass all panes of glass that they meet."""
     return rng.random(lidar.channels * lidar.azimuth_steps, np.float32) < lidar.glass_pass
 
 
 def cast(scene: Scene, world_from_sensor: Array, lidar: Lidar, passes: Mask, hidden: int | None = None) -> Returns:
-    """Return the surface within range from which each ray of one spin returns, in a world without the actor `hidden`.
+    """Cast the rays of one spin; return the surfaces within range that they return from, without the actor `hidden`.
 
-    `passes` (N,) marks the rays that go through glass. A rolling LiDAR rides on `hidden`; it stands still where that is
-    None.
+    `world_from_sensor` (4, 4) [m] is the sensor's pose; `passes` (N,) marks rays that pass through glass. A rolling
+    LiDAR moves with `hidden`, its carrier, or is stationary if that is None.
     """
     pattern, surfaces = build_ray_pattern(lidar), scene.surfaces
 
@@ -215,13 +213,15 @@ def cast(scene: Scene, world_from_sensor: Array, lidar: Lidar, passes: Mask, hid
 
     if not lidar.rolling:
         return part(world_from_sensor, slice(None))
-    steps, count = lidar.azimuth_steps, len(pattern)
+    # The sensor and the traffic move during a rolling spin: sectors are cast one by one, at their own times.
+    steps = lidar.azimuth_steps
+    count = len(pattern)
     numbers, kinds = np.empty((2, count), np.int32), np.empty((2, count), np.uint8)
     whole = Returns(np.empty(count, np.float32), numbers[0], numbers[1], kinds[0], kinds[1])
     for columns, pose in step_sectors(scene, world_from_sensor, steps, 1 / lidar.rate_hz, hidden):
         rays = (np.arange(lidar.channels)[:, None] * steps + columns).ravel()
-        for values, found in zip(whole, part(pose, rays)):
-            values[rays] = found
+        for values, sector_values in zip(whole, part(pose, rays)):
+            values[rays] = sector_values
     return whole
 
 
@@ -233,9 +233,9 @@ def measure_points(
     rng: np.random.Generator,
     weather: Weather | None = None,
 ) -> tuple[Array32, Ints32]:
-    """Return the points that the detector reports, (M, 4), and the actor (M,) each comes from: see `Scan`.
+    """Return the detected points (M, 4) of a spin and the actors (M,) that they are on: see `Scan`.
 
-    `echoes` are the surfaces from which the spin's rays return, `weather` is clear by default.
+    `echoes` are the surfaces that the spin's rays return from; `weather` is clear by default.
     """
     rays = len(echoes.distance)
     chance = rng.random(rays, np.float32)
@@ -251,7 +251,8 @@ def measure_points(
     bright = compute_brightness(
         echoes, build_ray_pattern(lidar), scene.surfaces, sensor_from_instance, weather.wetness, lidar.roughness_rad
     )
-    distance, least_power = echoes.distance, 0.9 / lidar.sensitivity_m**2
+    distance = echoes.distance
+    least_power = 0.9 / lidar.sensitivity_m**2
     air = compute_air(weather, lidar.divergence_rad, 0.7 * least_power)
     if air is not None:
         distance, bright, aerial = add_air_returns(distance, bright, air, rng)
@@ -277,7 +278,7 @@ def measure_points(
 
 
 def compress_intensity(points: Array32, lidar: Lidar) -> None:
-    """Raise the intensities of `points` (N, 4) to the sensor's gamma, in place."""
+    """Apply the sensor's gamma and floor to the intensities of `points` (N, 4), in place."""
     if lidar.intensity_gamma != 1:
         points[:, 3] **= np.float32(lidar.intensity_gamma)
     if lidar.intensity_floor > 0:
@@ -292,9 +293,9 @@ def scan(
     hidden: int | None = None,
     weather: Weather | None = None,
 ) -> Scan:
-    """Return the point cloud of one spin at the scene's instant, without the actor `hidden` (the carrier).
+    """Simulate one spin at the scene's instant, without the actor `hidden` (the carrier).
 
-    `weather` is clear by default.
+    `world_from_sensor` (4, 4) [m] is the sensor's pose; `weather` is clear by default.
     """
     passes = draw_passes(lidar, rng)
     returns = cast(scene, world_from_sensor, lidar, passes, hidden)
@@ -302,8 +303,8 @@ def scan(
 
 
 def point_times_s(lidar: Lidar, points: Array32) -> Array32:
-    """Return the time (N,) of each of `points` (N, >=2, sensor frame) after the middle of the spin [s].
+    """Return the times (N,) of points (N, >=2), sensor frame, relative to the middle of the spin [s].
 
-    From -0.5 / `rate_hz` to 0.5 / `rate_hz` for a rolling LiDAR, else 0.
+    They are from -0.5 / `rate_hz` to 0.5 / `rate_hz` for a rolling LiDAR, else 0.
     """
     return time_in_spin_s(points, 1 / lidar.rate_hz) if lidar.rolling else np.zeros(len(points), np.float32)

@@ -1,4 +1,4 @@
-"""LiDAR returns: surfaces met through panes of glass, their brightness (reflectance models), and detection.
+"""LiDAR returns: surfaces behind panes of glass, their brightness (reflectance models), and detection.
 
 Reflectance is Lambertian, Oren-Nayar for rough surfaces, stronger for retro-reflectors, and lower on wet roads.
 """
@@ -13,34 +13,34 @@ from flcav.machine.compiled import compiled
 from flcav.world.materials import Material
 from flcav.world.rays.packets import Hits
 
-PANES = 6  # more panes than these stop a ray
-PANE_TRANSMISSION = 0.8  # of the power, both ways together
+PANES = 6  # number of panes that a ray can pass
+PANE_TRANSMISSION = 0.8  # two-way transmittance of a pane
 RETRO_GAIN = 4.0  # factor of a retro-reflector's reflectivity, at any incidence
 GLASS = int(Material.GLASS)
 ROAD, SIDEWALK = int(Material.ROAD), int(Material.SIDEWALK)
-WATER_INDEX = 1.33  # of refraction
+WATER_INDEX = 1.33  # refractive index
 TURNED_BACK = 1 - (1 - 0.066) / WATER_INDEX**2  # p: share of diffuse light that the film reflects back down
-AFTER_PANE_M = 0.002  # a ray goes on so far behind a pane
+AFTER_PANE_M = 0.002  # distance behind a pane from which a ray is cast again
 ROUGH = np.array(
     [
         name in ("GROUND", "ROAD", "SIDEWALK", "WALL", "ROOF", "BARK", "LEAF", "CLOTH", "TROUSERS")
         for name in Material.__members__
     ]
 )
-LEVELS = 4096
+LEVELS = 4096  # of the tabulated normal distribution
 QUANTILES = ndtri((np.arange(LEVELS) + 0.5) / LEVELS).astype(np.float32)  # of the normal distribution
 
 
 class CastRays(Protocol):
-    """A ray caster over a fixed set of rays, given the indices of those to cast: see `embree.Hierarchy.trace`."""
+    """A ray caster over a fixed set of rays, called with the indices of those to cast: see `embree.Hierarchy.trace`."""
 
     def __call__(self, rays: Ints | slice, *, near_m: Array32 | None = None) -> Hits:
-        """Return the first hits of `rays`, beyond `near_m` (one for each of them) where given."""
+        """Return the first hits of `rays`, beyond `near_m` (one distance per ray [m]) if given."""
         ...
 
 
 class Returns(NamedTuple):
-    """The surface from which each of N LiDAR rays returns."""
+    """The surfaces that N LiDAR rays return from."""
 
     distance: Array32  # (N,) [m]; inf where none
     instance: Ints32  # (N,) instance of the scene; -1 where none
@@ -50,19 +50,19 @@ class Returns(NamedTuple):
 
 
 def cast_through_glass(trace: CastRays, passes: Mask, first: Ints, material: Bytes) -> Returns:
-    """Return the surface from which each of N rays returns; rays marked in `passes` (N,) go through up to PANES panes.
+    """Return the surfaces that N rays return from; rays marked in `passes` (N,) pass through up to PANES panes.
 
-    Face f of instance i is of `material[first[i] + f]`.
+    Face f of instance i has the material `material[first[i] + f]`.
     """
     hits = trace(slice(None))
-    found, through = _look_up(hits.instance, hits.face, first, material, passes, GLASS)
-    echoes = Returns(*hits, found, np.zeros(len(passes), np.uint8))
+    materials, through = _look_up(hits.instance, hits.face, first, material, passes, GLASS)
+    echoes = Returns(*hits, materials, np.zeros(len(passes), np.uint8))
     for _ in range(PANES):
         if not len(through):
             break
         beyond = trace(through, near_m=echoes.distance[through] + np.float32(AFTER_PANE_M))
-        found, again = _look_up(beyond.instance, beyond.face, first, material, passes[through], GLASS)
-        for known, further in zip(echoes, (*beyond, found)):
+        materials, again = _look_up(beyond.instance, beyond.face, first, material, passes[through], GLASS)
+        for known, further in zip(echoes, (*beyond, materials)):
             known[through] = further
         echoes.panes[through] += 1
         through = through[again]
@@ -71,27 +71,27 @@ def cast_through_glass(trace: CastRays, passes: Mask, first: Ints, material: Byt
 
 @compiled
 def _look_up(instance, face, first, material, passes, glass):
-    """Return the material (N,) at each ray's hit, and the indices of the rays that hit glass and pass it."""
-    found = np.zeros(len(instance), np.uint8)
+    """Return the materials (N,) at the hits, and the indices of the rays that hit glass and pass it."""
+    materials = np.zeros(len(instance), np.uint8)
     through = np.empty(len(instance), np.int64)
     count = 0
     for ray in range(len(instance)):
         if instance[ray] >= 0:
-            found[ray] = material[first[instance[ray]] + face[ray]]
-            if found[ray] == glass and passes[ray]:
+            materials[ray] = material[first[instance[ray]] + face[ray]]
+            if materials[ray] == glass and passes[ray]:
                 through[count] = ray
                 count += 1
-    return found, through[:count]
+    return materials, through[:count]
 
 
 @compiled
 def compute_brightness(echoes, directions, surfaces, sensor_from_instance, wetness, roughness=0.0):
-    """Return the brightness of each ray's surface, reflectivity * cos(incidence): (N,) float32, 0 where there is none.
+    """Return the brightness of the hit surfaces, reflectivity * cos(incidence): (N,) float32, 0 where nothing is hit.
 
     It is 1 for a white surface at normal incidence. `directions` (N, 3) are unit rays, sensor frame;
     `sensor_from_instance` (I, 3, 3) rotates normals into that frame. A water film dims roads and sidewalks in
-    proportion to `wetness` (0 to 1). Ground, masonry, plants and cloth are Oren-Nayar surfaces of slope deviation
-    `roughness` [rad]. Each pane on the way costs PANE_TRANSMISSION.
+    proportion to `wetness` (0 to 1). Ground, masonry, plants and cloth are Oren-Nayar surfaces with slope deviation
+    `roughness` [rad]. Panes on the way attenuate by PANE_TRANSMISSION.
     """
     _, instance, face, materials, panes = echoes
     turn = sensor_from_instance.reshape(-1, 9)
@@ -126,10 +126,11 @@ def compute_brightness(echoes, directions, surfaces, sensor_from_instance, wetne
 
 @compiled
 def compute_oren_nayar(cosine, roughness):
-    """Return the Oren-Nayar reflectance, seen from the light, over that of a Lambertian surface at normal incidence.
+    """Return the monostatic Oren-Nayar reflectance, over that of a Lambertian surface at normal incidence.
 
-    `cosine` is that of the incidence, `roughness` the standard deviation of the facets' slopes [rad]. Source: Oren and
-    Nayar, "Generalization of Lambert's reflectance model", SIGGRAPH 1994, eq. 30, for equal directions in and out.
+    `cosine` is that of the angle of incidence, `roughness` the standard deviation of the facets' slopes [rad]. Source:
+    Oren and Nayar, "Generalization of Lambert's reflectance model", SIGGRAPH 1994, eq. 30, for equal directions of
+    incidence and reflection.
     """
     square = roughness * roughness
     flat = 1 - 0.5 * square / (square + 0.33)
@@ -140,9 +141,9 @@ def compute_oren_nayar(cosine, roughness):
 def compute_wet_brightness(cosine, reflectivity):
     """Return the brightness of a diffuse surface under a water film, relative to dry: (1 - F)^2 / n^2 / (1 - p a).
 
-    F is the film's Fresnel reflectance at the incidence of that `cosine`, n the refractive index, p the share that the
-    film reflects back down, a the `reflectivity`: Lekner and Dorf, "Why some things are darker when wet", Applied
-    Optics 27:1278 (1988).
+    F is the film's Fresnel reflectance at the angle of incidence with this `cosine`, n the refractive index, p the
+    share of light that the film reflects back down, a the `reflectivity`: Lekner and Dorf, "Why some things are darker
+    when wet", Applied Optics 27:1278 (1988).
     """
     inside = np.sqrt(1 - (1 - cosine**2) / WATER_INDEX**2)
     across = (cosine - WATER_INDEX * inside) / (cosine + WATER_INDEX * inside)
@@ -169,9 +170,9 @@ def detect_returns(
     """Detect returns: write the first M rows of `points` (N, 4) and `actor` (N,), and return M.
 
     A return of power P = `brightness` / `distance`^2 is detected with a probability that rises linearly from 0 at
-    0.7 P_min to `keep` at 1.3 P_min; `inverse_threshold` is 1 / P_min, `chance` (N,) in [0, 1) decides. `noise` (N,) is
-    the quantile of a normal range error of standard deviation hypot(`noise_m`, `noise_share` * distance). A point is
-    x, y, z [m] in the sensor's frame and the brightness, at most 1. `source` (N,) is the actor each return comes from.
+    0.7 P_min to `keep` at 1.3 P_min; `inverse_threshold` is 1 / P_min, `chance` (N,) uniform in [0, 1). `noise` (N,) is
+    the quantile of a normal range error with standard deviation hypot(`noise_m`, `noise_share` * distance) [m]. A point
+    is x, y, z [m], sensor frame, and the brightness, at most 1. `source` (N,) is the actor that a return comes from.
     """
     count = 0
     for ray in range(len(directions)):

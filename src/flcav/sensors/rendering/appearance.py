@@ -1,4 +1,4 @@
-"""Appearance tables of a scene: materials, semantic classes, colours and textures, by surface row and instance."""
+"""Appearance tables of a scene: materials, semantic classes, colours and textures of its faces and instances."""
 
 import zlib
 from collections.abc import Mapping
@@ -53,9 +53,9 @@ _RIDER = (Material.SKIN, Material.CLOTH, Material.TROUSERS)
 class Plates(NamedTuple):
     """The plates of a town's traffic signs: places, kinds and textures."""
 
-    place: Array32  # (S, 5) centre x, y, z, cosine and sin of the direction to the reader's right
+    place: Array32  # (S, 5) centre x, y, z [m], cosine and sine of the direction to the reader's right, world frame
     kind: Bytes  # (S,) row of SIGN_KINDS
-    drawn: Array32  # see `signs.pictures`
+    drawn: Array32  # mip-maps, see `draw_signs`
 
 
 class Appearance(NamedTuple):
@@ -64,27 +64,27 @@ class Appearance(NamedTuple):
     material: Bytes  # (S,) by surface row
     semantic: Bytes  # (S,) one of SEMANTICS
     thing: Ints32  # (S,) -(t + 1) for thing t of the town, else 0
-    part: Bytes  # (S,) a Part; undefined for actors
+    part: Bytes  # (S,) a `TownPart`; undefined for actors
     part_row: Ints32  # (S,) see `StaticWorld.row`
-    first_actor: int  # first surface row of the actors' faces; the town's come before
-    corner: Array32  # (S - first_actor, 3, 3) corners of actors' faces, body frame
+    first_actor: int  # first surface row of the actors' faces, which follow the town's
+    corner: Array32  # (S - first_actor, 3, 3) corners of actors' faces, body frame [m]
     corner_normal: Array32  # (S - first_actor, 3, 3) see `Mesh.corner_normals`
-    colour: Array32  # (I, M, 3) by instance and material: actors differ in paint and clothes
+    colour: Array32  # (I, M, 3) linear RGB by instance and material: actors differ in paint and clothes
     mirror: Array32  # (M,) specular reflectance at normal incidence
     gloss: Array32  # (M,) exponent of the sun's highlight
     markings: Markings
     facades: Facades
     plates: Plates
-    noise: Array32  # see `noise.clouds`
+    noise: Array32  # see `make_noise`
 
 
-_AS = {"van": "car", "prop": "static"}  # categories without a class of their own
+_AS = {"van": "car", "prop": "static"}  # categories without a semantic class
 _KNOWN: WeakKeyDictionary[Scene, tuple[Surfaces, Appearance]] = WeakKeyDictionary()
 _TOWNS: WeakKeyDictionary[Solid, Appearance] = WeakKeyDictionary()  # of towns without actors
 
 
 def build_appearance(scene: Scene) -> Appearance:
-    """Return the appearance tables of `scene`: cached, the same for all instants with the same actors."""
+    """Return the appearance tables of `scene`; they are cached, and shared by all instants with the same actors."""
     if scene not in _KNOWN or _KNOWN[scene][0] is not scene.surfaces:
         if scene.town_solid not in _TOWNS:
             _TOWNS[scene.town_solid] = _of_town(scene)
@@ -93,7 +93,7 @@ def build_appearance(scene: Scene) -> Appearance:
 
 
 def _of_town(scene: Scene) -> Appearance:
-    """Return the appearance of a scene's town alone, whose faces come first in the scene."""
+    """Return the appearance of a scene's town without actors; its faces come first in the scene."""
     town = scene.town
     world, signs = build_static_world(town), town.signs
     numbers = np.array([SEMANTICS[_OF_PART[TownPart(value)]] for value in range(len(TownPart))], np.uint8)
@@ -121,7 +121,7 @@ def _of_town(scene: Scene) -> Appearance:
 
 
 def _add_actors(scene: Scene, of_town: Appearance) -> Appearance:
-    """Return the appearance of a scene from that of its town alone."""
+    """Return the appearance of a scene: that of its town, extended by the actors' faces."""
     surfaces, trace = scene.surfaces, scene.trace
     actors = len(of_town.part)
     beyond = (0, len(surfaces.material) - actors)  # the faces of the actors follow the town's
@@ -155,7 +155,7 @@ def _corners(category: str, shape: int, size: tuple[float, ...]) -> tuple[Array3
 
 
 def _colours(names: list[str], paints_of: Mapping[str, tuple[float, float, float]]) -> Array32:
-    """Return the colours (I, M, 3) by instance and material, chosen by a hash of each actor's name, or its paint."""
+    """Return the colours (I, M, 3) by instance and material, chosen by a hash of the actor's name, or its paint."""
     out = np.tile(COLOUR, (len(names) + 1, 1, 1))
     for instance, name in enumerate(names, start=1):
         number = zlib.crc32(name.encode())

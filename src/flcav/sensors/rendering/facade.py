@@ -1,8 +1,7 @@
 """Textures of facades and of traffic signs.
 
-Procedural textures of facades: plaster, brick or panels, with windows aligned to the mesh's sills and balconies.
-
-Textures of traffic signs: mip-maps, drawn once, with trilinear filtering.
+Facades are procedural: plaster, brick or panels, with windows aligned to the mesh's sills and balconies. Signs are
+mip-maps, rasterised once, with trilinear filtering.
 """
 
 from functools import lru_cache
@@ -33,27 +32,31 @@ WALLS = (  # style, linear colour
 )
 ROOFS = ((0.21, 0.062, 0.035), (0.25, 0.095, 0.05), (0.07, 0.07, 0.075), (0.14, 0.10, 0.08))
 WINDOW_M = (1.30, 1.45)  # width, height
-SILL_M = 0.95  # of a window above its floor
-FRAME_M = 0.07
+SILL_M = 0.95  # height of a window above its floor
+FRAME_M = 0.07  # width of window frames and bars
 
 
 class Facades(NamedTuple):
-    """Placement, size, style and colours of the B buildings of a town."""
+    """Pose, size, style and colours of the B buildings of a town, world frame."""
 
-    place: Array32  # (B, 4) x, y, cos and sin of the yaw
-    size: Array32  # (B, 3) length, width, height of the walls
+    place: Array32  # (B, 4) centre x, y [m], cosine and sine of the yaw
+    size: Array32  # (B, 3) length, width, height of the walls [m]
     style: Bytes  # (B,) PLASTER, BRICK or PANEL
     wall: Array32  # (B, 3) linear colour
     roof: Array32  # (B, 3) linear colour
 
 
 def facades_of(name: str, buildings: Array) -> Facades:
-    """Return the facades of `buildings` (B, 6): x, y, yaw, length, width, height. The town's `name` seeds styles."""
+    """Return the facades of `buildings` (B, 6): x, y [m], yaw [rad], length, width, height [m], world frame.
+
+    The town's `name` seeds their styles and colours.
+    """
     rng = stream(0, "walls", name)
     count = len(buildings)
     kind = rng.integers(len(WALLS), size=count)
     tint = 1 + 0.10 * rng.standard_normal((count, 1)) + 0.03 * rng.standard_normal((count, 3))
-    yaw, height = buildings[:, 2], buildings[:, 5]
+    yaw = buildings[:, 2]
+    height = buildings[:, 5]
     gabled = height < GABLED_BELOW_M
     walls = np.where(gabled, 0.68 * height, height - 0.5)
     roof = np.array(ROOFS)[rng.integers(len(ROOFS), size=count)]
@@ -69,10 +72,10 @@ def facades_of(name: str, buildings: Array) -> Facades:
 
 @inlined
 def shade_facade(building, x, y, z, nx, ny, across, slant, facades, table):
-    """Return red, green, blue, the share of glass, and the window's number, at a point of a building's wall.
+    """Return red, green, blue, the share of glass, and the window's number at a point of a building's wall.
 
-    x, y, z is the point, nx, ny the normal, world frame. `across` [m] is the pixel's footprint at normal incidence,
-    `slant` [m] the same over the cosine of the incidence.
+    x, y, z is the point [m], nx, ny the unit normal, world frame. `across` [m] is the pixel's footprint at normal
+    incidence, `slant` [m] the footprint divided by the cosine of the angle of incidence.
     """
     place, cos, sin = facades.place, facades.place[building, 2], facades.place[building, 3]
     dx, dy = x - place[building, 0], y - place[building, 1]
@@ -81,7 +84,8 @@ def shade_facade(building, x, y, z, nx, ny, across, slant, facades, table):
     if abs(side) > np.float32(0.7):
         u, v, length, number = v, u, facades.size[building, 1], 1
     else:
-        length, number = facades.size[building, 0], 0
+        length = facades.size[building, 0]
+        number = 0
     if v < 0:
         number += 2
     tone = np.float32(0.90) + np.float32(0.20) * sample_noise(table, u * 0.7 + building * 13.0, z * 0.5)
@@ -159,9 +163,9 @@ def _bricks(u, z, wide, tall):
 
 
 SIGN_KINDS = ("stop", "yield", "speed_30", "speed_60", "speed_90")
-SIDE = 128  # texels along each side of the finest level
-LEVELS = 6  # of the mip-map, each of half the size of the one before
-DRAWN = 4  # samples along each side of a texel
+SIDE = 128  # texels per side of the finest level
+LEVELS = 6  # of the mip-map, every one half the size of the one before
+DRAWN = 4  # samples per side of a texel
 
 RED, WHITE, BLACK = (0.56, 0.015, 0.020), (0.80, 0.80, 0.79), (0.012, 0.012, 0.012)
 _TEXT = {"stop": "STOP", "speed_30": "30", "speed_60": "60", "speed_90": "90"}
@@ -170,7 +174,10 @@ _TEXT_WIDTH = {"stop": 1.34, "speed_30": 0.98, "speed_60": 0.98, "speed_90": 0.9
 
 @lru_cache(maxsize=1)
 def draw_signs() -> Array32:
-    """Return mip-maps (kinds, LEVELS, SIDE, SIDE, 3), rows from the top; level l fills SIDE / 2^l rows and columns."""
+    """Rasterise the signs; return mip-maps (kinds, LEVELS, SIDE, SIDE, 3), rows from the top.
+
+    Level l fills SIDE / 2^l rows and columns.
+    """
     out = np.zeros((len(SIGN_KINDS), LEVELS, SIDE, SIDE, 3), np.float32)
     for kind, name in enumerate(SIGN_KINDS):
         picture = _draw(name)
@@ -182,7 +189,7 @@ def draw_signs() -> Array32:
 
 @inlined
 def sample_sign(kind, right, up, footprint, drawn):
-    """Return red, green, blue of a plate at `right`, `up` of its centre [m], for a pixel's `footprint` [m]."""
+    """Return red, green, blue of a plate at the offset `right`, `up` [m] from its centre, for a footprint [m]."""
     texel = np.float32(2 * SIGN_RADIUS_M / SIDE)
     level = np.log2(max(footprint / texel, np.float32(1)))
     first = min(int(level), LEVELS - 1)
@@ -211,7 +218,7 @@ def _texel(picture, u, v, side):
 
 
 def _draw(kind: str) -> Array:
-    """Return the finest level (SIDE, SIDE, 3) of a sign; texels outside its plate have the colour of its rim."""
+    """Rasterise the finest level (SIDE, SIDE, 3) of a sign; texels outside the plate have the colour of its rim."""
     count = SIDE * DRAWN
     step = (np.arange(count) + 0.5) / count * 2 - 1
     x, y = np.meshgrid(step, -step)
@@ -236,7 +243,7 @@ def _painted(inside: Mask, inner: tuple[float, ...], outer: tuple[float, ...]) -
 
 
 def _text(kind: str, x: Array, y: Array) -> Mask:
-    """Return, in the shape of `x`, which points `x`, `y` of a plate of radius 1 lie in a sign's letters."""
+    """Return, in the shape of `x`, whether points `x`, `y` of a plate with radius 1 are in a sign's letters."""
     from matplotlib.font_manager import FontProperties
     from matplotlib.textpath import TextPath
 
@@ -245,10 +252,10 @@ def _text(kind: str, x: Array, y: Array) -> Mask:
     scale = np.array([_TEXT_WIDTH[kind] / (high[0] - low[0])] * 2) * (1.0, 1.15)
     points = np.stack((x.ravel(), y.ravel()), axis=1) / scale + (low + high) / 2
     near = (np.abs(x) < _TEXT_WIDTH[kind] / 2 + 0.02) & (np.abs(y) < 0.75)
-    found = np.zeros(x.size, np.bool_)
+    inside = np.zeros(x.size, np.bool_)
     outlines = letters.to_polygons(closed_only=True)
     from matplotlib.path import Path
 
     for outline in outlines:  # even-odd rule: the holes of letters have outlines too
-        found[near.ravel()] ^= Path(outline).contains_points(points[near.ravel()])
-    return found.reshape(x.shape)
+        inside[near.ravel()] ^= Path(outline).contains_points(points[near.ravel()])
+    return inside.reshape(x.shape)

@@ -1,4 +1,4 @@
-"""G-buffer: surface, position and shading normal at each ray's hit."""
+"""G-buffer of a deferred renderer: surface, position and shading normal at the hits of rays."""
 
 from typing import NamedTuple
 
@@ -12,7 +12,7 @@ from flcav.sensors.rendering.appearance import Appearance
 from flcav.world.rays.packets import Hits
 from flcav.world.scene import Scene
 
-LIFT_M = 0.015  # offset along the normal of secondary rays' origins
+LIFT_M = 0.015  # offset of secondary rays' origins along the normal, against self-intersection
 
 
 class GBuffer(NamedTuple):
@@ -29,7 +29,7 @@ class GBuffer(NamedTuple):
         return len(self.distance)
 
     def part(self, of: slice) -> "GBuffer":
-        """Return some of the hits, as views."""
+        """Return a slice of the hits, as views."""
         near = self.ray[of], self.distance[of], self.instance[of], self.row[of]
         return GBuffer(*near, self.normal[of], self.position[of])
 
@@ -37,7 +37,7 @@ class GBuffer(NamedTuple):
 def fill_gbuffer(
     scene: Scene, appearance: Appearance, world_from_camera: Array, directions: Array32, hits: Hits, threads: int = 1
 ) -> GBuffer:
-    """Return the G-buffer of N rays `directions` (N, 3), unit, optical frame, from their `hits`."""
+    """Return the G-buffer of N hits; `directions` (N, 3) are the unit rays, optical frame."""
     count, poses = len(directions), scene.poses()
     bodies = np.zeros((len(poses) + 1, 5), np.float32)  # by instance: x, y, z, cosine and sine of the yaw
     bodies[1:] = np.c_[poses[:, :3], heading_vectors(poses[:, 3])]
@@ -50,7 +50,7 @@ def fill_gbuffer(
         np.zeros((count, 3), np.float32),
     )
     pose, rays = world_from_camera.astype(np.float32), directions.view()
-    rays.flags.writeable = False  # as some are: the loop is compiled once for all
+    rays.flags.writeable = False  # as some are: Numba compiles the loop for one type only
     first, normals = scene.surfaces.first, scene.surfaces.normal
 
     def look_up(start: int, end: int) -> None:
@@ -104,9 +104,9 @@ def _look_up(pose, directions, face, first, normals, bodies, appearance, out):
 
 @inlined
 def _smooth(x, y, z, corner, normal, face):
-    """Return the shading normal at a point of an actor's face: corner normals interpolated by barycentric coordinates.
+    """Return the shading normal at a point of an actor's face: the barycentric interpolation of the corner normals.
 
-    Body frame; unit, or zero where the corners have none.
+    The point [m] and the normal are in the body frame; it has unit length, or 0 where the corners have none.
     """
     ax, ay, az = (
         corner[face, 1, 0] - corner[face, 0, 0],

@@ -1,8 +1,8 @@
 """Procedural textures of asphalt, paving and grass, and anti-aliased road markings.
 
-Markings are rectangles in a grid. A rectangle's coverage of a pixel's footprint is the product of two overlaps of
-intervals, along and across it: exact where the footprint is aligned with the rectangle, elsewhere smooth and right in
-the mean. So lines fade with distance, without aliasing.
+Markings are rectangles in a grid. A rectangle's coverage of a pixel's footprint is the product of the overlaps of two
+intervals, along and across it: exact where the footprint is aligned with the rectangle, otherwise smooth and correct on
+average. So lines fade with distance, without aliasing.
 """
 
 from collections.abc import Iterator
@@ -22,7 +22,7 @@ from flcav.sensors.rendering.noise import fade, hash_pair, overlap, sample_noise
 from flcav.world.map.layers import Arrow, ArrowKind, MapLayers, Marking, outline_arrow, outline_stripes
 
 CELL_M = 1.0  # side of the cells of the grid
-REACH_M = 0.3  # margin around a rectangle within which cells list it
+REACH_M = 0.3  # margin around a rectangle within which grid cells list it
 STRIP_M = 0.06  # arrows are cut into strips of this length
 COLOURS = {"white": (0.68, 0.68, 0.66), "yellow": (0.62, 0.42, 0.06)}
 
@@ -32,13 +32,13 @@ JOINT_M = 0.012  # width of the joints between slabs
 
 
 class Markings(NamedTuple):
-    """Road markings as K rectangles, with a grid whose cells list those nearby."""
+    """Road markings as K rectangles, world frame, with a grid whose cells list those nearby."""
 
-    rectangle: Array32  # (K, 6) see Rectangle
-    colour: Array32  # (K, 3)
-    corner: Array  # (2,) lowest x, y of the grid
-    first: Ints32  # (cells along x, cells along y + 1) start of each cell's list
-    listed: Ints32  # lists of rows of `rectangle`, cell after cell
+    rectangle: Array32  # (K, 6) see `Rectangle` [m]
+    colour: Array32  # (K, 3) linear RGB
+    corner: Array  # (2,) lowest x, y of the grid [m]
+    first: Ints32  # (cells along x, cells along y + 1) start of a cell's list
+    listed: Ints32  # lists of rows of `rectangle`, cell by cell
 
 
 def build_markings(layers: MapLayers) -> Markings:
@@ -54,7 +54,7 @@ def build_markings(layers: MapLayers) -> Markings:
 
 @inlined
 def sample_paint(x, y, look_x, look_y, across, along, markings):
-    """Return the painted share of a pixel's footprint around x, y, and the row of the rectangle that covers most of it.
+    """Return the painted share of a pixel's footprint around x, y [m], and the row of the rectangle that covers most.
 
     The footprint is `along` [m] long in the horizontal unit direction look_x, look_y, and `across` [m] wide.
     """
@@ -106,7 +106,7 @@ def _arrow(arrow: Arrow) -> Iterator[Rectangle]:
 
 @lru_cache(maxsize=16)
 def _strips(kind: ArrowKind) -> tuple[tuple[float, float, float, float], ...]:
-    """Return an arrow at the origin that points along x, as strips: centre x, y, half length, half width [m]."""
+    """Return an arrow at the origin, pointing along x, as strips: centre x, y, half length, half width [m]."""
     shape = Polygon(outline_arrow(Arrow(kind, 0.0, 0.0, 0.0, "")))
     low_x, low_y, high_x, high_y = shape.bounds
     out = []
@@ -149,7 +149,7 @@ def _grid(rectangle: Array32) -> tuple[Array, Ints32, Ints32]:
 
 @inlined
 def asphalt(x, y, footprint, table):
-    """Return the brightness of asphalt at x, y relative to its mean colour: grain, stains, repairs, sealed cracks."""
+    """Return the brightness of asphalt at x, y [m], over its mean: grain, stains, repairs, sealed cracks."""
     broad = sample_noise(table, x * 0.9, y * 0.9)
     patch = sample_noise(table, x * 0.11 + 40.0, y * 0.11)
     tone = np.float32(0.68) + np.float32(0.30) * broad + np.float32(0.40) * patch
@@ -167,7 +167,7 @@ def asphalt(x, y, footprint, table):
 
 @inlined
 def paving(x, y, footprint, table):
-    """Return the brightness of paving slabs at x, y relative to their mean colour."""
+    """Return the brightness of paving slabs at x, y [m], over their mean."""
     i, j = int(np.floor(x / SLAB_M)), int(np.floor(y / SLAB_M))
     tone = np.float32(0.86) + np.float32(0.24) * sample_noise(table, x * 0.5, y * 0.5)
     near = fade(np.float32(0.5), footprint)
@@ -186,7 +186,7 @@ def paving(x, y, footprint, table):
 
 @inlined
 def grass(x, y, footprint, table):
-    """Return the brightness of grass at x, y relative to its mean colour, and its dryness, 0 to 1."""
+    """Return the brightness of grass at x, y [m], over its mean, and its dryness, 0 to 1."""
     dry = sample_noise(table, x * 0.07, y * 0.07)
     tone = np.float32(0.55) + np.float32(0.6) * sample_noise(table, x * 0.8, y * 0.8)
     near = fade(np.float32(0.10), footprint)

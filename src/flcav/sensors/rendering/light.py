@@ -1,11 +1,10 @@
 """Illumination: sun, sky and air by weather, shadows of the sun and of lamps by shadow rays, and ambient occlusion.
 
-One unit of radiance is the brightness that a camera exposed for full daylight shows as white. Shadows take one ray from
-every hit to the sun, and one to the lamp that is strongest there.
+One unit of radiance is the brightness that a camera exposed for full daylight shows as white. For shadows, one ray is
+cast from every hit to the sun, and one to the strongest lamp.
 
-Ambient occlusion: one short ray for every block of 2 x 2 pixels, averaged over 4 x 4 neighbouring blocks.
-
-Ray directions are cosine-weighted; each of the 16 blocks has another one.
+Ambient occlusion casts one short ray for every block of 2 x 2 pixels, and averages over 4 x 4 neighbouring blocks. Ray
+directions are cosine-weighted, and different in these 16 blocks.
 """
 
 from typing import NamedTuple
@@ -25,7 +24,7 @@ Colour = tuple[np.float32, np.float32, np.float32]  # scalars: compiled code pas
 
 RAIN_EXTINCTION = 0.00022  # 1/m at 1 mm/h, growing with the rain's power of 0.63 (Atlas 1953, visible light)
 
-# Sun elevation [deg] -> colours of the sun's light on a surface face on, and of the sky overhead and at the horizon
+# Sun elevation [deg] -> irradiance of the sun at normal incidence, and radiance of the sky at zenith and horizon
 _ELEVATION = (-18.0, -9.0, -4.0, 0.0, 4.0, 10.0, 25.0, 60.0)
 _SUN = (
     (0.0, 0.0, 0.0),
@@ -60,13 +59,13 @@ _HORIZON = (
 
 SUN_REACH_M = 300.0  # length of shadow rays
 DARK = 1e-3  # irradiance of the sun below which it casts no shadow
-SAME = 0.04  # relative difference of distance up to which two pixels lie on one surface
+SAME = 0.04  # relative difference of distance up to which two pixels are taken to be on one surface
 
 
 class Illumination(NamedTuple):
-    """The light of the sun and the sky, and the air, under one weather."""
+    """Illumination in one weather: light of sun and sky, and scattering by the air."""
 
-    to_sun: Colour  # unit, world
+    to_sun: Colour  # unit direction, world frame
     sun: Colour  # irradiance at normal incidence, through the clouds
     zenith: Colour  # radiance of the clear sky overhead
     horizon: Colour  # radiance of the sky at the horizon
@@ -78,11 +77,11 @@ class Illumination(NamedTuple):
     extinction: np.float32  # [1/m] by fog, haze and rain
     exposure: np.float32  # factor before tone mapping
     wetness: np.float32
-    lamps: np.float32  # 0 off, 1 on
+    lamps: np.float32  # brightness of street lamps, 0 to 1
 
 
 def compute_light(weather: Weather) -> Illumination:
-    """Return the sun, sky and air of `weather`: tables by the sun's elevation, changed by clouds, fog and rain."""
+    """Return the illumination in `weather`: tables by the sun's elevation, modified by clouds, fog and rain."""
     elevation, azimuth = np.radians(weather.sun_elevation_deg), np.radians(weather.sun_azimuth_deg)
     level = np.cos(elevation)
     to_sun = np.array([level * np.sin(azimuth), level * np.cos(azimuth), np.sin(elevation)])
@@ -104,7 +103,7 @@ def compute_light(weather: Weather) -> Illumination:
     rain = RAIN_EXTINCTION * weather.rain_mm_h**0.63 * 3.0
     lamps = float(np.clip((2.0 - weather.sun_elevation_deg) / 6.0, 0, 1))
     sky = 0.45 * zenith + 0.55 * horizon
-    sky = 0.55 * sky + 0.45 * sky.mean()  # houses and ground reflect light of the sky, which makes it less blue
+    sky = 0.55 * sky + 0.45 * sky.mean()  # reflections from houses and ground make skylight less blue
     bounce = 0.16 * (sun * max(to_sun[2], 0.0) + sky)
     ambient = float((0.5 * sun * max(to_sun[2], 0.15) + 0.6 * zenith + 0.4 * horizon).mean())
     return Illumination(
@@ -133,12 +132,12 @@ def _at(elevation_deg: float, table: tuple[tuple[float, float, float], ...]) -> 
 
 
 def _exposure(ambient: float) -> float:
-    """Return the exposure for an `ambient` brightness: a power law of exponent -0.55, so that nights stay dark."""
+    """Return the exposure for an `ambient` brightness: a power law with exponent -0.55, so that nights stay dark."""
     return float(0.92 * max(ambient, 2e-3) ** -0.55 if ambient < 1.0 else 0.92)
 
 
 def compute_lamplight(scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | None, threads: int = 1) -> Array32:
-    """Return the irradiance (N, 3) of lamps at each hit; only the strongest lamp there casts shadows."""
+    """Return the irradiance (N, 3) of lamps at hits; only the strongest lamp at a hit casts shadows."""
     light, most, towards = (np.zeros((len(seen), 3), np.float32) for _ in range(3))
     far = np.empty(len(seen), np.float32)
     light_up(seen, lamps, light, most, towards, far)
@@ -149,7 +148,7 @@ def compute_lamplight(scene: Scene, seen: GBuffer, lamps: Lamps, hidden: int | N
 def compute_sun_visibility(
     scene: Scene, seen: GBuffer, light: Illumination, hidden: int | None, threads: int = 1
 ) -> Array32:
-    """Return for each hit (N,) 0 where it is in the sun's shadow, else 1; also 1 where it faces away from the sun."""
+    """Return (N,) 0 for hits in the sun's shadow, else 1, also for surfaces that face away from the sun."""
     far = np.empty(len(seen), np.float32)
     _facing(seen, light.to_sun, max(light.sun) > DARK, far)
     to_sun = np.array([light.to_sun])
@@ -158,9 +157,9 @@ def compute_sun_visibility(
 
 
 def soften(lit: Array32, seen: GBuffer, width: int, threads: int = 1) -> Array32:
-    """Return `lit` (N,), an image's row after row, with soft shadow edges, as of an extended sun.
+    """Return `lit` (N,), an image in row order, with softened shadow edges, as from an extended sun.
 
-    A 3 x 3 binomial filter (weights 1, 2, 1 each way) over pixels of similar distance.
+    A 3 x 3 binomial filter (weights 1, 2, 1 in both directions) over pixels at a similar distance.
     """
     out = np.empty_like(lit)
 
@@ -190,13 +189,20 @@ def _add_where_free(light, most, blocked):
 @compiled
 def _soften(lit, distance, width, first, last, out):
     column = 0
-    for pixel in range(max(first * width, 0), last * width):  # not negative, as the compiler can see
-        column = column + 1 if column < width else 1  # from 1 on
-        own = lit[pixel]
-        out[pixel] = own
+    for pixel in range(
+        max(first * width, 0), last * width
+    ):  # the `max` proves to the compiler that indices are not negative
+        column = column + 1 if column < width else 1  # counted from 1
+        centre = lit[pixel]
+        out[pixel] = centre
         if column == 1 or column == width or pixel < width or pixel >= len(lit) - width:
             continue
-        if lit[pixel - 1] == own and lit[pixel + 1] == own and lit[pixel - width] == own and lit[pixel + width] == own:
+        if (
+            lit[pixel - 1] == centre
+            and lit[pixel + 1] == centre
+            and lit[pixel - width] == centre
+            and lit[pixel + width] == centre
+        ):
             continue
         total, weight, near = np.float32(0), np.float32(0), np.float32(SAME) * distance[pixel]
         for down in range(-1, 2):
@@ -210,19 +216,24 @@ def _soften(lit, distance, width, first, last, out):
             out[pixel] = total / weight
 
 
-REACH_M = 2.2  # length of the rays
-FARTHEST_M = 40.0  # distance beyond which nothing is occluded
+REACH_M = 2.2  # length of ambient occlusion rays
+FARTHEST_M = 40.0  # distance from the camera beyond which ambient occlusion is not computed
 DARKEST = 0.15  # value where all rays are blocked
-SPAN = 4  # blocks along each side of the neighbourhood that is averaged over
+SPAN = 4  # blocks per side of the neighbourhood that is averaged over
 
 
 def compute_ambient_occlusion(scene: Scene, seen: GBuffer, lens: Lens, hidden: int | None, threads: int = 1) -> Array32:
-    """Return the ambient occlusion (N,) of each pixel: the unoccluded share of the hemisphere, scaled to DARKEST..1.
+    """Return the ambient occlusion (N,) of pixels: the unoccluded share of the hemisphere, scaled to DARKEST..1.
 
-    Only objects within REACH_M occlude; the actor `hidden` does not.
+    Only objects within REACH_M occlude, except the actor `hidden`.
     """
     columns, rows = -(-lens.width // 2), -(-lens.height // 2)
-    blocks = (SPAN, SPAN, -(-rows // SPAN), -(-columns // SPAN))  # rays of one direction side by side: faster
+    blocks = (
+        SPAN,
+        SPAN,
+        -(-rows // SPAN),
+        -(-columns // SPAN),
+    )  # rays of one direction are consecutive, which is faster
     origin, towards = np.empty((*blocks, 3), np.float32), np.empty((*blocks, 3), np.float32)
     far = np.full(blocks, -1, np.float32)
     _hemisphere(seen, lens.width, columns, rows, _ways(), origin, towards, far)
@@ -239,7 +250,10 @@ def compute_ambient_occlusion(scene: Scene, seen: GBuffer, lens: Lens, hidden: i
 
 
 def _ways() -> Array32:
-    """Return (SPAN, SPAN, 3) points, even over the unit sphere; added to a normal: cosine-weighted directions."""
+    """Return (SPAN, SPAN, 3) points spread evenly over the unit sphere (Fibonacci lattice).
+
+    A unit normal plus such a point is a cosine-weighted direction in the normal's hemisphere.
+    """
     count = SPAN * SPAN
     z = 1 - (2 * np.arange(count) + 1) / count
     angle = np.pi * (3 - np.sqrt(5)) * np.arange(count)
@@ -267,7 +281,8 @@ def _hemisphere(seen, width, columns, rows, ways, origin, towards, far):
 
 @compiled
 def _spread(seen, blocked, width, height, columns, first, last, out):
-    """Write the shares of the blocks in rows `first` to `last`: 1 where no ray nearby is blocked."""
+    """Write the ambient occlusion of the blocks in rows `first` to `last`: 1 where no ray nearby is blocked."""
+    # A sliding window of column sums finds the many blocks without a blocked ray in their neighbourhood.
     half = SPAN // 2
     along = np.zeros(columns, np.int64)  # blocked rays in the neighbourhood's rows, by column
     for row in range(max(first - half, 0), min(first + half - 1, len(blocked))):

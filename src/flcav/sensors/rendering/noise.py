@@ -1,4 +1,4 @@
-"""Procedural noise: a periodic table of fractal noise, and hashes of lattice points; box-filter coverage."""
+"""Procedural noise: a periodic table of fractal noise, hashes of lattice points, and box-filter coverage."""
 
 from functools import lru_cache
 
@@ -8,12 +8,12 @@ from flcav.arrays import Array32
 from flcav.machine.compiled import inlined
 from flcav.statistics.streams import stream
 
-SIDE = 256  # cells along each side of a table, a power of two
+SIDE = 256  # cells per side of a table, a power of two
 
 
 @lru_cache(maxsize=1)
 def make_noise() -> Array32:
-    """Return a table (SIDE, SIDE) of periodic fractal noise, uniformly distributed in [0, 1]: power-law spectrum."""
+    """Return a table (SIDE, SIDE) of periodic fractal noise with a power-law spectrum, uniform in [0, 1]."""
     frequency = np.hypot(*np.meshgrid(np.fft.fftfreq(SIDE), np.fft.rfftfreq(SIDE), indexing="ij")) * SIDE
     amplitude = np.where(frequency > 0, np.maximum(frequency, 2.0) ** -1.7, 0.0)
     phase = np.exp(2j * np.pi * stream(0, "noise").random(frequency.shape))
@@ -24,7 +24,7 @@ def make_noise() -> Array32:
 
 @inlined
 def sample_noise(table, x, y):
-    """Return the value of a table at x, y (in cells, periodic), by bilinear interpolation."""
+    """Interpolate a periodic table bilinearly at x, y [cells]."""
     i, j = int(np.floor(x)), int(np.floor(y))
     u, v = np.float32(x - i), np.float32(y - j)
     i0, i1, j0, j1 = i & (SIDE - 1), (i + 1) & (SIDE - 1), j & (SIDE - 1), (j + 1) & (SIDE - 1)
@@ -35,7 +35,7 @@ def sample_noise(table, x, y):
 
 @inlined
 def hash_pair(a, b):
-    """Return a hash of the whole numbers a and b, as a number in [0, 1)."""
+    """Return a hash of the integers a and b as a number in [0, 1)."""
     word = np.uint32((a * 374761393 + b * 668265263) & 0xFFFFFFFF)
     word = np.uint32(((word ^ (word >> np.uint32(13))) * np.uint64(1274126177)) & np.uint64(0xFFFFFFFF))
     return np.float32((word ^ (word >> np.uint32(16))) & np.uint32(0xFFFFFF)) / np.float32(16777216.0)
@@ -43,12 +43,12 @@ def hash_pair(a, b):
 
 @inlined
 def fade(scale, footprint):
-    """Return the contrast, 1 to 0, of a texture of that scale [m] in a pixel `footprint` [m] wide (anti-aliasing)."""
+    """Return the contrast, 1 to 0, of a texture of `scale` [m] in a pixel of width `footprint` [m] (anti-aliasing)."""
     return min(max(np.float32(1.5) - footprint / scale, np.float32(0)), np.float32(1))
 
 
 @inlined
 def overlap(distance, half, width):
-    """Return the share of an interval of `width` around `distance` that lies within -`half` and `half`."""
+    """Return the share of an interval of `width` around `distance` that is between -`half` and `half`."""
     inside = min(distance + 0.5 * width, half) - max(distance - 0.5 * width, -half)
     return max(inside, np.float32(0)) / width

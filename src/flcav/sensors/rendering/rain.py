@@ -1,4 +1,4 @@
-"""Rain and glare in camera images: wet roads, streaks, drops on the lens, halos of lamps, veiling glare of the sun."""
+"""Rain and glare in camera images: wet roads, streaks, drops on the lens, halos of lamps, the sun's veiling glare."""
 
 import numpy as np
 
@@ -16,31 +16,31 @@ from flcav.world.scene import Scene
 ROAD = int(Material.ROAD)
 WATER = 0.02  # Fresnel reflectance at normal incidence
 SMEAR_PX = 15  # half height of the blur of reflections, in pixels of an image of half the size
-RIPPLE_PX = 4.0  # sideways displacement by ripples, likewise
+RIPPLE_PX = 4.0  # sideways displacement by ripples, in the same pixels
 STREAKS_PER_MM = 55.0  # number in an image of 640 x 384 at 1 mm/h; grows as rain^0.6
-DROPS_PER_MM = 3.0  # number on a lens of any size at 1 mm/h, likewise
+DROPS_PER_MM = 3.0  # number on a lens at 1 mm/h, for any image size; grows as rain^0.6
 DROP_VIEW = 0.45  # share of the image's height that a drop shows, upside down
 BLOCK_PX = 8  # drops are out of focus: they show means over squares of this side
 
 
 @compiled
 def wet_pixels(seen, appearance, width, height):
-    """Return the indices (K,) of the pixels that show a road, of every second row and column."""
-    found = np.empty((width // 2) * (height // 2), np.int64)
+    """Return the indices (K,) of road pixels in every second row and column."""
+    pixels = np.empty((width // 2) * (height // 2), np.int64)
     count = 0
     for j in range(height // 2):
         for i in range(width // 2):
             pixel = 2 * j * width + 2 * i
             row = seen.row[pixel]
             if row >= 0 and seen.instance[pixel] == 0 and appearance.material[row] == ROAD:
-                found[count] = pixel
+                pixels[count] = pixel
                 count += 1
-    return found[:count]
+    return pixels[:count]
 
 
 @compiled
 def smear(image, weight, width, height, out):
-    """Blur `image` (H, W, 3) vertically, as ripples do: write weighted means to `out` (H, W, 3); no weight: 0."""
+    """Blur `image` (H, W, 3) vertically, as ripples do, into `out`; pixels without `weight` (H, W) do not count."""
     for i in range(width):
         for j in range(height):
             total = np.float32(0)
@@ -58,7 +58,10 @@ def smear(image, weight, width, height, out):
 
 @compiled
 def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, width, height):
-    """Add the reflections `mirrored` (H / 2, W / 2, 3) to pixels that show road, by Fresnel reflectance and puddles."""
+    """Add the reflections `mirrored` (H / 2, W / 2, 3) to road pixels, by Fresnel reflectance and puddles.
+
+    `radiance` is (H * W, 3), `extinction` in [1/m], `wetness` 0 to 1.
+    """
     for pixel in range(len(radiance)):
         row = seen.row[pixel]
         if row < 0 or seen.instance[pixel] != 0 or appearance.material[row] != ROAD:
@@ -69,6 +72,7 @@ def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, widt
         puddle = min(max((level - np.float32(1.02) + np.float32(0.75) * wetness) * 4, np.float32(0)), np.float32(1))
         facing = -seen.ray[pixel, 2]
         grazing = 1 - facing
+        # Schlick's approximation of the Fresnel reflectance
         share = np.float32(WATER) + (1 - np.float32(WATER)) * grazing * grazing * grazing * grazing * grazing
         share *= wetness * (np.float32(0.35) + np.float32(0.65) * puddle)
         share *= np.exp(-extinction * seen.distance[pixel])
@@ -80,7 +84,7 @@ def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, widt
 
 
 def add_streaks(image: Array32, rain_mm_h: float, brightness: Array, rng: np.random.Generator) -> None:
-    """Draw motion-blurred streaks of falling drops, of the radiance `brightness` (3,), into an image (H, W, 3)."""
+    """Draw motion-blurred streaks of falling drops with the radiance `brightness` (3,) into an image (H, W, 3)."""
     height, width = image.shape[:2]
     count = int(STREAKS_PER_MM * rain_mm_h**0.6 * width * height / (640 * 384))
     size = rng.random(count) ** 3  # 1 is nearest; few are near
@@ -111,7 +115,7 @@ def _draw_streaks(image, place, length, slant, strength, thick, brightness):
 
 
 def add_drops(image: Array32, rain_mm_h: float, rng: np.random.Generator) -> None:
-    """Draw drops on the lens into an image (H, W, 3): each shows a small, blurred view of the scene, upside down."""
+    """Draw drops on the lens into an image (H, W, 3): they show small, blurred, inverted views of the scene."""
     height, width = image.shape[:2]
     count = int(rng.poisson(DROPS_PER_MM * rain_mm_h**0.6))
     place = rng.random((count, 2)) * (width, height)
@@ -156,18 +160,18 @@ def _draw_drops(image, blocks, place, radius, tall):
                     image[y, x, band] += share * (rim * blocks[j, i, band] - image[y, x, band])
 
 
-HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # strengths of the halos
+HEAD, TAIL, STREET, SIGNAL = 9.0, 0.55, 1.6, 0.35  # strengths of halos
 HEAD_COLOUR, TAIL_COLOUR, STREET_COLOUR = (1.0, 0.95, 0.86), (1.0, 0.05, 0.03), (1.0, 0.74, 0.40)
 SIGNAL_COLOURS = {RED: (1.0, 0.05, 0.03), AMBER: (1.0, 0.5, 0.03), GREEN: (0.06, 1.0, 0.55)}
 FLAGS = {Material.LENS_RED: RED, Material.LENS_AMBER: AMBER, Material.LENS_GREEN: GREEN}
-FARTHEST_M = 150.0  # of lamps with halos
+FARTHEST_M = 150.0  # greatest distance of lamps with halos
 SUN_RAYS, SUN_RAD, SUN_REACH_M = 16, 0.0046, 1000.0  # rays over the sun's disc, its angular radius, rays' length
-SUN_SPREAD_RAD, SUN_VEIL_RAD = 0.016, 0.16  # widths of the lens' narrow and wide scattering of the sun
-SUN_STRENGTH, VEIL_STRENGTH = 9.0, 0.22  # of the narrow and of the wide scattering
-HAZE_M = 500.0  # path through the air before the sun
+SUN_SPREAD_RAD, SUN_VEIL_RAD = 0.016, 0.16  # widths of the narrow and wide scattering of sunlight in the lens
+SUN_STRENGTH, VEIL_STRENGTH = 9.0, 0.22  # strengths of the narrow and the wide scattering
+HAZE_M = 500.0  # length of the path of sunlight through the air
 BESIDE = 0.25  # distance of the sun from the image's edge, over its size, up to which it causes glare
 
-Glowing = tuple[Array, tuple[float, float, float], float]  # place, colour, strength
+Glowing = tuple[Array, tuple[float, float, float], float]  # position [m], world frame, colour, strength
 
 
 def add_glare(
@@ -179,7 +183,7 @@ def add_glare(
     lens: Lens,
     hidden: int | None,
 ) -> None:
-    """Add a halo to an image (H, W, 3) for every lamp that is on and not hidden from the camera."""
+    """Add a halo to an image (H, W, 3) for every lamp that is on and visible from the camera."""
     glowing = [row for row in _glowing(scene, state, light, world_from_camera[:3, 3], hidden) if row[2] > 0.01]
     if not glowing:
         return
@@ -209,14 +213,14 @@ def add_glare(
 def add_sun_glare(
     image: Array32, scene: Scene, light: Illumination, world_from_camera: Array, lens: Lens, hidden: int | None
 ) -> None:
-    """Add the veiling glare of the sun to an image (H, W, 3), by the share of its disc that is visible."""
+    """Add the veiling glare of the sun to an image (H, W, 3), in proportion to the visible share of its disc."""
     to_sun, eye = np.array(light.to_sun, np.float64), world_from_camera[:3, 3]
     towards = world_from_camera[:3, :3].T @ to_sun
     pixel = project_optical(lens, towards)[0]
     size = np.array((lens.width, lens.height))
     if max(light.sun) < DARK or not (np.abs(pixel - size / 2) < (0.5 + BESIDE) * size).all():
         return
-    turn = np.arange(SUN_RAYS) * 2.399963
+    turn = np.arange(SUN_RAYS) * 2.399963  # the golden angle: points spread evenly over a disc (Vogel's spiral)
     across = (
         np.stack((np.cos(turn), np.sin(turn), 0 * turn), axis=1)
         * np.sqrt((np.arange(SUN_RAYS) + 0.5) / SUN_RAYS)[:, None]
@@ -233,7 +237,8 @@ def add_sun_glare(
 
 
 def _glowing(scene: Scene, state: LampState, light: Illumination, eye: Array, hidden: int | None) -> list[Glowing]:
-    trace, out = scene.trace, []
+    trace = scene.trace
+    out = []
     for actor in np.flatnonzero((state.head[1:] > 0) | (state.tail[1:] > 0)):
         if actor == hidden or not trace.present[scene.index, actor]:
             continue

@@ -2,11 +2,9 @@
 
 The result is the radiance of every pixel; exposure and tone mapping follow in `flcav.sensors.camera`.
 
-Adaptive supersampling: further rays for pixels at visible edges and where thin distant objects may cross them.
-
-Pixels at edges get two more rays, which with the first form a pattern of three rooks; pixels that a thin distant object
-may cross get eight more, in a pattern of nine rooks. So a pole covers the share of its pixels that its width is,
-whether or not a pixel's centre hits it.
+Supersampling is adaptive: pixels at visible edges get two more rays, which form a pattern of three rooks with the
+first; pixels that a thin distant object may cross get eight more, in a pattern of nine rooks. So a pole covers a share
+of its pixels that corresponds to its width, whether or not a pixel's centre hits it.
 """
 
 from typing import NamedTuple
@@ -39,18 +37,18 @@ from flcav.world.scene import Scene
 from flcav.world.weather import Weather
 
 FAR_M = 1000.0  # length of primary rays
-LOW_SIGHT = 0.002  # extinction [1/m] above which vehicles have their lamps on by day
-MIRRORS = 0.2  # wetness above which roads reflect
+LOW_SIGHT = 0.002  # extinction [1/m] above which vehicles' lamps are on by day
+MIRRORS = 0.2  # wetness above which roads show reflections
 NO_LAMPS = np.zeros((0, 3), np.float32)
 
 
 class RadianceImage(NamedTuple):
     """An image as radiance, with its exposure, G-buffer and appearance tables."""
 
-    radiance: Array32  # (N, 3) of each pixel, row after row
+    radiance: Array32  # (N, 3) of the pixels, in row order
     exposure: np.float32  # factor of the radiance before tone mapping
     seen: GBuffer  # G-buffer of the primary rays
-    painted: Mask  # (N,) whether a pixel shows a road marking
+    painted: Mask  # (N,) whether the pixel shows a road marking
     appearance: Appearance
 
 
@@ -75,10 +73,10 @@ def render_radiance(
     hidden: int | None,
     threads: int = 1,
 ) -> RadianceImage:
-    """Return the radiance of every pixel of `lens` at the scene's instant: see `camera.photograph`.
+    """Render the radiance of the pixels of `lens` at the scene's instant: see `camera.photograph`.
 
-    `world_from_camera` (4, 4) is the pose of the optical frame, `hidden` the actor left out (the carrier); `rng` draws
-    the rain. Rays are cast and shaded by `threads` threads.
+    `world_from_camera` (4, 4) [m] is the pose of the optical frame, `hidden` the actor that is left out (the carrier);
+    `rng` draws the rain. Rays are cast and shaded by `threads` threads.
     """
     keep_freed_memory()
     rays, light, appearance = compute_pixel_rays(lens), compute_light(weather), build_appearance(scene)
@@ -109,7 +107,10 @@ def render_radiance(
 def survey(
     scene: Scene, world_from_camera: Array, lens: Lens, *, hidden: int | None, threads: int = 1
 ) -> tuple[GBuffer, Mask, Appearance]:
-    """Return what the rays through the pixels' centres meet, and where that is paint (N,): see `render_radiance`."""
+    """Return the G-buffer of the pixels' centres, where they show road markings (N,), and the appearance tables.
+
+    Arguments are those of `render_radiance`.
+    """
     rays, appearance = compute_pixel_rays(lens), build_appearance(scene)
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=hidden, threads=threads)
     seen = fill_gbuffer(scene, appearance, world_from_camera, rays, hits, threads)
@@ -157,33 +158,35 @@ def _further(
     open_sky: Array32,
     radiance: Array32,
 ) -> Array32:
-    """Return the radiance (S, 3) of further rays, each within a `pixel` (S,): taken from a pixel nearby, or shaded."""
-    scene, appearance = world.scene, world.appearance
+    """Return the radiance (S, 3) of further rays in the pixels `pixel` (S,), copied from a pixel nearby, or shaded."""
+    scene = world.scene
+    appearance = world.appearance
     hits = scene.cast(world_from_camera, rays, far_m=FAR_M, hidden=world.hidden, threads=world.threads)
     donor = np.empty(len(rays), np.int32)
     donors(hits, pixel, seen, scene.surfaces.first, appearance.material, width, donor)
-    out, rest = radiance[donor], np.flatnonzero(donor < 0)
+    out = radiance[donor]
+    rest = np.flatnonzero(donor < 0)
     unknown = Hits(hits.distance[rest], hits.instance[rest], hits.face[rest])
-    found = fill_gbuffer(scene, appearance, world_from_camera, rays[rest], unknown)
+    unknown_seen = fill_gbuffer(scene, appearance, world_from_camera, rays[rest], unknown)
     finer = world._replace(pixel_angle=world.pixel_angle / ROOKS)
-    out[rest], _ = _radiance(finer, found, open_sky[pixel[rest]])
+    out[rest], _ = _radiance(finer, unknown_seen, open_sky[pixel[rest]])
     return out
 
 
 def _mirror(
     world: _World, world_from_camera: Array, lens: Lens, rays: Array32, seen: GBuffer, radiance: Array32
 ) -> None:
-    """Add planar reflections to wet roads: rays cast from the camera mirrored at the plane of the road, z = 0."""
+    """Add planar reflections to wet roads: rays are cast from the camera mirrored at the road's plane, z = 0."""
     wet = rain.wet_pixels(seen, world.appearance, lens.width, lens.height)
     if not len(wet):
         return
     below = np.diag((1.0, 1.0, -1.0, 1.0)) @ world_from_camera
     met = _meet(world, below, np.ascontiguousarray(rays[wet]), near_m=seen.distance[wet] + np.float32(0.05))
-    found, _ = _radiance(world, met, np.ones(len(wet), np.float32))
+    reflected, _ = _radiance(world, met, np.ones(len(wet), np.float32))
     width, height = lens.width // 2, lens.height // 2
     image, weight = np.zeros((height, width, 3), np.float32), np.zeros((height, width), np.float32)
     j, i = wet // lens.width // 2, wet % lens.width // 2
-    image[j, i], weight[j, i] = found, 1
+    image[j, i], weight[j, i] = reflected, 1
     smeared = np.zeros_like(image)
     rain.smear(image, weight, width, height, smeared)
     light = world.light
@@ -196,23 +199,23 @@ LEAF = int(Material.LEAF)
 EDGE, THIN = 1, 2  # flags of a pixel
 BEND = 0.93  # cosine between the normals of two pixels below which there is an edge
 STEP = 0.02  # distance from the other pixel's plane, over range, above which there is an edge
-CONTRAST = 0.03  # difference over sum of two pixels' radiance, below which an edge is not visible
-DARK = 0.02  # exposed light that is added to that sum: no edges in the dark
-THIN_PX = 4.0  # objects narrower than this are thin
-REACH_PX = 0.8  # margin beside thin objects
-FARTHEST_M = 220.0  # of thin objects
+CONTRAST = 0.03  # difference over sum of two pixels' radiance below which an edge is not visible
+DARK = 0.02  # exposed radiance that is added to that sum: no edges in the dark
+THIN_PX = 4.0  # width below which objects are thin
+REACH_PX = 0.8  # margin around thin objects
+FARTHEST_M = 220.0  # greatest distance of thin objects
 POST_M, SIGN_M, SIGNAL_M = 0.1, 0.42, 0.6  # half widths of thin objects
 SIGN = int(Material.SIGN)
 ROOKS = np.float32(3)  # factor by which the footprint of a further ray is narrower than its pixel
 _THREE = np.array([(-1, 1), (1, -1)], np.float32) / 3
 _NINE = np.array([(-4, -1), (-3, 2), (-2, -3), (-1, 4), (1, -4), (2, 3), (3, -2), (4, 1)], np.float32) / 9
-BRIGHTEST = 3.0  # exposed light at which samples are clamped: else edges of lamps would stay jagged
+BRIGHTEST = 3.0  # exposed radiance at which samples are clamped: otherwise edges of lamps would stay jagged
 
 
 def find_edges(
     seen: GBuffer, radiance: Array32, exposure: np.float32, appearance: Appearance, lens: Lens, threads: int = 1
 ) -> Bytes:
-    """Return (N,) EDGE for pixels at visible edges, else 0, by their G-buffer and `radiance` (N, 3)."""
+    """Return (N,) EDGE for pixels at visible edges, else 0, from the G-buffer and the `radiance` (N, 3)."""
     out = np.zeros(len(seen), np.uint8)
     dark = np.float32(DARK / exposure)
 
@@ -224,7 +227,7 @@ def find_edges(
 
 
 def mark_thin(kind: Bytes, town: Town, world_from_camera: Array, lens: Lens, seen: GBuffer) -> None:
-    """Set THIN in `kind` (N,) for pixels that lamps, masts, signs or signal heads may cross with nothing nearer."""
+    """Set THIN in `kind` (N,) for pixels that a lamp, mast, sign or signal head may cross with nothing in front."""
     bars = thin_bars(town)
     camera_from_world = inverse(world_from_camera)
     ends = [transform_points(camera_from_world, bars[:, part]) for part in (slice(0, 3), slice(3, 6))]
@@ -248,7 +251,7 @@ def mark_thin(kind: Bytes, town: Town, world_from_camera: Array, lens: Lens, see
 
 
 def thin_bars(town: Town) -> Array:
-    """Return the thin objects of a town as bars (K, 7): both ends x, y, z, world frame, and half width [m]."""
+    """Return the thin objects of a town as bars (K, 7): both ends x, y, z and half width [m], world frame."""
     rows = [(x, y, 0, x, y, height, POST_M) for x, y, height in town.lamps]
     rows += [(x, y, 0, x, y, z, POST_M) for x, y, z in town.poles.position]
     for x, y, z in town.signs.position:
@@ -263,8 +266,10 @@ def thin_bars(town: Town) -> Array:
 def _edges(seen, radiance, dark, material, width, first, last, out):
     row = seen.row
     column = 0
-    for pixel in range(max(first * width, 0), last * width):  # not negative, as the compiler can see
-        column = column + 1 if column < width else 1  # from 1 on
+    for pixel in range(
+        max(first * width, 0), last * width
+    ):  # the `max` proves to the compiler that indices are not negative
+        column = column + 1 if column < width else 1  # counted from 1
         for side in range(2):
             if side == 0 and column == width:
                 continue
@@ -308,7 +313,7 @@ def _draw_bars(start, end, half, near, distance, width, height, kind):
 
 
 def further_rays(rays: Array32, kind: Bytes, lens: Lens) -> tuple[Array32, Ints32]:
-    """Return further unit rays (S, 3), optical frame, for pixels flagged in `kind` (N,), and each one's pixel (S,)."""
+    """Return further unit rays (S, 3), optical frame, for pixels flagged in `kind` (N,), and their pixels (S,)."""
     flagged = kind[kind > 0]
     total = int(np.bincount(flagged, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
@@ -318,20 +323,20 @@ def further_rays(rays: Array32, kind: Bytes, lens: Lens) -> tuple[Array32, Ints3
 
 @compiled
 def donors(hits, pixel, seen, first, material, width, out):
-    """Write for each further ray the pixel `out` (S,) whose radiance it takes: its own or a neighbour of the same face.
+    """Write to `out` (S,) the pixel whose radiance a further ray copies: this pixel or a neighbour on the same face.
 
     It is -1 where no neighbour has the ray's face, and on signs, whose letters are finer than pixels; textures of other
     faces are smooth over pixels. `first` and `material` are those of `Scene.surfaces`.
     """
     for sample in range(len(pixel)):
         out[sample] = -1
-        own, instance, row = pixel[sample], hits.instance[sample], -1
+        centre, instance, row = pixel[sample], hits.instance[sample], -1
         if instance >= 0:
             row = first[instance] + hits.face[sample]
             if material[row] == SIGN:
                 continue
         for step in (0, -1, 1, -width, width, -width - 1, -width + 1, width - 1, width + 1):
-            other = own + step
+            other = centre + step
             if other >= 0 and other < len(seen.row) and seen.row[other] == row and seen.instance[other] == instance:
                 out[sample] = other
                 break
@@ -339,31 +344,32 @@ def donors(hits, pixel, seen, first, material, width, out):
 
 @compiled
 def average_samples(radiance, further, pixel, ceiling):
-    """Replace the `radiance` of pixels by the mean with their `further` samples (S, 3), each clamped to `ceiling`."""
+    """Replace the `radiance` of pixels by the mean with their `further` samples (S, 3), clamped to `ceiling`."""
     start = 0
     while start < len(pixel):
-        own, end = pixel[start], start
-        while end < len(pixel) and pixel[end] == own:
+        centre = pixel[start]
+        end = start
+        while end < len(pixel) and pixel[end] == centre:
             end += 1
         for band in range(3):
-            total = min(radiance[own, band], ceiling)
+            total = min(radiance[centre, band], ceiling)
             for sample in range(start, end):
                 total += min(further[sample, band], ceiling)
-            radiance[own, band] = total / (end - start + 1)
+            radiance[centre, band] = total / (end - start + 1)
         start = end
 
 
 @compiled
 def _spread(rays, kind, width, height, three, nine, directions, pixel):
     sample = 0
-    for own in range(len(kind)):
-        if kind[own] == 0:
+    for centre in range(len(kind)):
+        if kind[centre] == 0:
             continue
-        offsets = nine if kind[own] & THIN else three
-        right = own + 1 if own % width + 1 < width else own - 1
-        below = own + width if own + width < len(kind) else own - width
-        sign_x, sign_y = np.float32(right - own), np.float32(1 if below > own else -1)
-        a, b = rays[own, 0] / rays[own, 2], rays[own, 1] / rays[own, 2]
+        offsets = nine if kind[centre] & THIN else three
+        right = centre + 1 if centre % width + 1 < width else centre - 1
+        below = centre + width if centre + width < len(kind) else centre - width
+        sign_x, sign_y = np.float32(right - centre), np.float32(1 if below > centre else -1)
+        a, b = rays[centre, 0] / rays[centre, 2], rays[centre, 1] / rays[centre, 2]
         a_x, b_x = (rays[right, 0] / rays[right, 2] - a) * sign_x, (rays[right, 1] / rays[right, 2] - b) * sign_x
         a_y, b_y = (rays[below, 0] / rays[below, 2] - a) * sign_y, (rays[below, 1] / rays[below, 2] - b) * sign_y
         for number in range(len(offsets)):
@@ -371,5 +377,5 @@ def _spread(rays, kind, width, height, three, nine, directions, pixel):
             x, y = a + u * a_x + v * a_y, b + u * b_x + v * b_y
             length = np.sqrt(x * x + y * y + 1)
             directions[sample, 0], directions[sample, 1], directions[sample, 2] = x / length, y / length, 1 / length
-            pixel[sample] = own
+            pixel[sample] = centre
             sample += 1

@@ -1,4 +1,4 @@
-"""Light sources at one instant: signal lenses, head and tail lamps, street lamps, and the irradiance of lamps."""
+"""Light sources at one instant: signal lenses, head and tail lamps, street lamps, and their irradiance."""
 
 from functools import lru_cache
 from typing import NamedTuple
@@ -14,40 +14,41 @@ from flcav.world.scene import Scene
 
 RED, AMBER, GREEN = 1, 2, 4  # flags of lit lenses
 LENSES = {"r": RED, "R": RED, "y": AMBER, "Y": AMBER, "u": RED | AMBER, "g": GREEN, "G": GREEN, "o": AMBER}
-BRAKING_MS2 = -0.6  # acceleration below which brake lamps are on
+BRAKING_MS2 = -0.6  # longitudinal acceleration below which brake lamps are on
 
 STREET_LAMP = (4.6, 3.3, 1.75)  # intensity straight down
 HEADLAMP = (17.0, 16.2, 14.5)  # intensity on the axis of a low beam
-STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0  # distances at which their light is cut off
-CELL_M = 8.0  # side of the cells of the lamps' grid
+STREET_REACH_M, BEAM_REACH_M = 20.0, 45.0  # distances at which their light ends
+CELL_M = 8.0  # side of the grid's cells
 
 
 class LampState(NamedTuple):
-    """Lit signal lenses by thing of the town, and lamp brightness by instance."""
+    """Lit signal lenses of the town's things, and brightness of the instances' lamps."""
 
-    lens: Bytes  # (K,) of each of the town's things: flags RED, AMBER and GREEN
+    lens: Bytes  # (K,) flags RED, AMBER and GREEN of the town's things
     head: Array32  # (I,) brightness of the head lamps, 0 to 1
     tail: Array32  # (I,) brightness of the tail lamps, 0 to 1; brakes included
 
 
 class Lamps(NamedTuple):
-    """K lamps that illuminate the scene, and a grid whose cells list the lamps in reach."""
+    """K lamps that illuminate the scene, world frame, and a grid whose cells list the lamps in reach."""
 
-    position: Array32  # (K, 3) world [m]
+    position: Array32  # (K, 3) [m]
     ahead: Array32  # (K, 3) unit direction of a beam; zero for a street lamp
     colour: Array32  # (K, 3) intensity straight down, or on the beam's axis
-    corner: Array  # (2,) lowest x, y of the grid
-    first: Ints32  # (cells along x, cells along y + 1) start of each cell's list
-    listed: Ints32  # lists of lamps, cell after cell
+    corner: Array  # (2,) lowest x, y of the grid [m]
+    first: Ints32  # (cells along x, cells along y + 1) start of a cell's list
+    listed: Ints32  # lists of lamps, cell by cell
 
 
 def compute_lamp_state(scene: Scene, lamps_on: float, low_sight: bool) -> LampState:
     """Return the lit lenses and vehicle lamps at the scene's instant.
 
-    `lamps_on` (0 to 1) is the brightness of lamps by the sun's elevation; with `low_sight` (rain or fog), vehicles have
-    theirs on by day too. Parked vehicles have none on.
+    `lamps_on` (0 to 1) is the brightness of lamps by the sun's elevation; with `low_sight` (rain or fog), vehicles'
+    lamps are also on by day. Lamps of parked vehicles are off.
     """
-    trace, index = scene.trace, scene.index
+    trace = scene.trace
+    index = scene.index
     letters = dict(zip(trace.light.tolist(), trace.light_state[index].tolist()))
     lens = [LENSES.get(letters.get(link, ""), 0) for link in scene.things.link]
     parked = np.char.startswith(trace.actor, "parked")
@@ -64,7 +65,8 @@ def collect_lamps(scene: Scene, state: LampState) -> Lamps:
     """Return the lamps that illuminate the scene: all street lamps, then the head lamps that are on."""
     street = scene.town.lamps - (0.0, 0.0, 0.08)
     street[:, 2] += scene.town.grounds(*street[:, :2].T)
-    places, beams = [street], [np.zeros_like(street)]
+    places = [street]
+    beams = [np.zeros_like(street)]
     for actor in np.flatnonzero(state.head[1:] > 0.5):
         body = scene.world_from_actor(int(actor))
         heads, _ = lamp_places(*scene.trace.model(int(actor)))
@@ -87,13 +89,13 @@ def no_lamps() -> Lamps:
 
 @lru_cache(maxsize=256)
 def lamp_places(category: str, shape: int, size: tuple[float, ...] | None = None) -> tuple[Array, Array]:
-    """Return the centres (K, 3) of an actor's head lamps and those (L, 3) of its tail lamps, body frame [m]."""
+    """Return the centres of an actor's head lamps (K, 3) and tail lamps (L, 3), body frame [m]."""
     mesh = actor_mesh(category, shape, size)
     centres = mesh.vertices[mesh.faces].mean(axis=1).astype(np.float64)
 
     def centre(material: Material) -> Array:
-        own = centres[mesh.material == material]
-        sides = [own[own[:, 1] > 0.15], own[own[:, 1] < -0.15], own[np.abs(own[:, 1]) <= 0.15]]
+        lamps = centres[mesh.material == material]
+        sides = [lamps[lamps[:, 1] > 0.15], lamps[lamps[:, 1] < -0.15], lamps[np.abs(lamps[:, 1]) <= 0.15]]
         return np.array([side.mean(axis=0) for side in sides if len(side)]).reshape(-1, 3)
 
     return centre(Material.HEADLAMP), centre(Material.TAILLAMP)
@@ -101,7 +103,7 @@ def lamp_places(category: str, shape: int, size: tuple[float, ...] | None = None
 
 @inlined
 def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
-    """Return the irradiance of a lamp, over its intensity, at a surface at x, y, z with the unit normal nx, ny, nz."""
+    """Return the irradiance of a lamp over its intensity [1/m^2] at x, y, z [m] for the unit normal nx, ny, nz."""
     px, py, pz = lamps.position[lamp, 0] - x, lamps.position[lamp, 1] - y, lamps.position[lamp, 2] - z
     square = px * px + py * py + pz * pz
     faced = px * nx + py * ny + pz * nz
@@ -135,7 +137,8 @@ def lamp_light(lamp, x, y, z, nx, ny, nz, lamps):
 def light_up(survey, lamps, light, most, towards, distance):
     """Write the irradiance of lamps at N hits: `light` (N, 3) of all but the strongest lamp, `most` (N, 3) of that one.
 
-    `towards` (N, 3), unit, and `distance` (N,) [m] are of the shadow ray to the strongest; -1 where there is none.
+    `towards` (N, 3) and `distance` (N,) [m] are unit direction and length of the shadow ray to the strongest lamp; the
+    length is -1 where there is none.
     """
     for ray in range(len(distance)):
         distance[ray] = -1
@@ -149,10 +152,14 @@ def light_up(survey, lamps, light, most, towards, distance):
         best, which = np.float32(1e-5), -1
         for place in range(lamps.first[i, j], lamps.first[i, j + 1]):
             lamp = lamps.listed[place]
-            own = lamp_light(lamp, x, y, z, nx, ny, nz, lamps)
-            if own <= 0:
+            share = lamp_light(lamp, x, y, z, nx, ny, nz, lamps)
+            if share <= 0:
                 continue
-            red, green, blue = lamps.colour[lamp, 0] * own, lamps.colour[lamp, 1] * own, lamps.colour[lamp, 2] * own
+            red, green, blue = (
+                lamps.colour[lamp, 0] * share,
+                lamps.colour[lamp, 1] * share,
+                lamps.colour[lamp, 2] * share,
+            )
             if red > best:
                 light[ray, 0] += most[ray, 0]
                 light[ray, 1] += most[ray, 1]

@@ -1,9 +1,8 @@
 """Surface shading: diffuse colour under sun, sky and lamps, emission, mirror reflection, and aerial perspective.
 
-Diffuse light is Lambertian, on procedural textures. Mirror reflection grows towards grazing incidence after Schlick's
-approximation of the Fresnel term. The air blends radiance into its own by exp(-extinction * distance).
-
-Radiance of the sky with sun and clouds, and an environment map of a street for mirror reflections.
+Diffuse light is Lambertian, on procedural textures. Mirror reflection grows towards grazing incidence by Schlick's
+approximation of the Fresnel term, and shows a procedural environment map of a street: sky, sun, clouds and houses. The
+air attenuates radiance by exp(-extinction * distance), and adds airlight.
 """
 
 import numpy as np
@@ -31,7 +30,7 @@ ROAD_LINE = 0.5  # painted share of a pixel above which its class is road markin
 
 @kernel
 def mark_paint(survey, appearance, pixel_angle, painted):
-    """Write whether each of the N hits of a G-buffer is `painted` (N,) road, as `shade` does."""
+    """Write whether the N hits of a G-buffer are on road markings to `painted` (N,), as `shade` does."""
     for ray in range(len(painted)):
         row = survey.row[ray]
         painted[ray] = False
@@ -49,10 +48,10 @@ def mark_paint(survey, appearance, pixel_angle, painted):
 
 @kernel
 def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angle, radiance, painted):
-    """Shade the N hits of a G-buffer: write their `radiance` (N, 3), and whether they are `painted` (N,) road.
+    """Shade the N hits of a G-buffer: write `radiance` (N, 3), and whether they are on road markings, `painted` (N,).
 
-    `lit` (N,) is the share of the sun that is not in shadow, `lamplight` (N, 3) the irradiance of lamps ((0, 3) where
-    none is on), `open_sky` (N,) the ambient occlusion (1: open), `pixel_angle` [rad] the angle that a pixel covers.
+    `lit` (N,) is the visible share of the sun, `lamplight` (N, 3) the irradiance of lamps ((0, 3) if none is on),
+    `open_sky` (N,) the ambient occlusion (1: open), `pixel_angle` [rad] the angle of view of a pixel.
     """
     lamps_on = len(lamplight) > 0
     table = appearance.noise
@@ -64,14 +63,19 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             red, green, blue = compute_sky(dx, dy, dz, light, table)
             radiance[ray, 0], radiance[ray, 1], radiance[ray, 2] = red, green, blue
             continue
-        instance, material = survey.instance[ray], appearance.material[row]
+        instance = survey.instance[ray]
+        material = appearance.material[row]
         x, y, z = survey.position[ray, 0], survey.position[ray, 1], survey.position[ray, 2]
         nx, ny, nz = survey.normal[ray, 0], survey.normal[ray, 1], survey.normal[ray, 2]
         facing = max(-(dx * nx + dy * ny + dz * nz), np.float32(0.02))
         across = np.float32(survey.distance[ray] * pixel_angle)
         slant = across / facing
-        own = appearance.colour
-        red, green, blue = own[instance, material, 0], own[instance, material, 1], own[instance, material, 2]
+        colours = appearance.colour
+        red, green, blue = (
+            colours[instance, material, 0],
+            colours[instance, material, 1],
+            colours[instance, material, 2],
+        )
         mirror, gloss = appearance.mirror[material], appearance.gloss[material]
         shine_r, shine_g, shine_b = np.float32(0), np.float32(0), np.float32(0)
         sunny = lit[ray]
@@ -90,9 +94,9 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                 green += share * (colour[piece, 1] * tone - green)
                 blue += share * (colour[piece, 2] * tone - blue)
             if light.to_sun[2] < np.float32(LOW_SUN) and nz > np.float32(0.9):
-                beside = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
+                toward_sun = dx * light.to_sun[0] + dy * light.to_sun[1] - dz * light.to_sun[2]
                 flat = 1 - facing
-                sheen = sunny * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (beside - 1))
+                sheen = sunny * np.float32(SHEEN) * flat * flat * np.exp(np.float32(SHEEN_GLOSS) * (toward_sun - 1))
                 shine_r, shine_g, shine_b = sheen * light.sun[0], sheen * light.sun[1], sheen * light.sun[2]
         elif material == SIDEWALK:
             if nz > np.float32(0.5):
@@ -132,7 +136,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             tone = np.float32(0.85) + np.float32(0.3) * sample_noise(table, (x + y) * 1.9, z * 1.9)
             red, green, blue = red * tone, green * tone, blue * tone
         elif material == ROOF and appearance.part[row] == BUILDING:
-            colour, building = appearance.facades.roof, appearance.part_row[row]
+            colour = appearance.facades.roof
+            building = appearance.part_row[row]
             tone = np.float32(0.85) + np.float32(0.3) * sample_noise(table, x * 2.3, y * 2.3 + z)
             near = fade(np.float32(0.25), slant)
             if near > 0 and nz > np.float32(0.2) and nz < np.float32(0.97):
@@ -151,7 +156,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             red, green, blue = red * tone * (np.float32(0.75) + autumn * np.float32(0.7)), green * tone, blue * tone
             through = np.float32(0.55)
         elif material == SIGN:
-            place, plate = appearance.plates.place, appearance.part_row[row]
+            place = appearance.plates.place
+            plate = appearance.part_row[row]
             right = (x - place[plate, 0]) * place[plate, 3] + (y - place[plate, 1]) * place[plate, 4]
             red, green, blue = sample_sign(
                 appearance.plates.kind[plate], right, z - place[plate, 2], across, appearance.plates.drawn
@@ -202,9 +208,9 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
             env_r, env_g, env_b = compute_environment(rx, ry, rz, light, table)
             if gloss > 0 and sunny > 0:
-                beside = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
-                if beside > np.float32(0.6):
-                    flash = np.exp(gloss * (beside - 1)) * sunny * gloss * np.float32(0.02)
+                toward_sun = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
+                if toward_sun > np.float32(0.6):
+                    flash = np.exp(gloss * (toward_sun - 1)) * sunny * gloss * np.float32(0.02)
                     env_r += flash * light.sun[0]
                     env_g += flash * light.sun[1]
                     env_b += flash * light.sun[2]
@@ -220,22 +226,22 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         radiance[ray, 2] = light.air[2] + kept * (blue - light.air[2])
 
 
-SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky, in reflections
-TOP_OF_FOG_M = 500.0  # height of the layer of fog
+SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky in reflections
+TOP_OF_FOG_M = 500.0  # height of the fog layer
 
 
 @inlined
 def compute_clear_sky(x, y, z, light):
-    """Return red, green, blue of the sky without clouds or sun's disc, in the unit direction x, y, z, world frame."""
+    """Return red, green, blue of the sky without clouds and solar disc in the unit direction x, y, z, world frame."""
     low = 1 - max(z, np.float32(0))
     low = low * low * low
     low *= low * np.float32(0.55) + np.float32(0.45)
     red = light.zenith[0] * (1 - low) + light.horizon[0] * low
     green = light.zenith[1] * (1 - low) + light.horizon[1] * low
     blue = light.zenith[2] * (1 - low) + light.horizon[2] * low
-    beside = 1 - (x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2])
-    if beside < np.float32(0.6):
-        halo = np.float32(0.012) / (beside + np.float32(0.012)) * np.float32(0.16) * (1 - beside / np.float32(0.6))
+    off_sun = 1 - (x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2])
+    if off_sun < np.float32(0.6):
+        halo = np.float32(0.012) / (off_sun + np.float32(0.012)) * np.float32(0.16) * (1 - off_sun / np.float32(0.6))
         red += halo * light.sun[0]
         green += halo * light.sun[1]
         blue += halo * light.sun[2]
@@ -244,10 +250,10 @@ def compute_clear_sky(x, y, z, light):
 
 @inlined
 def compute_sky(x, y, z, light, table):
-    """Return red, green, blue of a ray that hits nothing: sky, sun, clouds, and the air in between."""
+    """Return red, green, blue of a ray that hits nothing, in the unit direction x, y, z: sky, sun, clouds and air."""
     red, green, blue = compute_clear_sky(x, y, z, light)
-    beside = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
-    sun = min(max((beside - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
+    cosine = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
+    sun = min(max((cosine - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
     if z > np.float32(0.01) and light.cover > 0.02:
         far = 1 / (z + np.float32(0.06))
         u, v = x * far * np.float32(16), y * far * np.float32(16)
@@ -277,7 +283,7 @@ def compute_sky(x, y, z, light, table):
 
 @inlined
 def compute_environment(x, y, z, light, table):
-    """Return red, green, blue of the environment of a mirror in the unit direction x, y, z: sky, dim houses, ground."""
+    """Return red, green, blue of the environment map in the unit direction x, y, z: sky, dim houses, ground."""
     red, green, blue = compute_clear_sky(x, y, abs(z), light)
     height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * sample_noise(table, x * 9.0, y * 9.0))
     above = min(max((z - height) * np.float32(25), np.float32(0)), np.float32(1))

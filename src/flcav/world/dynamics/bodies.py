@@ -1,4 +1,4 @@
-"""Bodies under control: vehicles, walkers and props that a client has put into a live world."""
+"""Controlled bodies: vehicles, walkers and props that a client has spawned in a live world."""
 
 from dataclasses import dataclass
 
@@ -25,11 +25,11 @@ AT_REST = Controls()
 ON_SPRINGS = ("car", "van", "truck", "bus")
 ALOFT_M = 3.0  # a body placed farther above the ground than this falls; one farther below it stays there
 LAUNCH_MPS = 1.0  # a body leaves the ground where its vertical velocity exceeds that of the slope by more than this
-PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # rad by which cars lean on their springs, for each m/s^2 ahead and aside
-FALL_MPS = 3.0  # change of velocity by a hit that nobody stands
+PITCH_S2PM, ROLL_S2PM = 0.004, 0.007  # lean of cars on their springs [rad] per longitudinal and lateral m/s^2
+FALL_MPS = 3.0  # change of velocity by a hit beyond which a walker falls
 SLIDE_MPS2 = 0.7 * GRAVITY_MPS2  # deceleration of a fallen walker on the road
-MOST_LEAN_MPS2 = 10.0  # accelerations beyond are those of collisions
-WALK_MPS2 = 10.0  # by which walkers change their velocity, also after they were hit
+MOST_LEAN_MPS2 = 10.0  # higher accelerations are those of collisions, and do not lean cars further
+WALK_MPS2 = 10.0  # acceleration of walkers towards their wanted velocity, also after a hit
 
 
 STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "tilt", "aloft")  # arrays of `Bodies`
@@ -37,16 +37,16 @@ STATE = ("position", "velocity", "acceleration", "yaw", "yaw_rate", "steer", "ti
 
 @dataclass
 class ControlledBody:
-    """A vehicle, walker or prop under control: what does not change with its motion."""
+    """A vehicle, walker or prop under control, without its motion, which is in `Bodies`."""
 
     name: str
     blueprint: BodyBlueprint
     controls: Controls = AT_REST
-    walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity [m/s]
+    walk: tuple[float, float] = (0.0, 0.0)  # wanted velocity x, y of a walker, world frame [m/s]
     physics: bool = True
     gravity: bool = True
-    fallen: bool = False  # of a walker: was hit, and lies on the road
-    grip: float = 1.0  # share of the friction of a dry road
+    fallen: bool = False  # a walker that was hit and lies on the road
+    grip: float = 1.0  # friction over that of a dry road
 
     @property
     def category(self) -> str:
@@ -55,33 +55,35 @@ class ControlledBody:
 
 
 class Bodies:
-    """The N bodies under control and their motion, world frame."""
+    """The N controlled bodies and their motion in the world frame, as arrays with a row per body."""
 
     def __init__(self, ground: TownGround, *, leans: bool = False) -> None:
-        """Start without bodies on this ground; with `leans`, cars pitch and roll on their springs."""
+        """Start without bodies; with `leans`, cars pitch and roll on their springs."""
         self._leans = leans
         self.members: list[ControlledBody] = []
+        # (N, 3) x, y, z of the underside [m], [m/s], [m/s^2]
         self.position, self.velocity, self.acceleration = (np.zeros((0, 3)) for _ in range(3))
+        # (N,) [rad], [rad/s], angle of the front wheels [rad]
         self.yaw, self.yaw_rate, self.steer = (np.zeros(0) for _ in range(3))
-        self.tilt = np.zeros((0, 2))
-        self.size = np.zeros((0, 3))
+        self.tilt = np.zeros((0, 2))  # (N, 2) pitch and roll [rad]; on the ground those of its slope
+        self.size = np.zeros((0, 3))  # (N, 3) length, width, height [m]
         self.aloft = np.zeros(0, np.bool_)  # (N,) bodies with physics and gravity that are not on the ground
         self._vehicles: Vehicles = stack_blueprints([])
         self._ground = ground
 
     def row(self, name: str) -> int:
-        """Return the row of a body; raises `InputError` where there is none of this name."""
+        """Return the row of the body `name`. Raises `InputError` for an unknown name."""
         for row, body in enumerate(self.members):
             if body.name == name:
                 return row
         raise InputError(f"actor {shorten(name)}: there is none of this name under control")
 
     def find(self, name: str) -> ControlledBody:
-        """Return a body; raises `InputError` where there is none of this name."""
+        """Return the body `name`. Raises `InputError` for an unknown name."""
         return self.members[self.row(name)]
 
     def add(self, body: ControlledBody, x: float, y: float, yaw: float, z: float | None) -> None:
-        """Add a body at rest at x, y [m] with this yaw [rad], its underside at `z` [m]; None: on the ground."""
+        """Add a body at rest at x, y [m] with `yaw` [rad], world frame, underside at `z` [m], None: on the ground."""
         self.members.append(body)
         for name in STATE:
             array = getattr(self, name)
@@ -90,7 +92,7 @@ class Bodies:
         self.place(len(self.members) - 1, x, y, yaw, z)
 
     def remove(self, row: int) -> None:
-        """Remove a body."""
+        """Remove the body in a row; later rows move up."""
         del self.members[row]
         for name in STATE:
             setattr(self, name, np.delete(getattr(self, name), row, axis=0))
@@ -99,9 +101,9 @@ class Bodies:
     def place(
         self, row: int, x: float, y: float, yaw: float, z: float | None, pitch: float = 0.0, roll: float = 0.0
     ) -> None:
-        """Move a body to x, y [m], yaw, pitch, roll [rad], its underside at `z` [m]; None: onto the ground.
+        """Move a body to x, y [m], yaw, pitch, roll [rad], world frame, underside at `z` [m], None: on the ground.
 
-        With physics and gravity it stands on the ground there, where that is within `ALOFT_M`.
+        A body with physics and gravity is put onto the ground if that is within `ALOFT_M` of `z`.
         """
         self.position[row] = x, y, np.nan if z is None else z
         self.yaw[row] = wrap_angle(yaw)
@@ -113,7 +115,7 @@ class Bodies:
             self.land(row)
 
     def land(self, row: int) -> None:
-        """Put a body with physics and gravity onto the ground, unless that is more than `ALOFT_M` away."""
+        """Put a body with physics and gravity onto the ground if that is within `ALOFT_M`; otherwise it is aloft."""
         body = self.members[row]
         if body.physics and body.gravity:
             self.aloft[row] = abs(self._clearance(np.array([row]))[0]) > ALOFT_M
@@ -121,7 +123,7 @@ class Bodies:
                 self._stand(np.array([row]))
 
     def push(self, row: int, velocity: tuple[float, float, float]) -> None:
-        """Set the velocity [m/s] of a body: pushed up, it leaves the ground; pushed down, it stays on it."""
+        """Set the velocity [m/s] of a body, world frame; pushed up, it leaves the ground."""
         self.velocity[row] = velocity
         body = self.members[row]
         if body.physics and body.gravity and not self.aloft[row]:
@@ -131,12 +133,12 @@ class Bodies:
                 self.velocity[row, 2] = climb
 
     def _climb(self, rows: Ints) -> Array:
-        """Return the vertical velocities [m/s] with which bodies follow the slopes that they move on."""
+        """Return the vertical velocities [m/s] of bodies that follow the slope of the ground."""
         ahead = (self.velocity[rows, :2] * heading_vectors(self.yaw[rows])).sum(axis=1)
         return -ahead * np.tan(self.tilt[rows, 0])
 
     def move(self, dt_s: float) -> None:
-        """Move all bodies with physics by a step of `dt_s` [s], before contacts are resolved."""
+        """Integrate the motion of all bodies with physics over `dt_s` [s], before contacts are resolved."""
         on = np.array([body.physics for body in self.members], np.bool_)
         flies = on & self.aloft
         self.position[flies] += self.velocity[flies] * dt_s
@@ -149,9 +151,9 @@ class Bodies:
             self._walk(rows, dt_s)
 
     def fall(self, change: Array) -> None:
-        """Let walkers fall whose velocity changed by more than `FALL_MPS` in contacts, in the direction of the hit.
+        """Make walkers fall, in the direction of the hit, whose velocity changed by more than `FALL_MPS` in contacts.
 
-        `change` (N, 2) [m/s] are the changes of velocity.
+        `change` (N, 2) is the change of velocity by contacts, world frame [m/s].
         """
         for row in np.flatnonzero(np.linalg.norm(change, axis=1) > FALL_MPS).tolist():
             body = self.members[row]
@@ -160,7 +162,7 @@ class Bodies:
                 self.yaw[row] = np.arctan2(change[row, 1], change[row, 0])
 
     def settle(self, dt_s: float) -> None:
-        """Put bodies with physics onto the ground and its slope after contacts; let those aloft fall for `dt_s` [s]."""
+        """Align bodies with the ground and its slope after contacts; those aloft fall for `dt_s` [s]."""
         heavy = np.array([body.physics and body.gravity for body in self.members], np.bool_)
         if len(rows := np.flatnonzero(heavy & self.aloft)):
             clearance = self._clearance(rows)
@@ -172,7 +174,7 @@ class Bodies:
             self.velocity[rows, 2] = self._climb(rows)
 
     def weights(self) -> tuple[Array, Array]:
-        """Return masses (N,) [kg] and moments of inertia (N,) [kg m^2]; infinite where contacts do not move a body."""
+        """Return masses (N,) [kg] and yaw inertias (N,) [kg m^2]; infinite where contacts do not move a body."""
         held = np.array([not body.physics or body.category == "prop" for body in self.members], np.bool_)
         upright = np.array([body.category == "pedestrian" for body in self.members], np.bool_)
         mass = np.where(held, np.inf, self._vehicles.mass_kg)
@@ -180,7 +182,7 @@ class Bodies:
         return mass, np.where(held | upright, np.inf, inertia)
 
     def find_grounded(self) -> Mask:
-        """Return (N,) which bodies are within `ALOFT_M` of the ground; the others obstruct no traffic."""
+        """Return (N,) whether bodies are within `ALOFT_M` of the ground; the others do not obstruct traffic."""
         return np.abs(self._clearance(np.arange(len(self.members)))) <= ALOFT_M
 
     def _clearance(self, rows: Ints) -> Array:
@@ -189,7 +191,7 @@ class Bodies:
         return z - self._ground.heights(x, y, z)
 
     def actors(self) -> Actors:
-        """Return the present states of the bodies."""
+        """Return the current states of the bodies, world frame."""
         return Actors(
             name=tuple(body.name for body in self.members),
             category=tuple(body.category for body in self.members),
@@ -204,9 +206,9 @@ class Bodies:
         )
 
     def _find_lean(self) -> Array:
-        """Return pitch and roll (N, 2) [rad] on top of the ground's: of fallen walkers, and of cars on their springs.
+        """Return pitch and roll (N, 2) [rad] relative to the ground: of fallen walkers, and of cars on their springs.
 
-        A fallen walker lies with the head ahead. Cars dive when they brake, and roll outwards in a curve, both in
+        A fallen walker lies with the head ahead. Cars pitch down when braking and roll outwards in a curve, in
         proportion to the acceleration.
         """
         lie: Array = np.column_stack((np.pi / 2 * self._lie(), np.zeros(len(self.members)))).astype(np.float64)
@@ -228,7 +230,7 @@ class Bodies:
     def _drive(self, rows: Ints, dt_s: float) -> None:
         controls = [self.members[row].controls for row in rows]
         pedals = Pedals(
-            *(np.array([getattr(each, name) for each in controls]) for name in Pedals._fields),
+            *(np.array([getattr(controls_of_one, name) for controls_of_one in controls]) for name in Pedals._fields),
         )
         motion = PlanarMotion(
             self.position[rows, :2], self.yaw[rows], self.velocity[rows, :2], self.yaw_rate[rows], self.steer[rows]

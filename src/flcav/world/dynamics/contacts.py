@@ -1,8 +1,7 @@
-"""Contacts of upright boxes: the separating axis test, and impulses between those that touch (rigid bodies in plan).
+"""Contacts of upright boxes, as rigid bodies in plan: separating axis test, position correction and impulses.
 
-Where two boxes overlap, they are moved apart along the axis of least overlap, and those that approach exchange an
-impulse at the contact, without friction (Baraff, An Introduction to Physically Based Modeling, 1997, part II,
-section 8).
+Overlapping boxes are moved apart along the axis of least overlap, and those that approach exchange a frictionless
+impulse at the contact (Baraff, An Introduction to Physically Based Modeling, 1997, part II, section 8).
 """
 
 from typing import NamedTuple
@@ -12,39 +11,39 @@ import numpy as np
 from flcav.arrays import Array, Ints
 from flcav.machine.compiled import compiled
 
-RESTITUTION = 0.1  # speed after a collision over that before, along its normal
-PASSES = 12  # over all pairs of neighbours
-SLOP_M = 1e-6  # gap that is left between two boxes that were moved apart
-HEAVY = 5.0  # what is so many times as heavy as the other is not moved aside
-UNDO_PASSES = 1000
+RESTITUTION = 0.1  # coefficient of restitution: separation over approach speed, along the normal
+PASSES = 12  # of position correction over all pairs of neighbours
+SLOP_M = 1e-6  # gap between two boxes after they are moved apart
+HEAVY = 5.0  # mass ratio above which only the lighter box is moved aside
+UNDO_PASSES = 1000  # of putting overlapping boxes back
 
 
 class Footprints(NamedTuple):
-    """Footprints and levels of N upright boxes, world frame."""
+    """Footprints and vertical extents of N upright boxes, world frame."""
 
-    place: Array  # (N, 3) x, y [m], yaw [rad] of the middle
-    half: Array  # (N, 2) half of length and width [m]
-    level: Array  # (N, 2) lowest and highest point [m]
+    place: Array  # (N, 3) x, y [m] of the centre, and yaw [rad]
+    half: Array  # (N, 2) half length and half width [m]
+    level: Array  # (N, 2) lowest and highest z [m]
 
 
 class Contacts(NamedTuple):
-    """C contacts, each of two boxes."""
+    """C contacts between pairs of boxes, world frame."""
 
     first: Ints  # (C,) row of a box
-    second: Ints  # (C,) row of the other; greater
-    normal: Array  # (C, 2) unit vector from the second towards the first
-    point: Array  # (C, 2) place of the contact [m]
-    impulse: Array  # (C,) along the normal, on the first [N s]
+    second: Ints  # (C,) row of the other box, greater than `first`
+    normal: Array  # (C, 2) unit vector from the second towards the first box
+    point: Array  # (C, 2) contact point x, y [m]
+    impulse: Array  # (C,) impulse on the first box, along the normal [N s]
 
 
 def resolve_contacts(
     boxes: Footprints, before: Array, velocity: Array, yaw_rate: Array, mass: Array, inertia: Array
 ) -> tuple[Array, Array, Array, Contacts]:
-    """Return places (N, 3) [m, rad], velocities (N, 2) [m/s], yaw rates (N,) [rad/s] after contacts, and these.
+    """Return places (N, 3) [m, rad], velocities (N, 2) [m/s], yaw rates (N,) [rad/s] after contacts, and the contacts.
 
-    `mass` (N,) [kg] and `inertia` (N,) [kg m^2] are infinite for what nothing moves. `before` (N, 3) are the places
-    before the last motion: a box that still overlaps in the end goes back there and stands still, so that boxes that
-    did not overlap there never do unless something immovable was moved into them.
+    `mass` (N,) [kg] and `inertia` (N,) [kg m^2] are infinite for immovable boxes. `before` (N, 3) are the places before
+    the last motion: a box that still overlaps after `PASSES` returns there and stops. Boxes that did not overlap before
+    the motion therefore do not overlap after it, unless something immovable was moved into them.
     """
     place, velocity, yaw_rate = boxes.place.copy(), velocity.copy(), yaw_rate.copy()
     pairs = _find_neighbours(place, before, boxes.half, boxes.level, 1 / mass)
@@ -58,7 +57,7 @@ def resolve_contacts(
 
 
 def find_overlaps(boxes: Footprints, others: Footprints) -> Ints:
-    """Return the pairs (K, 2) of rows of `boxes` and of `others` that overlap."""
+    """Return the overlapping pairs (K, 2): rows of `boxes` and of `others`."""
     both = Footprints(*(np.concatenate(pair) for pair in zip(boxes, others)))
     inverse = np.repeat((1.0, 0.0), (len(boxes.place), len(others.place)))
     pairs = _find_neighbours(both.place, both.place, both.half, both.level, inverse)
@@ -69,7 +68,7 @@ def find_overlaps(boxes: Footprints, others: Footprints) -> Ints:
 
 @compiled
 def _find_neighbours(place, before, half, level, inverse_mass):
-    """Return the pairs (P, 2) of boxes that may come to touch, one of which at least can move."""
+    """Return the pairs (P, 2) of boxes that may touch, at least one of which can move (broad phase)."""
     count = len(place)
     reach = np.empty(count)
     for i in range(count):
@@ -95,7 +94,7 @@ def _find_neighbours(place, before, half, level, inverse_mass):
 
 @compiled
 def _overlap(place, half, i, j):
-    """Return the penetration depth [m] of two boxes, not positive where they are apart, and its axis, towards box i."""
+    """Return the penetration depth [m] of two boxes, not positive if they are apart, and its unit axis towards i."""
     dx, dy = place[i, 0] - place[j, 0], place[i, 1] - place[j, 1]
     least, least_x, least_y = np.inf, 0.0, 0.0
     if np.hypot(dx, dy) > np.hypot(half[i, 0], half[i, 1]) + np.hypot(half[j, 0], half[j, 1]):
@@ -103,13 +102,13 @@ def _overlap(place, half, i, j):
     turn = place[i, 2] - place[j, 2]
     cos, sin = abs(np.cos(turn)), abs(np.sin(turn))
     for side in range(4):
-        own, other = (i, j) if side < 2 else (j, i)
+        box, other = (i, j) if side < 2 else (j, i)
         along = side % 2
-        angle = place[own, 2] + along * np.pi / 2
+        angle = place[box, 2] + along * np.pi / 2
         x, y = np.cos(angle), np.sin(angle)
         offset = dx * x + dy * y
         across = half[other, 0] * (sin if along else cos) + half[other, 1] * (cos if along else sin)
-        depth = half[own, along] + across - abs(offset)
+        depth = half[box, along] + across - abs(offset)
         if depth < least:
             least = depth
             least_x, least_y = (x, y) if offset >= 0 else (-x, -y)
@@ -120,10 +119,11 @@ def _overlap(place, half, i, j):
 
 @compiled
 def _meet(place, before, half, i, j):
-    """Return depth and axis as `_overlap`, but of the axis along which two moving boxes came into contact last.
+    """Return depth and axis as `_overlap` does, but for the axis on which two moving boxes came into contact last.
 
-    Fast boxes overlap deeply after a step, and the least overlap may then be sideways; it counts where they overlapped
-    before, too (separating axis test of moving boxes: Ericson, Real-Time Collision Detection, 2005, section 5.5.8).
+    Fast boxes overlap deeply after a step, and the axis of least overlap may then be sideways; it is used only if the
+    boxes overlapped before, too (separating axis test of moving boxes: Ericson, Real-Time Collision Detection, 2005,
+    section 5.5.8).
     """
     least, least_x, least_y = _overlap(place, half, i, j)
     if least <= 0:
@@ -134,15 +134,15 @@ def _meet(place, before, half, i, j):
     cos, sin = abs(np.cos(turn)), abs(np.sin(turn))
     latest = 0.0
     for side in range(4):
-        own, other = (i, j) if side < 2 else (j, i)
+        box, other = (i, j) if side < 2 else (j, i)
         along = side % 2
-        angle = place[own, 2] + along * np.pi / 2
+        angle = place[box, 2] + along * np.pi / 2
         x, y = np.cos(angle), np.sin(angle)
         if was_x * x + was_y * y < 0:
             x, y = -x, -y
         across = half[other, 0] * (sin if along else cos) + half[other, 1] * (cos if along else sin)
-        gap = was_x * x + was_y * y - half[own, along] - across
-        depth = half[own, along] + across - (dx * x + dy * y)
+        gap = was_x * x + was_y * y - half[box, along] - across
+        depth = half[box, along] + across - (dx * x + dy * y)
         if gap > 0 and gap / (gap + depth) > latest:
             latest, least, least_x, least_y = gap / (gap + depth), depth, x, y
     return least, least_x, least_y
@@ -150,30 +150,30 @@ def _meet(place, before, half, i, j):
 
 @compiled
 def _find_point(place, half, i, j):
-    """Return the contact point: the mean of the corners that lie in the other box; without any, of the two centres."""
-    sum_x, sum_y, found = 0.0, 0.0, 0
-    for own, other in ((i, j), (j, i)):
-        cos, sin = np.cos(place[own, 2]), np.sin(place[own, 2])
+    """Return the contact point [m]: the mean of the corners inside the other box, or else of the two centres."""
+    sum_x, sum_y, corners = 0.0, 0.0, 0
+    for box, other in ((i, j), (j, i)):
+        cos, sin = np.cos(place[box, 2]), np.sin(place[box, 2])
         cos_other, sin_other = np.cos(place[other, 2]), np.sin(place[other, 2])
         for corner in range(4):
-            along = half[own, 0] * (1 if corner % 2 else -1)
-            aside = half[own, 1] * (1 if corner // 2 else -1)
-            x = place[own, 0] + along * cos - aside * sin
-            y = place[own, 1] + along * sin + aside * cos
+            along = half[box, 0] * (1 if corner % 2 else -1)
+            aside = half[box, 1] * (1 if corner // 2 else -1)
+            x = place[box, 0] + along * cos - aside * sin
+            y = place[box, 1] + along * sin + aside * cos
             dx, dy = x - place[other, 0], y - place[other, 1]
             inside = abs(dx * cos_other + dy * sin_other) <= half[other, 0]
             if inside and abs(dy * cos_other - dx * sin_other) <= half[other, 1]:
-                sum_x, sum_y, found = sum_x + x, sum_y + y, found + 1
-    if not found:
+                sum_x, sum_y, corners = sum_x + x, sum_y + y, corners + 1
+    if not corners:
         return (place[i, 0] + place[j, 0]) / 2, (place[i, 1] + place[j, 1]) / 2
-    return sum_x / found, sum_y / found
+    return sum_x / corners, sum_y / corners
 
 
 @compiled
 def _resolve(
     pairs, place, before, half, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point, impulse, touched
 ):
-    """Move boxes apart and exchange impulses, in place; note each pair's contact."""
+    """Move boxes apart and exchange impulses, in place, and record the contacts of the pairs."""
     for _ in range(PASSES):
         apart = True
         for row in range(len(pairs)):
@@ -188,6 +188,7 @@ def _resolve(
                 point[row, 0], point[row, 1] = _find_point(place, half, i, j)
             impulse[row] += _strike(row, i, j, place, velocity, yaw_rate, inverse_mass, inverse_inertia, normal, point)
             a, b = inverse_mass[i], inverse_mass[j]
+            # The correction is shared by inverse mass, except that a much heavier box does not give way at all.
             a, b = (0.0 if a * HEAVY < b else a), (0.0 if b * HEAVY < a else b)
             move = (depth + SLOP_M) / (a + b)
             place[i, 0] += a * move * x
@@ -196,6 +197,7 @@ def _resolve(
             place[j, 1] -= b * move * y
         if apart:
             return
+    # Putting a box back may let it overlap another that has moved: repeat until nothing overlaps or everything is back.
     for _ in range(UNDO_PASSES):
         apart = True
         for row in range(len(pairs)):

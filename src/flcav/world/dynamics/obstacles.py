@@ -1,4 +1,4 @@
-"""What bodies stand on and run into in a town: its ground with bridges and kerbs, and obstacles as upright boxes."""
+"""Static collision geometry of a town: the ground with bridges and kerbs, and obstacles as upright boxes."""
 
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -16,24 +16,24 @@ from flcav.world.meshes.furniture import MAST_BEHIND_M
 from flcav.world.snapshot import NOBODY, Actors
 
 LAMP_M, POST_M, MAST_M = 0.08, 0.05, 0.09  # radius of the posts of lamps, of signs and signals, and of sensors
-CLEARANCE_M = 0.15  # what is lower, such as debris, is in nobody's way
-BELOW_M = 1.0  # obstacles reach so far below the ground at their middle, since it may slope
+CLEARANCE_M = 0.15  # ground clearance: lower objects, such as debris, do not obstruct
+BELOW_M = 1.0  # depth of obstacles below the ground at their centre, since it may slope
 
 
 class Obstacles(NamedTuple):
-    """The obstacles of a town, with a search tree."""
+    """The S obstacles of a town, with a spatial index."""
 
-    boxes: Footprints  # of S obstacles
+    boxes: Footprints  # S upright boxes, world frame
     name: tuple[str, ...]  # (S,) "kind:row", e.g. "building:3"
-    tree: shapely.STRtree
+    tree: shapely.STRtree  # of the bounding rectangles in plan
 
     def near(self, low: Array, high: Array) -> Ints:
-        """Return the rows (K,), ascending, of obstacles that touch any of the boxes from `low` to `high` (N, 2) [m]."""
+        """Return the rows (K,), ascending, of obstacles that may touch a rectangle from `low` to `high` (N, 2) [m]."""
         return np.unique(self.tree.query(shapely.box(*low.T, *high.T))[1])
 
 
 def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
-    """Return a town's buildings, trunks, clutter and posts as obstacles, and its `parked` vehicles."""
+    """Return the obstacles of a town: buildings, tree trunks, clutter, posts, and the `parked` vehicles."""
     rows, name = [np.zeros((0, 6))], []
     for kind, part in _parts(town):
         rows.append(part)
@@ -51,19 +51,19 @@ def list_obstacles(town: Town, parked: Actors = NOBODY) -> Obstacles:
 
 
 def outline_actors(actors: Actors) -> Footprints:
-    """Return the upright boxes of actors, world frame [m]; those of vehicles and people from `CLEARANCE_M` up."""
+    """Return the upright boxes of actors, world frame [m]; those of vehicles and people begin at `CLEARANCE_M`."""
     z = actors.position[:, 2]
     clear = np.where(np.array(actors.category, np.str_) == "prop", 0.0, CLEARANCE_M)
     return Footprints(actors.places, actors.size[:, :2] / 2, np.column_stack((z + clear, z + actors.size[:, 2])))
 
 
 def join_footprints(*parts: Footprints) -> Footprints:
-    """Return the boxes of all parts, in order."""
+    """Concatenate footprints, in order."""
     return Footprints(*(np.concatenate(arrays) for arrays in zip(*parts)))
 
 
 def corners(boxes: Footprints) -> tuple[Array, Array]:
-    """Return the lowest and the highest x, y of footprints, (N, 2) each [m]."""
+    """Return the bounding rectangles of footprints: lowest and highest x, y, (N, 2) and (N, 2) [m], world frame."""
     cos, sin = np.abs(heading_vectors(boxes.place[:, 2])).T
     length, width = boxes.half.T
     reach = np.column_stack((length * cos + width * sin, length * sin + width * cos))
@@ -71,7 +71,7 @@ def corners(boxes: Footprints) -> tuple[Array, Array]:
 
 
 def _parts(town: Town) -> Iterator[tuple[str, Array]]:
-    """Yield kind, and x, y, yaw, length, width, height (K, 6), of all obstacles."""
+    """Yield the kind and the rows x, y [m], yaw [rad], length, width, height [m] (K, 6) of all obstacles."""
     yield "building", town.buildings
     x, y, height, _ = town.trees.T
     yield "tree", _posts(np.column_stack((x, y)), 0.05 + 0.018 * height, height)
@@ -90,7 +90,7 @@ def _posts(foot: Array, radius: Array | float, height: Array | float) -> Array:
     return np.column_stack((foot, level, 2 * radius + level, 2 * radius + level, height + level))
 
 
-EDGE_M = 0.05  # a point so far beside a deck still is on it
+EDGE_M = 0.05  # margin around a deck within which a point counts as on it
 
 
 class TownGround:
@@ -107,7 +107,10 @@ class TownGround:
             shapely.prepare(area)
 
     def heights(self, x: Array, y: Array, z: Array) -> Array:
-        """Return the height (N,) [m] of the ground, or of a deck there that is nearer to `z` (N,); NaN: the ground."""
+        """Return the height (N,) [m] at x, y (N,) [m] of the ground, or of a deck if that is nearer to `z` (N,) [m].
+
+        With a `z` of NaN it is that of the ground.
+        """
         ground = self._town.grounds(x, y)
         for deck, area in self._decks:
             inside = np.flatnonzero(shapely.contains_xy(area, x, y))
@@ -116,10 +119,10 @@ class TownGround:
         return ground
 
     def stand(self, position: Array, yaw: Array, size: Array, upright: Mask) -> tuple[Array, Array]:
-        """Return height (N,) [m], pitch and roll (N, 2) [rad] of bodies of this `size` (N, 3) at `position` (N, 3) [m].
+        """Return height (N,) [m], pitch and roll (N, 2) [rad] of bodies on the ground, world frame.
 
-        Whether a body is on a bridge or below it follows from its height; NaN: below. Bodies that are `upright` (N,)
-        do not tilt, and step onto kerbs.
+        The bodies have `size` (N, 3) [m], `position` (N, 3) [m] and `yaw` (N,) [rad]. Whether a body is on a bridge or
+        below it follows from its height; NaN: below. Bodies that are `upright` (N,) do not tilt, and step onto kerbs.
         """
         x, y, z = position.T
         height, tilt = np.zeros(len(x)), np.zeros((len(x), 2))

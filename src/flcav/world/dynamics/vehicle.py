@@ -1,10 +1,10 @@
-"""Vehicles: their mechanical parameters, and the kinematic bicycle model with tyres of limited grip.
+"""Vehicle dynamics: mechanical parameters, and the kinematic bicycle model with tyres of limited grip.
 
 The bicycle model turns a vehicle about a point on the line of its rear axle: at the speed u its yaw rate is
-u tan(steer) / wheelbase, and its middle moves sideways by the yaw rate times the distance to the rear axle (Rajamani,
-Vehicle Dynamics and Control, 2012, section 2.2). Tyres pull the motion towards that of the model, and change the
-velocity by no more than `FRICTION` times gravity: a vehicle that is too fast for its curve understeers, and one that
-was hit slides and spins until they hold it again.
+u tan(steer) / wheelbase, and its centre moves sideways at the yaw rate times the distance to the rear axle (Rajamani,
+Vehicle Dynamics and Control, 2012, section 2.2). The tyres pull the motion towards that of the model, with an
+acceleration of at most `FRICTION` times gravity: a vehicle that is too fast for its curve understeers, and one that
+was hit slides and spins until the tyres regain grip.
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ class _Make(NamedTuple):
     density: float  # mass over the volume of the box [kg/m^3]
     pull: float  # greatest acceleration by the engine [m/s^2]
     power: float  # of the engine, over the mass [W/kg]
-    drag: float  # coefficient of drag, of the frontal area
+    drag: float  # drag coefficient, referred to the frontal area
     brake: float  # greatest deceleration by the brakes [m/s^2]
 
 
@@ -52,13 +52,13 @@ class BodyBlueprint:
     category: str  # one of `trace.CATEGORIES`, or "prop"
     shape: int  # row of `SHAPES[category]`, or of `PROPS`
     size: tuple[float, float, float]  # length, width, height [m]
-    mass_kg: float
+    mass_kg: float  # [kg]
     engine_n: float  # greatest force of the engine [N]
     power_w: float  # greatest power of the engine [W]
-    drag_area_m2: float  # coefficient of drag times frontal area
-    brake_mps2: float  # greatest deceleration by the brakes
-    wheelbase_m: float  # between the axles, which are symmetric about the box's middle
-    steer_limit_rad: float = STEER_LIMIT_RAD  # greatest angle of the front wheels
+    drag_area_m2: float  # drag coefficient times frontal area [m^2]
+    brake_mps2: float  # greatest deceleration by the brakes [m/s^2]
+    wheelbase_m: float  # distance of the axles, which are symmetric about the box's centre [m]
+    steer_limit_rad: float = STEER_LIMIT_RAD  # greatest angle of the front wheels [rad]
 
     @property
     def inertia_kgm2(self) -> float:
@@ -68,7 +68,7 @@ class BodyBlueprint:
 
 
 def make_blueprint(category: str, shape: int = 0, size: tuple[float, float, float] | None = None) -> BodyBlueprint:
-    """Return the blueprint of a shape; `size` is length, width, height [m], None: those of the shape.
+    """Return the mechanical parameters of a shape; `size` is length, width, height [m], by default the shape's.
 
     Raises `InputError` for an unknown category or shape, and for a size that is not positive.
     """
@@ -96,27 +96,27 @@ def make_blueprint(category: str, shape: int = 0, size: tuple[float, float, floa
 
 
 GRAVITY_MPS2 = 9.81
-FRICTION = 0.9  # of tyres on a dry road
+FRICTION = 0.9  # coefficient of tyres on a dry road
 GRIP_MPS2 = FRICTION * GRAVITY_MPS2
 AIR_KGPM3 = 1.2  # density of air
 ROLLING_MPS2 = 0.015 * GRAVITY_MPS2  # deceleration by rolling resistance
 HAND_BRAKE_MPS2 = 0.5 * GRIP_MPS2  # of the rear wheels alone
-STEER_RADPS = 2.5  # how fast the front wheels turn
-REVERSE_MPS = 8.0  # the engine drives backwards no faster
+STEER_RADPS = 2.5  # steering rate of the front wheels
+REVERSE_MPS = 8.0  # greatest speed in reverse gear
 
 
 class PlanarMotion(NamedTuple):
     """The motion of N bodies in plan, world frame."""
 
-    position: Array  # (N, 2) middle of the box [m]
+    position: Array  # (N, 2) centre of the box [m]
     yaw: Array  # (N,) [rad]
-    velocity: Array  # (N, 2) of the middle [m/s]
+    velocity: Array  # (N, 2) of the centre [m/s]
     yaw_rate: Array  # (N,) [rad/s]
     steer: Array  # (N,) angle of the front wheels, positive to the left [rad]
 
 
 class Vehicles(NamedTuple):
-    """The parameters of N vehicles: see `BodyBlueprint`."""
+    """The mechanical parameters of N vehicles, (N,) each: see `BodyBlueprint`."""
 
     mass_kg: Array
     engine_n: Array
@@ -125,36 +125,36 @@ class Vehicles(NamedTuple):
     brake_mps2: Array
     wheelbase_m: Array
     steer_limit_rad: Array
-    grip_mps2: Array  # (N,) greatest change of the velocity by the tyres
-    spin_mps2: Array  # (N,) greatest change of the yaw rate by the tyres [rad/s^2]
+    grip_mps2: Array  # (N,) greatest acceleration by the tyres [m/s^2]
+    spin_mps2: Array  # (N,) greatest yaw acceleration by the tyres [rad/s^2]
 
 
 class Pedals(NamedTuple):
-    """Controls of N vehicles."""
+    """Driving controls of N vehicles."""
 
     throttle: Array  # (N,) 0 to 1
-    steer: Array  # (N,) -1 to 1, share of the limit, positive to the left
+    steer: Array  # (N,) -1 to 1, in steering limits, positive to the left
     brake: Array  # (N,) 0 to 1
     hand_brake: Mask  # (N,)
     reverse: Mask  # (N,)
 
 
 def stack_blueprints(blueprints: list[BodyBlueprint]) -> Vehicles:
-    """Return the parameters of vehicles as arrays."""
+    """Return the mechanical parameters of vehicles as arrays."""
     rows = [
         (
-            *(each.mass_kg, each.engine_n, each.power_w, each.drag_area_m2),
-            *(each.brake_mps2, each.wheelbase_m, each.steer_limit_rad),
+            *(blueprint.mass_kg, blueprint.engine_n, blueprint.power_w, blueprint.drag_area_m2),
+            *(blueprint.brake_mps2, blueprint.wheelbase_m, blueprint.steer_limit_rad),
             GRIP_MPS2,
-            GRIP_MPS2 * each.wheelbase_m / 2 * each.mass_kg / each.inertia_kgm2,
+            GRIP_MPS2 * blueprint.wheelbase_m / 2 * blueprint.mass_kg / blueprint.inertia_kgm2,
         )
-        for each in blueprints
+        for blueprint in blueprints
     ]
     return Vehicles(*np.array(rows, np.float64).reshape(-1, len(Vehicles._fields)).T)
 
 
 def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> PlanarMotion:
-    """Return the motion of N vehicles `dt_s` [s] later, on slopes of this `pitch` (N,) [rad], positive downhill."""
+    """Integrate the motion of N vehicles over `dt_s` [s], on slopes of `pitch` (N,) [rad], positive downhill."""
     ahead = heading_vectors(motion.yaw)
     speed = (motion.velocity * ahead).sum(axis=1)
     wanted = np.clip(pedals.steer, -1, 1) * vehicles.steer_limit_rad
@@ -165,6 +165,7 @@ def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pit
     spin = vehicles.spin_mps2 * dt_s
     yaw_rate = motion.yaw_rate + np.clip(turn - motion.yaw_rate, -spin, spin)
     yaw = motion.yaw + yaw_rate * dt_s
+    # The velocity that the bicycle model wants; tyres change the present one towards it only within their grip.
     model = speed[:, None] * heading_vectors(yaw) + (turn * vehicles.wheelbase_m / 2)[:, None] * left_vectors(yaw)
     change = model - motion.velocity
     needed = np.linalg.norm(change, axis=1, keepdims=True)
@@ -176,7 +177,7 @@ def drive_vehicles(motion: PlanarMotion, vehicles: Vehicles, pedals: Pedals, pit
 
 
 def _accelerate(speed: Array, vehicles: Vehicles, pedals: Pedals, pitch: Array, dt_s: float) -> Array:
-    """Return the longitudinal speed (N,) [m/s] after `dt_s` [s]: engine, drag, slope, then brakes, at most to rest."""
+    """Return the longitudinal speed (N,) [m/s] after `dt_s` [s]: engine, drag and slope, then brakes down to rest."""
     force = np.minimum(vehicles.engine_n, vehicles.power_w / np.maximum(np.abs(speed), 1e-3))
     force = np.clip(pedals.throttle, 0, 1) * np.where(pedals.reverse, -1 * (speed > -REVERSE_MPS), 1) * force
     drag = AIR_KGPM3 / 2 * vehicles.drag_area_m2 * speed * np.abs(speed)

@@ -16,10 +16,10 @@ from flcav.world.trace import Trace
 
 
 def measure_traffic_density(sites: Array, traces: Trace | Sequence[Trace], range_m: float) -> Array:
-    """Return the traffic density (P,): the mean number of actors within `range_m` of each site, over all instants.
+    """Return the traffic density (P,) at sites: the mean number of actors within `range_m` [m], over all instants.
 
-    `sites` (P, 3) are in the world frame [m]. Every present actor counts, moving or parked, vehicle or pedestrian; its
-    distance is the 3D distance from the site to the centre of its box. All zeros without traces.
+    `sites` (P, 3) are in the world frame [m]. All present actors count, moving or parked, vehicle or pedestrian, by the
+    3D distance from the site to the centre of the box. It is zero without traces.
     """
     traces = [traces] if isinstance(traces, Trace) else traces
     total, instants = np.zeros(len(sites)), 0
@@ -34,9 +34,9 @@ def measure_traffic_density(sites: Array, traces: Trace | Sequence[Trace], range
 def summarise_town(town: Town) -> dict[str, float]:
     """Return the statistics of a town by name.
 
-    `width_m` and `height_m` are the extents of its bounds; `driving_km` and `sidewalk_km` the total length of these
-    lanes; `junctions` the number of nodes with three or more neighbours, `lights` of junctions with traffic lights;
-    `vehicles` and `pedestrians` the number moving at once; all others are plain counts.
+    `width_m` and `height_m` are the extents of its bounds [m]; `driving_km` and `sidewalk_km` the total length of these
+    lanes [km]; `junctions` the number of nodes with three or more neighbours, `lights` that of junctions with traffic
+    lights; `vehicles` and `pedestrians` the number moving at the same time; all others are plain counts.
     """
     net = read_net(town.net)
     x_low, y_low, x_high, y_high = town.bounds

@@ -1,10 +1,9 @@
 """The lane-level map of a town: vector layers (`map_layers`), road markings, and a bird's-eye raster (`rasterise`).
 
-Road markings of a SUMO net, after the practice of European towns.
-
-Lane lines are dashed, and solid before a controlled junction. The directions of a street are separated by a dashed
-line, and by a double solid line where they have more than two driving lanes together. Solid lines separate bicycle and
-parking lanes; edge lines mark streets without a kerb and fast ones. Approaches end in a stop line or a give-way line.
+Road markings of a SUMO net follow the practice of European towns. Lane lines are dashed, and solid before a controlled
+junction. The directions of a street are separated by a dashed line, or by a double solid line if they have more than
+two driving lanes together. Solid lines separate bicycle and parking lanes; edge lines mark streets without a kerb and
+fast ones. Approaches end in a stop line or a give-way line.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -48,15 +47,15 @@ RASTER_LAYERS: tuple[str, ...] = (
 )
 
 WAYS: dict[str, ArrowKind] = {kind: kind for kind in get_args(ArrowKind)}
-ARROWS_BEFORE_M = (8.0, 28.0)  # from the end of the lane back to an arrow's middle
+ARROWS_BEFORE_M = (8.0, 28.0)  # distances of arrows' centres from the end of the lane
 
 
 def rasterise(layers: MapLayers, world_from_patch: Array, size_m: tuple[float, float], resolution_m: float) -> Mask:
-    """Return the bird's-eye raster (len(RASTER_LAYERS), H, W) of a patch: which pixel centres lie in each layer.
+    """Rasterise a patch in bird's-eye view: (len(RASTER_LAYERS), H, W) whether pixel centres are in the layers.
 
-    `world_from_patch` (4, 4) is the pose of the patch's middle, x forward and y left; `size_m` its extents along x, y
-    [m]; H = size_m[0] / resolution_m and W = size_m[1] / resolution_m, rounded.
-    Row 0 is farthest ahead, column 0 farthest left: pixel (i, j) has its centre at x = size_m[0] / 2 - (i + 0.5)
+    `world_from_patch` (4, 4) [m] is the pose of the patch's centre, x forward and y left; `size_m` its extents along
+    x, y [m]; H = size_m[0] / resolution_m and W = size_m[1] / resolution_m, rounded, with `resolution_m` [m/px]. Row 0
+    is farthest ahead, column 0 farthest left: the centre of pixel (i, j) is at x = size_m[0] / 2 - (i + 0.5)
     resolution_m, y = size_m[1] / 2 - (j + 0.5) resolution_m.
     """
     shape = round(size_m[0] / resolution_m), round(size_m[1] / resolution_m)
@@ -74,11 +73,11 @@ def rasterise(layers: MapLayers, world_from_patch: Array, size_m: tuple[float, f
 
 
 def fill_polygons(points: Array, counts: Ints, shape: tuple[int, int]) -> Mask:
-    """Return the mask (H, W) of pixels whose centres (i + 0.5, j + 0.5) lie in any of the polygons.
+    """Fill polygons: return the mask (H, W) of pixels whose centres (i + 0.5, j + 0.5) are in one of them.
 
     Scan-line fill by the nonzero winding rule, vectorised over all edges. `points` (N, 2) are the polygons' vertices as
-    row and column [px], polygon after polygon; `counts` are their numbers of vertices. All polygons are wound the same
-    way. `shape` is (H, W).
+    row and column [px], polygon by polygon; `counts` are the polygons' numbers of vertices. All polygons have the same
+    orientation. `shape` is (H, W).
     """
     height, width = shape
     starts = np.repeat(np.cumsum(counts) - counts, counts)
@@ -99,7 +98,7 @@ def fill_polygons(points: Array, counts: Ints, shape: tuple[int, int]) -> Mask:
 
 
 def _polygons(layers: MapLayers) -> dict[str, list[Array]]:
-    """Return the polygons (K, 2) of each raster layer, world frame [m], in the order of `RASTER_LAYERS`."""
+    """Return the polygons (K, 2) of the raster layers, world frame [m], in the order of `RASTER_LAYERS`."""
     across = ("stop_line", "yield_line")
     driving = [lane for lane in layers.lanes if lane.kind == "driving" and len(lane.centre_line) > 1]
     strips = shapely.buffer(
@@ -122,7 +121,7 @@ def _polygons(layers: MapLayers) -> dict[str, list[Array]]:
 
 
 def map_layers(town: Town) -> MapLayers:
-    """Return the lane-level map of a town, in the world frame. The same town gives the same map."""
+    """Build the lane-level map of a town, world frame [m]. The same town gives the same map."""
     net = read_net(town.net)
     roads = shapely.union_all([Polygon(outline) for outline in town.roads])
     crossings = tuple(_crossings(net, roads))
@@ -139,7 +138,7 @@ def map_layers(town: Town) -> MapLayers:
 
 
 def _lanes(net: RoadNet) -> Iterator[MapLane]:
-    """Yield the lanes of a net with their successors; lanes inside junctions also with their turn and light."""
+    """Yield the lanes of a net with their successors; lanes inside junctions also have their turn and light."""
     following: dict[str, list[str]] = {}
     entered = {connection.via: connection for connection in net.connections if connection.via}
     for connection in net.connections:
@@ -161,7 +160,7 @@ def _lanes(net: RoadNet) -> Iterator[MapLane]:
 
 
 def _crossings(net: RoadNet, roads: BaseGeometry) -> Iterator[Crossing]:
-    """Yield the pedestrian crossings of a net, clipped to `roads`; of a divided one the largest part."""
+    """Yield the pedestrian crossings of a net, clipped to `roads`; only the largest part of a divided one."""
     for edge in net.edges.values():
         if edge.function == "crossing":
             lane = edge.lanes[0]
@@ -194,7 +193,7 @@ def _way(turns: set[str]) -> ArrowKind | None:
 
 
 def _along(edge: Edge, lane: Lane, way: ArrowKind) -> Iterator[Arrow]:
-    """Yield the arrows of one lane, `ARROWS_BEFORE_M` before its end, as far as the lane is long enough."""
+    """Yield the arrows of a lane, `ARROWS_BEFORE_M` before its end, where the lane is long enough."""
     line = LineString(lane.shape)
     for before in ARROWS_BEFORE_M:
         middle = line.length - before
@@ -206,17 +205,17 @@ def _along(edge: Edge, lane: Lane, way: ArrowKind) -> Iterator[Arrow]:
 
 
 LINE_M = 0.12  # width of a line
-BICYCLE_LINE_M = 0.25
+BICYCLE_LINE_M = 0.25  # width of the line along a bicycle lane
 DASH_M, GAP_M = 3.0, 6.0  # of a dashed lane line
-YIELD_DASH_M, YIELD_GAP_M, YIELD_LINE_M = 0.5, 0.25, 0.5
-STOP_LINE_M = 0.5
-TO_STOP_M = 0.35  # from the middle of a stop line to the end of its lane
-APPROACH_M = 18.0  # lane lines are solid over this length before a controlled junction
-DOUBLE_M = 0.12  # from the middle of the road to each line of a double line
-INSET_M = 0.2  # from the edge of the lane to an edge line
-FAST = 13.0  # [m/s] from this speed limit on, streets have edge lines even along a kerb
+YIELD_DASH_M, YIELD_GAP_M, YIELD_LINE_M = 0.5, 0.25, 0.5  # dash, gap and width of a give-way line
+STOP_LINE_M = 0.5  # width of a stop line
+TO_STOP_M = 0.35  # distance from the middle of a stop line to the end of its lane
+APPROACH_M = 18.0  # length over which lane lines are solid before a controlled junction
+DOUBLE_M = 0.12  # distance of the lines of a double line from the middle of the road
+INSET_M = 0.2  # distance of an edge line from the edge of the lane
+FAST = 13.0  # speed limit from which streets have edge lines even along a kerb [m/s]
 SHORTEST_M = 0.3  # shorter pieces of a line are left out
-SAME_LINE_M = 0.7  # left sides of two edges nearer than this are one line: the directions of one street
+SAME_LINE_M = 0.7  # distance within which the left sides of two edges coincide: the directions of one street
 
 
 def generate_markings(
@@ -224,14 +223,14 @@ def generate_markings(
 ) -> Iterator[Marking]:
     """Yield the road markings of a net, clipped to `roads` and left out on `crossings`.
 
-    Both areas are shapely geometry in the world frame [m]. Lanes with a key in `stop_lines` have one so far before
-    their ends [m]; their edges have no other one.
+    Both areas are shapely geometry in the world frame [m]. `stop_lines` maps lanes to the distances of their stop lines
+    from their ends [m]; edges with such a lane have no other stop line.
     """
     paper = roads.buffer(-0.01).difference(crossings)
     shapely.prepare(paper)
     for marking in _generate_unclipped(net, stop_lines):
         width = marking.width_m / 2
-        inside = paper.buffer(-width) if width > LINE_M else paper  # wide ones lie wholly on the road
+        inside = paper.buffer(-width) if width > LINE_M else paper  # wide ones are completely on the road
         for part in _lines(LineString(marking.line).intersection(inside)):
             if part.length >= SHORTEST_M:
                 line = np.asarray(part.coords)
@@ -239,7 +238,7 @@ def generate_markings(
 
 
 def _generate_unclipped(net: RoadNet, stop_lines: Mapping[str, float]) -> Iterator[Marking]:
-    """Yield all markings of a net before they are clipped, edge by edge."""
+    """Yield the unclipped markings of a net, edge by edge."""
     bends = _bends(net)
     facing: dict[tuple[str, str], list[Edge]] = {}
     for edge in net.edges.values():
@@ -269,7 +268,7 @@ def _generate_unclipped(net: RoadNet, stop_lines: Mapping[str, float]) -> Iterat
 
 
 def _between_lanes(lanes: list[Lane], approach: float, side: int) -> Iterator[Marking]:
-    """Yield the lines between neighbouring lanes (from the kerb to the middle); `approach` is as in `_broken`."""
+    """Yield the lines between neighbouring lanes, from the kerb to the middle; `approach` is as in `_broken`."""
     for right, left in pairwise(lanes):
         line = _beside(right, right.width / 2, side)
         if right.kind == left.kind == "driving":
@@ -280,7 +279,7 @@ def _between_lanes(lanes: list[Lane], approach: float, side: int) -> Iterator[Ma
 
 
 def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: float, side: int) -> Iterator[Marking]:
-    """Yield the centre line towards that edge of `across` (the opposite direction) which adjoins, else an edge line."""
+    """Yield the centre line towards the adjacent edge of `across` (the opposite direction), or else an edge line."""
     line = _beside(lanes[-1], lanes[-1].width / 2, side)
     for other in across:
         theirs = [lane for lane in other.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
@@ -299,7 +298,7 @@ def _left_side(edge: Edge, lanes: list[Lane], across: list[Edge], approach: floa
 
 
 def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterator[Marking]:
-    """Yield a dashed line that is solid over its last `approach` metres, or over both ends; a third of it at most."""
+    """Yield a dashed line that is solid over its last `approach` [m], or over both ends, by a third of it at most."""
     whole = LineString(line)
     approach = min(approach, whole.length / 3)
     start = approach if both_ends else 0.0
@@ -313,7 +312,7 @@ def _broken(line: Array, approach: float, *, both_ends: bool = False) -> Iterato
 
 
 def _stop_line(lane: Lane, before_end_m: float, side: int) -> Marking:
-    """Return the stop line across one lane; beyond the lane's end its direction goes straight on."""
+    """Return the stop line across a lane, which is extended straight beyond its end."""
     line = LineString(lane.shape)
     at = line.length - before_end_m
     near = max(min(at, line.length) - 0.5, 0.0)
@@ -356,7 +355,7 @@ def _is_controlled(net: RoadNet, edge: Edge) -> bool:
 
 
 def _bends(net: RoadNet) -> dict[str, str]:
-    """Return the internal edges that continue one street through a node with two neighbours: edge -> junction."""
+    """Return the internal edges that continue a street through a node with two neighbours, as edge -> junction."""
     neighbours: dict[str, set[str]] = {}
     for edge in net.streets:
         neighbours.setdefault(edge.end, set()).add(edge.start)
@@ -375,14 +374,14 @@ def _bends(net: RoadNet) -> dict[str, str]:
 
 
 def _beside(lane: Lane, left_m: float, side: int) -> Array:
-    """Return the line `left_m` to the left of a lane's middle, with left-hand traffic (`side` -1) to the right."""
+    """Return the line `left_m` [m] to the left of a lane's middle; with left-hand traffic (`side` -1) to the right."""
     line = LineString(lane.shape).offset_curve(side * left_m, join_style="mitre")
     parts = _lines(line)
     return np.asarray(max(parts, key=lambda part: part.length).coords) if parts else lane.shape
 
 
 def _coincide(one: Array, other: Array) -> bool:
-    """Return whether two polylines (K, 2) coincide within `SAME_LINE_M`, at three points of the other."""
+    """Return whether two polylines (K, 2) [m] coincide within `SAME_LINE_M`, at three points of `other`."""
     line = LineString(one)
     whole = LineString(other)
     inner = [whole.interpolate(share, normalized=True) for share in (0.25, 0.5, 0.75)]

@@ -25,14 +25,14 @@ ArrowKind = Literal["straight", "left", "right", "straight_left", "straight_righ
 
 @dataclass(frozen=True)
 class MapLane:
-    """One lane, on a street or inside a junction."""
+    """A lane, on a street or inside a junction."""
 
     id: str
     kind: LaneKind
-    centre_line: Array  # (K, 2) in driving direction; the outline of a walkingarea
-    width_m: float
+    centre_line: Array  # (K, 2) in driving direction; outline of a walkingarea [m]
+    width_m: float  # [m]
     speed: float  # limit [m/s]
-    junction: str  # the junction it lies in; empty on a street
+    junction: str  # the junction that contains it; empty on a street
     turn: str  # of a lane inside a junction: s straight, l left, r right, t U-turn; else empty
     light: str  # of a lane inside a junction: "junction:link" of the signal that controls its entry; else empty
     successors: tuple[str, ...]  # ids of the lanes that it leads to
@@ -43,10 +43,10 @@ class Marking:
     """A road marking: one painted line."""
 
     kind: MarkingKind
-    line: Array  # (K, 2) centre line of the paint
-    width_m: float
-    dash_m: float  # length of a dash; 0 for a continuous line
-    gap_m: float  # between two dashes
+    line: Array  # (K, 2) centre line of the paint [m]
+    width_m: float  # [m]
+    dash_m: float  # length of a dash [m]; 0 for a continuous line
+    gap_m: float  # length between two dashes [m]
     colour: str = "white"
 
 
@@ -55,28 +55,28 @@ class Crossing:
     """A pedestrian crossing."""
 
     id: str
-    outline: Array  # (K, 2) counter-clockwise, clipped to the road
-    centre_line: Array  # (K, 2) from kerb to kerb
-    width_m: float
+    outline: Array  # (K, 2) counter-clockwise, clipped to the road [m]
+    centre_line: Array  # (K, 2) from kerb to kerb [m]
+    width_m: float  # [m]
 
 
 @dataclass(frozen=True)
 class Arrow:
-    """A lane arrow on the road: position of its middle [m] and the driving direction in which it is read [rad]."""
+    """A lane arrow on the road."""
 
     kind: ArrowKind
-    x: float
-    y: float
-    yaw: float
-    lane: str  # id of the lane it lies on
+    x: float  # of its centre [m]
+    y: float  # of its centre [m]
+    yaw: float  # driving direction in which it is read [rad]
+    lane: str  # id of its lane
 
 
 @dataclass(frozen=True)
 class MapLayers:
     """The lane-level map of a town, as vector layers."""
 
-    roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, counter-clockwise, without holes
-    sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2)
+    roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, counter-clockwise, without holes [m]
+    sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2) [m]
     lanes: tuple[MapLane, ...]
     markings: tuple[Marking, ...]
     crossings: tuple[Crossing, ...]
@@ -89,7 +89,7 @@ SHAFT_M = 0.15  # width of its shaft
 
 
 class Paint(NamedTuple):
-    """One polygon of road paint."""
+    """A polygon of road paint."""
 
     layer: str  # marking | crossing | arrow
     outline: Array  # (K, 2) counter-clockwise, without holes [m]
@@ -97,7 +97,7 @@ class Paint(NamedTuple):
 
 
 def outline_paint(layers: MapLayers) -> tuple[Paint, ...]:
-    """Return the road paint of a map as polygons in the world frame: markings, then crossings, then arrows."""
+    """Return the road paint of a map as polygons, world frame [m]: markings, then crossings, then arrows."""
     return (
         *(Paint("marking", piece, marking.colour) for marking in layers.markings for piece in outline_dashes(marking)),
         *(Paint("crossing", piece, "white") for crossing in layers.crossings for piece in outline_stripes(crossing)),
@@ -106,7 +106,7 @@ def outline_paint(layers: MapLayers) -> tuple[Paint, ...]:
 
 
 def outline_dashes(marking: Marking) -> Iterator[Array]:
-    """Yield the polygons (K, 2) of a marking: one per dash, or one of a continuous line."""
+    """Yield the polygons (K, 2) [m] of a marking: one per dash, or one for a continuous line."""
     line = LineString(marking.line)
     period = marking.dash_m + marking.gap_m if marking.dash_m else line.length
     starts = np.arange(0.0, line.length - 1e-6, period)
@@ -116,7 +116,7 @@ def outline_dashes(marking: Marking) -> Iterator[Array]:
 
 
 def outline_stripes(crossing: Crossing) -> Iterator[Array]:
-    """Yield the polygons (K, 2) of a zebra crossing's stripes, whose long sides lie in driving direction."""
+    """Yield the polygons (K, 2) [m] of a zebra crossing's stripes, which are along the driving direction."""
     line, outline = LineString(crossing.centre_line), Polygon(crossing.outline)
     count = max(int((line.length + STRIPE_M) / (2 * STRIPE_M)), 1)
     first = (line.length - (2 * count - 1) * STRIPE_M) / 2
@@ -135,7 +135,8 @@ def outline_arrow(arrow: Arrow) -> Array:
 @lru_cache(maxsize=16)
 def _glyph(kind: ArrowKind) -> Array:
     """Return the outline (K, 2) of an arrow centred on the origin, pointing along +x [m]."""
-    back, heads = -ARROW_M / 2, kind.split("_")
+    back = -ARROW_M / 2
+    heads = kind.split("_")
     shaft = LineString([(back, 0.0), (0.9 if "straight" in heads else -0.2, 0.0)])
     pieces: list[BaseGeometry] = [shaft.buffer(SHAFT_M / 2, cap_style="flat")]
     if "straight" in heads:
@@ -149,7 +150,7 @@ def _glyph(kind: ArrowKind) -> Array:
 
 
 def list_outlines(shape: BaseGeometry | Iterable[BaseGeometry]) -> Iterator[Array]:
-    """Yield the outer rings of a shape's polygons: (K, 2) vertices, counter-clockwise, the first not repeated."""
+    """Yield the outer rings of a shape's polygons: (K, 2) vertices [m], counter-clockwise, the first not repeated."""
     parts = shape if not isinstance(shape, BaseGeometry) else getattr(shape, "geoms", [shape])
     for part in parts:
         if isinstance(part, Polygon) and part.area > 1e-4:

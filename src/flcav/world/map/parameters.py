@@ -65,7 +65,7 @@ def _mix(value: dict[str, float], allowed: list[str]) -> dict[str, float]:
 
 
 def _rare_kinds(value: dict[str, float]) -> dict[str, float]:
-    """Return the shares; raises `ValueError` for an unknown kind, and where those of a category exceed its vehicles."""
+    """Validate the shares. Raises `ValueError` for an unknown kind, and where those of a category exceed 1."""
     if unknown := sorted(set(value) - set(RARE)):
         raise ValueError(f"unknown {unknown[0]!r}; allowed: {', '.join(RARE)}{suggest(unknown[0], list(RARE))}")
     for category in dict.fromkeys(RARE.values()):
@@ -76,7 +76,7 @@ def _rare_kinds(value: dict[str, float]) -> dict[str, float]:
 
 
 def _mix_of(allowed: Iterable[str], *, empty: bool = False) -> AfterValidator:
-    """Return the check of weights by kind, one of `allowed`; `empty`: there may be none."""
+    """Return the validator of weights by kind, one of `allowed`; `empty`: there may be none."""
     kinds = list(allowed)
     return AfterValidator(lambda value: value if empty and not value else _mix(value, kinds))
 
@@ -243,7 +243,7 @@ class TownParameters(Config):
         return self
 
     def shape_weights(self, category: str, *, parked: bool = False) -> list[float]:
-        """Return the probabilities of a category's shapes, in the order of `SHAPES`: of moving or `parked` vehicles."""
+        """Return the probabilities of a category's shapes for moving or `parked` vehicles, in the order of `SHAPES`."""
         rare = {kind: share for kind, share in self.rare.items() if kind != ANGLED and RARE[kind] == category}
         rare = {kind: share for kind, share in rare.items() if parked or kind not in PARKED_ONLY}
         weights = self.shapes.get(category) or {shape.name: 1.0 for shape in SHAPES[category] if shape.name not in RARE}

@@ -1,6 +1,6 @@
 """Relief of a town: the height of the ground, linear over the triangles of a Delaunay triangulation (TIN), and bridges.
 
-A bridge's deck has a surface of its own above the ground.
+A bridge's deck is a separate surface above the ground.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,17 +21,17 @@ from flcav.machine.compiled import compiled
 from flcav.storage.files import read_parquet
 
 PLACE = ("deck", "section")  # columns of a town's heights with bridges
-AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # from the middle of a vehicle to its wheels, of its length and width
-FARTHEST_M = 1e8
-BESIDE_M = 5.0  # so near to a deck a place that is roughly known may be on it
-NOISE_M = 0.1  # a point so far below the surface of a deck still is on it
+AXLE_SHARE, TRACK_SHARE = 0.3, 0.4  # distances of the wheels from the centre, over a vehicle's length and width
+FARTHEST_M = 1e8  # greatest coordinate
+BESIDE_M = 5.0  # distance from a deck within which an approximately known place may be on it
+NOISE_M = 0.1  # depth below the surface of a deck within which a point counts as on it
 
 
 class Relief:
     """The heights of a town's ground, and the decks of its bridges; immutable."""
 
     def __init__(self, points: Array, decks: "Sequence[Deck]" = ()) -> None:
-        """Take the points (N, 3) of the ground, world frame [m]; raises `ValueError` where they span no area."""
+        """Set the points (N, 3) of the ground, world frame [m]. Raises `ValueError` where they span no area."""
         self.points = points
         self.decks = tuple(decks)
         if len(points) < 3 or not (np.abs(points) <= FARTHEST_M).all():
@@ -46,36 +46,36 @@ class Relief:
 
     @cached_property
     def triangles(self) -> Ints32:
-        """Return the triangles (F, 3), rows of `points`, counter-clockwise."""
+        """The triangles (F, 3), indices of `points`, counter-clockwise."""
         return self._tin.simplices
 
     @cached_property
     def tree(self) -> shapely.STRtree:
-        """Return a search tree of the triangles, seen from above."""
+        """A spatial index of the triangles in plan."""
         return shapely.STRtree([shapely.Polygon(corners) for corners in self.points[self.triangles, :2]])
 
     @cached_property
     def area(self) -> BaseGeometry:
-        """Return the area of the triangles, seen from above."""
+        """The area of the triangles in plan [m]."""
         return shapely.MultiPoint(self.points[:, :2]).convex_hull
 
     def heights(self, x: ArrayLike, y: ArrayLike) -> Array:
-        """Return the height [m] of the ground at `x`, `y` (...) [m]; outside as at their edge; NaN at NaN."""
+        """Return the height (...) [m] of the ground at `x`, `y` (...) [m]; constant beyond the bounds; NaN at NaN."""
         low, high = self.points[:, :2].min(axis=0), self.points[:, :2].max(axis=0)
         inset = 1e-6 * (high - low)
         at = np.clip(np.stack(np.broadcast_arrays(x, y), axis=-1).astype(np.float64), low + inset, high - inset)
-        found = _interpolate(at.reshape(-1, 2), self.points, self._tin.simplices, self._tin.neighbors)
-        return found.reshape(at.shape[:-1])
+        z = _interpolate(at.reshape(-1, 2), self.points, self._tin.simplices, self._tin.neighbors)
+        return z.reshape(at.shape[:-1])
 
     def sole_heights(self, x: Array, y: Array) -> Array:
-        """Return the height [m] of the ground at `x`, `y` (N,) [m]; NaN on and below bridges, where it has two."""
+        """Return the height (N,) [m] of the ground at `x`, `y` (N,) [m]; NaN at bridges, where there are two levels."""
         out = self.heights(x, y)
         for deck in self.decks:
             out[shapely.dwithin(deck.outline, shapely.points(x, y), BESIDE_M)] = np.nan
         return out
 
     def above(self, points: Array) -> Array:
-        """Return the height (N,) [m] of points (N, 3), world frame [m], above the ground, or a deck below them."""
+        """Return the height (N,) [m] of points (N, 3), world frame [m], above the ground or a deck below them."""
         x, y, z = points.T
         foot = self.heights(x, y)
         for deck in self.decks:
@@ -87,7 +87,7 @@ class Relief:
     def table(self) -> pa.Table:
         """Return the points as a table with the columns x, y, z [m].
 
-        With bridges also `deck` and `section`, the numbers of a point's deck and of its cross-section; -1: ground.
+        With bridges it also has `deck` and `section`, the indices of a point's deck and cross-section; -1: ground.
         """
         if not self.decks:
             return pa.table(dict(zip("xyz", self.points.T)))
@@ -107,7 +107,7 @@ class Relief:
 
     @classmethod
     def load(cls, path: Path) -> "Relief":
-        """Return the relief that `save` wrote; raises `InputError` where the file is damaged."""
+        """Load the relief that `save` wrote. Raises `InputError` where the file is damaged."""
         table = read_parquet(path)
         names = table.column_names
         if names not in ([*"xyz"], [*"xyz", *PLACE]) or any(column.null_count for column in table.columns):
@@ -133,7 +133,7 @@ class Deck:
     """The deck of a bridge: the surface of a road where it passes above another one; immutable."""
 
     def __init__(self, sections: Sequence[Array]) -> None:
-        """Take its cross-sections (T, 3) along the road, each from right to left [m].
+        """Set its cross-sections (T, 3) along the road, from right to left, world frame [m].
 
         Raises `ValueError` where they span no area.
         """
@@ -147,12 +147,12 @@ class Deck:
 
     @cached_property
     def sides(self) -> tuple[Array, Array]:
-        """Return the right and the left edge, (K, 3) each [m]."""
+        """The right and the left edge, (K, 3) and (K, 3) [m]."""
         return np.stack([s[0] for s in self.sections]), np.stack([s[-1] for s in self.sections])
 
     @cached_property
     def outline(self) -> BaseGeometry:
-        """Return the area of the deck, seen from above."""
+        """The area of the deck in plan [m]."""
         right, left = self.sides
         area = shapely.make_valid(shapely.Polygon(np.concatenate((right, left[::-1]))[:, :2]))
         shapely.prepare(area)
@@ -162,11 +162,11 @@ class Deck:
 def find_tilts(
     heights: Callable[[Array, Array], Array], x: Array, y: Array, yaw: Array, size: Array
 ) -> tuple[Array, Array, Array]:
-    """Return height [m], pitch and roll [rad] of bodies (...) that stand on four wheels at these places.
+    """Return height [m], pitch and roll [rad] of bodies (...) that stand on four wheels at `x`, `y` [m], world frame.
 
-    `heights` are those of what they stand on; `size` (..., 3) is length, width, height [m]; the wheels are `AXLE_SHARE`
-    and `TRACK_SHARE` of it from the middle. A positive pitch turns the nose down, a positive roll lifts the left side,
-    as in `geometry.pose`.
+    `heights` gives the height of the ground [m]; `yaw` is in [rad]; `size` (..., 3) is length, width, height [m]; the
+    wheels are at `AXLE_SHARE` and `TRACK_SHARE` of it from the centre. A positive pitch turns the nose down, a positive
+    roll lifts the left side, as in `geometry.pose`.
     """
     along, aside = AXLE_SHARE * size[..., 0], TRACK_SHARE * size[..., 1]
     cos, sin = np.cos(yaw), np.sin(yaw)
@@ -183,13 +183,16 @@ def find_tilts(
 
 
 def _split_sections(points: Array, section: Ints) -> list[Array]:
-    """Return the cross-sections of points (N, 3) with these numbers (N,), in the order of the rows."""
+    """Split points (N, 3) [m] into cross-sections by their indices (N,), in the order of the rows."""
     return np.split(points, np.flatnonzero(np.diff(section)) + 1)
 
 
 @compiled
 def _interpolate(at, points, triangles, neighbours):
-    """Return the heights (N,) at places (N, 2), each found by walking over the triangles from the one before."""
+    """Interpolate heights (N,) [m] at places (N, 2) [m]; a triangle is found by walking from that of the last place.
+
+    Walking crosses the edge that the place is farthest beyond, until it is inside; consecutive places are mostly near.
+    """
     out = np.empty(len(at))
     here = 0
     for i in range(len(at)):

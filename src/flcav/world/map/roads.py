@@ -16,7 +16,7 @@ from flcav.arrays import Array
 from flcav.config import InputError, read_xml, shorten
 
 LaneKind = Literal["driving", "bicycle", "parking", "shoulder", "sidewalk", "crossing", "walkingarea"]
-CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two without traffic
+CARRIAGEWAY: tuple[LaneKind, ...] = ("driving", "bicycle", "parking", "shoulder")  # the last two without moving traffic
 
 FARTHEST_M = 1e8  # largest number in a net, coordinates included: more than the Earth's circumference
 ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
@@ -24,11 +24,11 @@ ONLY_FOR: dict[str, LaneKind] = {"pedestrian": "sidewalk", "bicycle": "bicycle"}
 
 @dataclass(frozen=True)
 class Lane:
-    """One lane of an edge."""
+    """A lane of an edge."""
 
     id: str
     kind: LaneKind
-    shape: Array  # (K, 2) centre line in driving direction, outline of a walkingarea, world [m]
+    shape: Array  # (K, 2) centre line in driving direction; outline of a walkingarea; world frame [m]
     width: float  # [m]
     speed: float  # limit [m/s]
 
@@ -55,8 +55,8 @@ class Junction:
 
     id: str
     kind: str  # SUMO's type: priority, priority_stop, traffic_light, ...
-    centre: Array  # (2,) [m]
-    shape: Array  # (K, 2) outline [m]; empty at a bare node
+    centre: Array  # (2,) world frame [m]
+    shape: Array  # (K, 2) outline, world frame [m]; empty for a bare node
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ class LaneConnection:
 
 @dataclass(frozen=True)
 class RoadNet:
-    """The parts of a SUMO net from which the town and its traffic are made."""
+    """A SUMO road net, as far as towns and traffic need it."""
 
     edges: dict[str, Edge]
     junctions: dict[str, Junction]
@@ -81,7 +81,7 @@ class RoadNet:
     # s stops, o is at a traffic light, ...
     right_of_way: dict[str, str]
     connections: tuple[LaneConnection, ...]
-    side: int = 1  # on which side of the road traffic keeps: 1 right, -1 left
+    side: int = 1  # side of the traffic: 1 right, -1 left
 
     @property
     def streets(self) -> Iterator[Edge]:
@@ -90,7 +90,7 @@ class RoadNet:
 
 
 def read_net(path: Path) -> RoadNet:
-    """Return the road network of a net file; raises `InputError` where it is missing or no SUMO net."""
+    """Read the road net of a file. Raises `InputError` where it is missing or not a SUMO net."""
     root = read_xml(path, "a SUMO net")
     if root.tag != "net":
         raise InputError(f"{path}: not a SUMO net (its root is <{root.tag}>, expected <net>)")
@@ -101,7 +101,7 @@ def read_net(path: Path) -> RoadNet:
 
 
 def _net(root: ElementTree.Element) -> RoadNet:
-    """Return the net below `root`; raises `LookupError` and `ValueError` where something is missing or no number."""
+    """Parse the net below `root`. Raises `LookupError` and `ValueError` for missing and invalid values."""
     edges = {row.attrib["id"]: _edge(row) for row in root.iterfind("edge")}
     junctions = {
         row.attrib["id"]: Junction(
@@ -123,7 +123,7 @@ def _net(root: ElementTree.Element) -> RoadNet:
     ends = [name for edge in edges.values() if edge.function == "normal" for name in (edge.start, edge.end)]
     _refuse_unknown("junction", [*ends, *circling], junctions)
     lanes = {lane.id for edge in edges.values() for lane in edge.lanes}
-    led = [name for each in connections for name in (each.start, each.end, each.via) if name]
+    led = [name for connection in connections for name in (connection.start, connection.end, connection.via) if name]
     _refuse_unknown("lane", led, lanes)
     side = -1 if root.get("lefthand") in ("1", "true") else 1
     return RoadNet(edges, junctions, frozenset(circling), states, connections, side)
@@ -171,39 +171,39 @@ def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
 
 
 def _points(text: str) -> Array:
-    """Return the points (K, 2) of SUMO's "x,y x,y ..." without heights; raises `ValueError` for other text."""
+    """Parse SUMO's "x,y x,y ..." as points (K, 2) [m], without heights. Raises `ValueError` for other text."""
     rows = [[_number(part) for part in point.split(",")[:2]] for point in text.split()]
     return np.array(rows, dtype=np.float64).reshape(-1, 2)
 
 
 def _number(text: str) -> float:
-    """Return a number; raises `ValueError` for NaN, for other text and beyond `FARTHEST_M`."""
+    """Parse a number. Raises `ValueError` for NaN, for other text and beyond `FARTHEST_M`."""
     value = float(text)
     if not abs(value) <= FARTHEST_M:
         raise ValueError(f"{shorten(text)} is no place in a town")
     return value
 
 
-SHORTEST_M = 20.0  # a route begins on a lane that is longer
-WINDOW_M = 30.0  # a place on a route is looked for so far from the last one
+SHORTEST_M = 20.0  # length of lane above which a route may begin on it
+WINDOW_M = 30.0  # distance from the last place on a route within which the next one is searched
 
 
 @dataclass(frozen=True)
 class Route:
-    """The centre line of a route through a town."""
+    """A route through a town: its centre line, speed limits and traffic lights."""
 
-    points: Array  # (K, 2) [m]
+    points: Array  # (K, 2) world frame [m]
     along: Array  # (K,) distance from the start [m], ascending
-    speed: Array  # (K,) limit from each point on [m/s]
-    stops: tuple[tuple[float, str], ...]  # where traffic lights are passed: distance [m], the entry of `Trace.light`
+    speed: Array  # (K,) speed limit from the point on [m/s]
+    stops: tuple[tuple[float, str], ...]  # traffic lights on the route: distance [m], entry of `Trace.light`
 
     @property
     def length_m(self) -> float:
-        """Return the length [m]."""
+        """The length of the route [m]."""
         return float(self.along[-1])
 
     def at(self, along: ArrayLike) -> Array:
-        """Return x, y [m] and heading [rad] (..., 3) at these distances; straight on beyond the ends."""
+        """Return x, y [m] and heading [rad] (..., 3), world frame, at distances (...) [m]; straight beyond the ends."""
         along = np.asarray(along, np.float64)
         piece = np.clip(np.searchsorted(self.along, along, side="right") - 1, 0, len(self.along) - 2)
         step = self.points[piece + 1] - self.points[piece]
@@ -212,12 +212,16 @@ class Route:
         return np.concatenate((self.points[piece] + share[..., None] * step, heading[..., None]), axis=-1)
 
     def limit(self, along: float) -> float:
-        """Return the speed limit [m/s] at a distance."""
+        """Return the speed limit [m/s] at a distance [m]."""
         return float(self.speed[max(int(np.searchsorted(self.along, along, side="right")) - 1, 0)])
 
     def project(self, x: float, y: float, near: float) -> tuple[float, float]:
-        """Return how far along the route, and how far to its left [m], a place is; looked for about `near` [m]."""
-        start, step = self.points[:-1], np.diff(self.points, axis=0)
+        """Project x, y [m] on the route: return the distance along it and the offset to its left [m].
+
+        The search is limited to distances within `WINDOW_M` of `near` [m].
+        """
+        start = self.points[:-1]
+        step = np.diff(self.points, axis=0)
         length = np.diff(self.along)
         share = np.clip(((np.array((x, y)) - start) * step).sum(axis=1) / length**2, 0.0, 1.0)
         away = np.array((x, y)) - start - share[:, None] * step
@@ -229,7 +233,7 @@ class Route:
 
 
 def draw_route(net: RoadNet, random: np.random.Generator, length_m: float) -> Route:
-    """Return a route of at least `length_m` [m], or to where the net ends, with its lanes drawn uniformly.
+    """Draw a route of at least `length_m` [m], or to the end of the net, with uniformly random lanes.
 
     Raises `InputError` where the net has no driving lane of `SHORTEST_M`.
     """
@@ -263,7 +267,7 @@ def _through(
     via = way.via
     while via:
         yield lanes[via]
-        via = next((each.via for each in onward.get(via, ()) if each.end == way.end), "")
+        via = next((link.via for link in onward.get(via, ()) if link.end == way.end), "")
     yield lanes[way.end]
 
 
@@ -272,7 +276,8 @@ def _join(lanes: list[Lane], stops: tuple[tuple[float, str], ...]) -> Route:
     speed = np.concatenate([np.full(len(lane.shape), lane.speed) for lane in lanes])
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     kept = np.concatenate(([True], steps > 1e-3))
-    points, speed = points[kept], speed[kept]
+    points = points[kept]
+    speed = speed[kept]
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     return Route(points, along, speed, stops)
 

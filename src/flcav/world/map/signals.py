@@ -1,4 +1,4 @@
-"""Placement of signal heads: a mast at the kerb of each approach to a traffic light, an arm over wide approaches."""
+"""Placement of signal heads: a mast at the kerb of every approach to a traffic light, an arm over wide approaches."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -12,37 +12,37 @@ from flcav.world.map.parameters import SignalParameters, StreetParameters
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.street_furniture import Verge
 
-Head = tuple[tuple[float, float, float], float, tuple[float, float], str]  # position, yaw, foot, link
+Head = tuple[tuple[float, float, float], float, tuple[float, float], str]  # position [m], yaw [rad], foot [m], link
 
-KERB_HEAD_M = 2.9  # height of the centre of a head beside the road
+KERB_HEAD_M = 2.9  # height of the centre of a head at the kerb
 ARM_HEAD_M = 5.6  # height of the centre of a head above the road
-ARM_LANES = 2  # approaches with at least so many driving lanes also have a head above them
-BEFORE_END_M = 0.6  # from a mast to the end of its lane
-FROM_KERB_M = 0.45  # from a mast to the kerb
-SENSOR_CLEAR_M = 8.0  # no arm where a roadside sensor is nearer than this to the mast
+ARM_LANES = 2  # number of driving lanes from which an approach also has a head above it
+BEFORE_END_M = 0.6  # distance of a mast from the end of its lane
+FROM_KERB_M = 0.45  # distance of a mast from the kerb
+SENSOR_CLEAR_M = 8.0  # distance of a roadside sensor from a mast within which it has no arm
 
 
 @dataclass(frozen=True)
 class Signals:
     """The K signal heads of a town."""
 
-    position: Array  # (K, 3) centre of the head, world [m]
-    yaw: Array  # (K,) direction it faces, towards the traffic it controls, world [rad]
-    foot: Array  # (K, 2) foot of its mast, world [m]; heads on one mast share it
-    link: tuple[str, ...]  # (K,) the entry of `Trace.light` it shows
-    walkers: int = 0  # the last so many heads are for pedestrians
+    position: Array  # (K, 3) centre of the head, world frame [m]
+    yaw: Array  # (K,) direction it faces, towards the traffic it controls, world frame [rad]
+    foot: Array  # (K, 2) foot of its mast, world frame [m]; heads on one mast share it
+    link: tuple[str, ...]  # (K,) the entry of `Trace.light` that it shows
+    walkers: int = 0  # number of heads at the end that are for pedestrians
 
     @classmethod
     def none(cls) -> "Signals":
-        """Return an empty record, of a town without traffic lights."""
+        """Return the record of a town without traffic lights."""
         return cls(np.zeros((0, 3)), np.zeros(0), np.zeros((0, 2)), ())
 
 
 def place_signals(net: RoadNet, sensors: Array, known: tuple[SignalParameters, ...] = ()) -> Signals:
-    """Return the signal heads of all approaches to traffic lights, in the net's order, and then those for pedestrians.
+    """Place the signal heads of all approaches to traffic lights, in the net's order, then those for pedestrians.
 
-    There is no arm within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) [m], since it would block the view.
-    An approach for which heads are `known` has these, and no others. Only those known are for pedestrians.
+    There is no arm within `SENSOR_CLEAR_M` of a roadside sensor, `sensors` (P, 3) [m], since it would block the view.
+    An approach with `known` heads has only these. Heads for pedestrians are only those known.
     """
     given: dict[str, list[Head]] = {}
     for signal in known:
@@ -63,14 +63,14 @@ def _head(signal: SignalParameters) -> Head:
 
 
 def _given(edge: Edge, net: RoadNet, given: dict[str, list[Head]]) -> list[Head]:
-    """Return the known heads of one approach."""
+    """Return the known heads of an approach."""
     lanes = {lane.id for lane in edge.lanes}
     lights = dict.fromkeys(way.light for way in net.connections if way.light and way.start in lanes)
     return [head for light in lights for head in given.get(light, ())]
 
 
 def _approach(edge: Edge, net: RoadNet, sensors: Array) -> Iterator[Head]:
-    """Yield position, yaw, foot and link of each head of one approach."""
+    """Yield the heads of an approach, placed by rule."""
     driven = edge.lanes_of("driving")
     names = {lane.id for lane in driven}
     ruled = [way for way in net.connections if way.light and way.start in names]

@@ -1,12 +1,8 @@
 """Procedural placement along the streets of a town: buildings, trees, clutter, fences, lamps, signs, candidate poles.
 
-Positions and yaws are in the world frame [m, rad]. The same random generator gives the same placement.
-
-Procedural placement of what encloses plots (hedges, walls, fences) and of small objects at the kerb.
-
-Both are clutter: rows (K, 6) x, y, yaw, length, width, height by kind, in the world frame [m, rad].
-
-Parking spaces, and objects beside the roads, of the map that a town was imported from.
+Positions and yaws are in the world frame [m, rad]. The same random generator gives the same placement. Boundaries of
+plots (hedges, walls, fences) and small objects at the kerb are clutter, too: rows (K, 6) x, y, yaw, length, width,
+height by kind, world frame [m, rad]. Parking spaces and roadside objects of an imported map replace random ones.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -35,13 +31,13 @@ from flcav.world.map.parameters import (
 from flcav.world.map.roads import Edge, RoadNet
 from flcav.world.map.surfaces import GroundSurfaces, make_footprint
 
-CORNER_M = 9.0  # a row of buildings may begin and end this far beyond its edge's ends
-STEP_M = 1.0  # shift along the street to the next try where something did not fit
-CELL_M = 20.0  # cells by which built land is searched
+CORNER_M = 9.0  # distance by which a row of buildings may extend beyond its edge's ends
+STEP_M = 1.0  # shift along the street to the next attempt if an object does not fit
+CELL_M = 20.0  # side of the cells by which built land is indexed
 CLEARANCE_M = 0.25  # least distance between solid objects
-SENSOR_CLEAR_M = 2.5  # no street lamp is nearer to a roadside sensor, since it would block the view
-KERBSIDE_M = 0.4  # from the kerb to the middle of what stands at it
-SIGN_HEIGHT_M = 2.2  # of the plate's centre
+SENSOR_CLEAR_M = 2.5  # least distance of a street lamp from a roadside sensor, since it would block the view
+KERBSIDE_M = 0.4  # distance of the centres of kerbside objects from the kerb
+SIGN_HEIGHT_M = 2.2  # height of a plate's centre
 SPEED_SIGNS: dict[int, Literal["speed_30", "speed_60", "speed_90"]] = {  # limit [km/h] -> kind of sign
     30: "speed_30",
     60: "speed_60",
@@ -50,18 +46,18 @@ SPEED_SIGNS: dict[int, Literal["speed_30", "speed_60", "speed_90"]] = {  # limit
 
 
 class Plot:
-    """Occupancy of a town's land: the area closed to building, and the footprints of what has been built."""
+    """The occupancy of a town's land: the area closed to building, and the footprints of placed objects."""
 
     def __init__(self, closed: BaseGeometry) -> None:
-        """Start without buildings; `closed` is the area that stays free, world frame [m]."""
+        """Start without objects; `closed` is the area that stays free, world frame [m]."""
         self._closed = closed
         shapely.prepare(self._closed)
-        self._taken: dict[tuple[int, int], list[Polygon]] = {}  # by the cells of `CELL_M` that a footprint touches
+        self._taken: dict[tuple[int, int], list[Polygon]] = {}  # by the cells that a footprint touches
 
     def build(self, shape: Polygon, apart_m: float = CLEARANCE_M) -> bool:
-        """Reserve the footprint `shape` and return True; return False where it is not free.
+        """Reserve the footprint `shape`, world frame [m], and return True; return False if it is not free.
 
-        It is free where it does not touch the closed area and is farther than `apart_m` from all that was built before.
+        It is free if it does not touch the closed area and is farther than `apart_m` [m] from all reserved footprints.
         """
         if self._closed.intersects(shape):
             return False
@@ -74,7 +70,7 @@ class Plot:
 
 
 def _list_cells(shape: Polygon, around_m: float) -> list[tuple[int, int]]:
-    """Return the cells of `CELL_M` that the bounds of a shape touch, widened by `around_m` [m]."""
+    """Return the cells that the bounds of a shape, widened by `around_m` [m], touch."""
     low_x, low_y, high_x, high_y = shape.bounds
     columns, rows = (
         range(int((low - around_m) // CELL_M), int((high + around_m) // CELL_M) + 1)
@@ -93,12 +89,12 @@ class Verge:
     line: LineString  # world frame [m]
     half_width: float  # of the lane [m]
     street: StreetParameters
-    side: int = 1  # on which side of the road traffic keeps: 1 right, -1 left
+    side: int = 1  # side of the traffic: 1 right, -1 left
 
     def at(self, along_m: float, right_m: float) -> tuple[float, float, float]:
-        """Return x, y [m] and the driving direction [rad] at `along_m` on the line, shifted `right_m` outwards.
+        """Return x, y [m] and the driving direction [rad] at `along_m` [m] on the line, shifted `right_m` [m] outwards.
 
-        Outwards is to the right, with left-hand traffic to the left. Beyond its ends the line goes straight on.
+        Outwards is to the right, with left-hand traffic to the left. The line is extended straight beyond its ends.
         """
         inside = float(np.clip(along_m, 0.0, self.line.length))
         before, after = max(inside - 0.5, 0.0), min(inside + 0.5, self.line.length)
@@ -113,14 +109,14 @@ class Verge:
 
 
 def list_verges(net: RoadNet, parameters: TownParameters) -> Iterator[Verge]:
-    """Yield the verge of each sidewalk of all streets, in the net's order."""
+    """Yield the verges of the sidewalks of all streets, in the net's order."""
     for edge in net.streets:
         for lane in edge.lanes_of("sidewalk"):
             yield Verge(LineString(lane.shape), lane.width / 2, parameters.streets[edge.type], net.side)
 
 
 def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Array:
-    """Return the buildings (B, 6) x, y, yaw, length, width, height [m, rad]: rows along every verge with drawn gaps."""
+    """Place rows of buildings along the verges with random gaps: (B, 6) x, y, yaw, length, width, height [m, rad]."""
     out = []
     for verge in rows:
         street = verge.street
@@ -144,7 +140,7 @@ def place_buildings(rows: list[Verge], plot: Plot, random: np.random.Generator) 
 
 
 def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) -> tuple[tuple[str, Array], ...]:
-    """Return the clutter just behind the sidewalks by kind: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
+    """Place clutter just behind the sidewalks, by kind: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
     pieces: list[Piece] = []
     for verge in rows:
         for along in list_stations(verge, verge.street.clutter_spacing_m, random):
@@ -157,7 +153,7 @@ def place_clutter(rows: list[Verge], plot: Plot, random: np.random.Generator) ->
 
 
 def place_trees(rows: list[Verge], ground: GroundSurfaces, plot: Plot, random: np.random.Generator) -> Array:
-    """Return the trees (T, 4) x, y, height, crown radius [m]: along the streets and on the traffic islands."""
+    """Place trees along the streets and on the traffic islands: (T, 4) x, y, height, crown radius [m]."""
     out = []
 
     def plant(x: float, y: float, room: Callable[[Polygon], bool]) -> None:
@@ -183,9 +179,9 @@ def place_trees(rows: list[Verge], ground: GroundSurfaces, plot: Plot, random: n
 
 
 def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) -> Array:
-    """Return the street lamps (L, 3): x, y of the foot at the kerb, and height [m].
+    """Place the street lamps at the kerb: (L, 3) x, y of the foot and height [m].
 
-    A lamp within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) is shifted along the street.
+    A lamp within `SENSOR_CLEAR_M` of one of the roadside `sensors` (P, 3) [m] is shifted along the street.
     """
     out = []
     for verge in rows:
@@ -201,11 +197,10 @@ def place_lamps(rows: list[Verge], sensors: Array, random: np.random.Generator) 
 def place_poles(
     net: RoadNet, parameters: tuple[PoleParameters, ...]
 ) -> list[tuple[int, tuple[float, float, float], float, str]]:
-    """Return id, position [m], yaw [rad] and kind of each candidate site, by id.
+    """Place the candidate sites: return id, position [m], yaw [rad] and kind, in the order of the ids.
 
-    Raises `KeyError` for an edge that the net lacks.
-
-    A straight site faces across the road, another one its junction or the middle of its roundabout.
+    A straight site faces across the road, another one its junction or the centre of its roundabout. Raises `KeyError`
+    for an edge that the net lacks.
     """
     out = []
     for pole in sorted(parameters, key=lambda pole: pole.id):
@@ -224,10 +219,10 @@ def place_poles(
 def place_signs(
     net: RoadNet, known: tuple[SignParameters, ...] = (), *, limits_known: bool = False
 ) -> list[tuple[tuple[float, float, float], float, str]]:
-    """Return position [m], yaw [rad] and kind of each sign: give way and stop before junctions, the limit after them.
+    """Place the signs: return position [m], yaw [rad] and kind; yield and stop before junctions, the limit after them.
 
-    Where some are `known`, these stand instead: signs of right of way, or speed limits. With `limits_known` there is no
-    speed limit but these, even where there are none.
+    `known` signs of right of way, or of speed limits, replace all signs of the same sort. With `limits_known` there are
+    no other speed limits even if none is known.
     """
     out = [((sign.x, sign.y, sign.height_m), float(np.radians(sign.yaw_deg)), str(sign.kind)) for sign in known]
     sorts = {kind.partition("_")[0] == "speed" for _, _, kind in out}
@@ -258,7 +253,7 @@ def _kerb_side(edge: Edge, before_end_m: float, side: int) -> tuple[float, float
 
 
 def list_stations(verge: Verge, spacing_m: float, random: np.random.Generator) -> Iterator[float]:
-    """Yield places along a verge [m], jittered by up to 30 % about `spacing_m`."""
+    """Yield positions along a verge [m] at a spacing of `spacing_m` with a jitter of up to 30 %."""
     along = spacing_m * random.uniform(0.2, 0.8)
     while along < verge.line.length - 2.0:
         yield float(along)
@@ -266,7 +261,7 @@ def list_stations(verge: Verge, spacing_m: float, random: np.random.Generator) -
 
 
 def draw_uniform(random: np.random.Generator, interval: Interval) -> float:
-    """Return a number drawn uniformly from an interval."""
+    """Draw a number uniformly from an interval."""
     return float(random.uniform(*interval))
 
 
@@ -278,13 +273,13 @@ Clutter = tuple[tuple[str, Array], ...]  # rows (K, 6) by kind
 Piece = tuple[str, tuple[float, ...]]  # kind and row
 
 PIECE_M = 4.0  # longest straight piece of a boundary
-JOINT_M = 0.02  # between two pieces of a stretch
+JOINT_M = 0.02  # gap between two pieces of a stretch
 
 
 def place_boundaries(rows: list[Verge], plot: Plot, random: np.random.Generator) -> Clutter:
-    """Return hedges, walls and fences along the verges whose streets have them.
+    """Place hedges, walls and fences along the verges of streets that have them.
 
-    A stretch is of one kind, height and setback, and made of straight pieces; pieces without room are left out.
+    A stretch has one kind, height and setback, and consists of straight pieces; pieces without room are left out.
     """
     pieces: list[Piece] = []
     for verge in rows:
@@ -298,7 +293,7 @@ def place_boundaries(rows: list[Verge], plot: Plot, random: np.random.Generator)
 
 
 def _stretch(verge: Verge, start: float, end: float, plot: Plot, random: np.random.Generator) -> Iterator[Piece]:
-    """Yield the pieces of one stretch of a boundary from `start` to `end` along the verge [m]."""
+    """Yield the pieces of a boundary's stretch from `start` to `end` along the verge [m]."""
     kind = _choose(verge.street.boundary, random)
     _, width, height = np.array(CLUTTER[kind]) * random.uniform(*verge.street.clutter_size, size=3)
     setback = draw_uniform(random, verge.street.boundary_setback_m)
@@ -310,7 +305,7 @@ def _stretch(verge: Verge, start: float, end: float, plot: Plot, random: np.rand
 
 
 def place_kerbside(rows: list[Verge], random: np.random.Generator) -> Clutter:
-    """Return the small objects at the kerb of the streets that have them."""
+    """Place small objects at the kerb of the streets that have them."""
     pieces: list[Piece] = []
     for verge in (verge for verge in rows if verge.street.kerbside):
         for along in list_stations(verge, verge.street.kerbside_spacing_m, random):
@@ -322,7 +317,7 @@ def place_kerbside(rows: list[Verge], random: np.random.Generator) -> Clutter:
 
 
 def join_clutter(*parts: Clutter) -> Clutter:
-    """Return the clutter of all `parts`, by kind."""
+    """Join clutter by kind."""
     return _by_kind([(kind, tuple(row)) for part in parts for kind, rows in part for row in rows.tolist()])
 
 
@@ -333,7 +328,9 @@ def _choose(mix: dict[str, float], random: np.random.Generator) -> str:
 
 def _by_kind(pieces: list[Piece]) -> Clutter:
     kinds = sorted({kind for kind, _ in pieces})
-    return tuple((kind, np.array([row for own, row in pieces if own == kind], np.float64)) for kind in kinds)
+    return tuple(
+        (kind, np.array([row for piece_kind, row in pieces if piece_kind == kind], np.float64)) for kind in kinds
+    )
 
 
 LINE_M = 0.12  # width of the lines
@@ -345,7 +342,7 @@ def outline_space(space: ParkingParameters) -> Polygon:
 
 
 def paint_spaces(spaces: Sequence[ParkingParameters]) -> Iterator[Marking]:
-    """Yield the lines around parking spaces, inside their outlines."""
+    """Yield the lines around parking spaces, inside their outlines, world frame [m]."""
     for space in spaces:
         inner = outline_space(space).buffer(-LINE_M / 2, join_style="mitre")
         corners = np.asarray(inner.exterior.coords)
@@ -354,8 +351,8 @@ def paint_spaces(spaces: Sequence[ParkingParameters]) -> Iterator[Marking]:
 
 
 def outline_objects(objects: Sequence[ObjectParameters]) -> list[Polygon]:
-    """Return the footprints of objects, world frame [m]; those of trees are as wide as their crowns."""
-    return [make_footprint(each.x, each.y, np.radians(each.yaw_deg), each.length_m, each.width_m) for each in objects]
+    """Return the footprints of objects, world frame [m]; a tree's is that of its crown."""
+    return [make_footprint(item.x, item.y, np.radians(item.yaw_deg), item.length_m, item.width_m) for item in objects]
 
 
 def list_buildings(objects: Sequence[ObjectParameters]) -> Array:
@@ -371,14 +368,14 @@ def list_trees(objects: Sequence[ObjectParameters]) -> Array:
 
 def list_clutter(objects: Sequence[ObjectParameters]) -> tuple[tuple[str, Array], ...]:
     """Return all other objects by kind of clutter: rows (K, 6) x, y, yaw, length, width, height [m, rad]."""
-    kinds = sorted({each.kind for each in objects} - {"building", "tree"})
+    kinds = sorted({item.kind for item in objects} - {"building", "tree"})
     return tuple((kind, _list_rows(objects, kind)) for kind in kinds)
 
 
 def _list_rows(objects: Sequence[ObjectParameters], kind: str) -> Array:
     rows = [
-        (each.x, each.y, float(np.radians(each.yaw_deg)), each.length_m, each.width_m, each.height_m)
-        for each in objects
-        if each.kind == kind
+        (item.x, item.y, float(np.radians(item.yaw_deg)), item.length_m, item.width_m, item.height_m)
+        for item in objects
+        if item.kind == kind
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, 6)

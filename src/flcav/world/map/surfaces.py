@@ -14,10 +14,10 @@ from flcav.arrays import Array
 from flcav.geometry import heading_vectors
 from flcav.world.map.roads import CARRIAGEWAY, RoadNet
 
-GRID_M = 1e-3
+GRID_M = 1e-3  # precision grid of coordinates where GEOS fails with exact ones
 SLIVER_M = 0.25  # narrower pieces are dropped, narrower gaps closed, shorter lanes left out: artefacts of the net
 
-ISLAND_M = 25.0  # farthest that a place on a traffic island is from the road; wider land within roads is open ground
+ISLAND_M = 25.0  # greatest distance of a traffic island's interior from the road; wider land is open ground
 
 
 @dataclass(frozen=True)
@@ -32,9 +32,9 @@ class GroundSurfaces:
 def build_ground_surfaces(
     net: RoadNet, frontage_m: Mapping[str, float], parking: Sequence[Polygon] = ()
 ) -> GroundSurfaces:
-    """Return the ground surfaces of a net; `frontage_m` is the width of paving behind the sidewalk, by street type.
+    """Build the ground surfaces of a net; `frontage_m` is the width of paving behind the sidewalk [m], by street type.
 
-    Spaces for `parking` [m] are part of the road.
+    Spaces for `parking`, world frame [m], are part of the road.
     """
     driven = [*parking] + [
         LineString(lane.shape).buffer(lane.width / 2, cap_style="flat", join_style="mitre")
@@ -71,7 +71,7 @@ def build_ground_surfaces(
 
 
 def unite(areas: Sequence[BaseGeometry]) -> BaseGeometry:
-    """Return the union of areas; where exact coordinates defeat GEOS, on a grid of `GRID_M`."""
+    """Return the union of areas [m]; on a grid of `GRID_M` where GEOS fails with exact coordinates."""
     try:
         return shapely.union_all(areas)
     except GEOSException:
@@ -79,7 +79,7 @@ def unite(areas: Sequence[BaseGeometry]) -> BaseGeometry:
 
 
 def join_areas(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
-    """Return the union of two areas, as `unite` does."""
+    """Return the union of two areas [m], as `unite` does."""
     try:
         return shapely.union(area, other)
     except GEOSException:
@@ -87,7 +87,7 @@ def join_areas(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
 
 
 def cut_area(area: BaseGeometry, other: BaseGeometry) -> BaseGeometry:
-    """Return `area` without `other`; where exact coordinates defeat GEOS, on a grid of `GRID_M`."""
+    """Return the difference of two areas [m]; on a grid of `GRID_M` where GEOS fails with exact coordinates."""
     try:
         return shapely.difference(area, other)
     except GEOSException:
@@ -100,7 +100,7 @@ def _snap(area: BaseGeometry) -> BaseGeometry:
 
 
 def split_into_polygons(area: BaseGeometry) -> tuple[Array, ...]:
-    """Return a partition of `area` into polygons (K, 2) without holes, counter-clockwise, first vertex not repeated."""
+    """Split an area [m] into polygons (K, 2) without holes, counter-clockwise, first vertex not repeated."""
     pieces: list[Array] = []
     for part in _polygons(area):
         if part.interiors:

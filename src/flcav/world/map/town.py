@@ -26,13 +26,13 @@ from flcav.world.map.surfaces import build_ground_surfaces, find_kerbs, join_are
 
 TOWNS: tuple[str, ...] = ("suburb", "grid", "ring", "arterial")
 HILLY: dict[str, str] = {f"hilly_{name}": name for name in TOWNS}  # the same towns with slopes and camber
-PACKAGED: tuple[str, ...] = (*TOWNS, *HILLY)  # all that come with flcav
-HEIGHTS = "heights.parquet"  # file of a town's relief, beside its net
-HILLS = "hills.parquet"  # that of a town of `HILLY`, beside the net of the level one
-NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # of a town: the beginning of the names of its frames
+PACKAGED: tuple[str, ...] = (*TOWNS, *HILLY)  # all towns that come with flcav
+HEIGHTS = "heights.parquet"  # file of a town's relief, in the folder of its net
+HILLS = "hills.parquet"  # file of the relief of a town of `HILLY`, in the folder of the level town
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,63}")  # of a town's name, with which the names of its frames begin
 KERB_M = 0.12  # height of a sidewalk above the road
-BESIDE_BRIDGE_M = 3.0  # no pole, sign, signal, tree or furniture stands nearer to a bridge
-MARGIN_M = 5.0  # from the outermost surface or building to the bounds
+BESIDE_BRIDGE_M = 3.0  # least distance of poles, signs, signals, trees and furniture from a bridge
+MARGIN_M = 5.0  # distance of the bounds from the outermost surface or building
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Poles:
     """The P candidate sites of a roadside sensor."""
 
     id: Ints  # (P,) site numbers, from 1
-    position: Array  # (P, 3) mount of the sensor, world [m]
-    yaw: Array  # (P,) direction the mount faces: the road or the junction, world [rad]
+    position: Array  # (P, 3) mount of the sensor, world frame [m]
+    yaw: Array  # (P,) direction the mount faces, towards the road or the junction, world frame [rad]
     kind: tuple[str, ...]  # (P,) straight | cross | tee | roundabout
 
 
@@ -49,8 +49,8 @@ class Poles:
 class Signs:
     """The S traffic signs of a town."""
 
-    position: Array  # (S, 3) plate centre, world [m]
-    yaw: Array  # (S,) direction of the plate's front normal, world [rad]
+    position: Array  # (S, 3) plate centre, world frame [m]
+    yaw: Array  # (S,) direction of the plate's front normal, world frame [rad]
     kind: tuple[str, ...]  # (S,) stop | yield | speed_30 | speed_60 | speed_90
 
 
@@ -59,7 +59,7 @@ Placed = TypeVar("Placed", Poles, Signs, Signals)
 
 @dataclass(frozen=True)
 class Town(Displayed):
-    """The static content of a town. World frame: ENU, metres, z = 0 at the surface of a level road.
+    """The static content of a town. World frame: ENU [m], z = 0 at the surface of a level road.
 
     >>> from flcav import Town, load_town
     >>> town: Town = load_town("suburb")
@@ -69,21 +69,21 @@ class Town(Displayed):
 
     name: str
     net: Path  # the SUMO net file (.net.xml)
-    parameters: TownParameters  # of its furnishing and of its traffic
+    parameters: TownParameters  # of its furnishing and its traffic
     bounds: tuple[float, float, float, float]  # x_min, y_min, x_max, y_max [m]
-    roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, without holes
-    sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2), raised by the kerb; traffic islands too
-    kerbs: tuple[Array, ...]  # polylines (K, 2) where road meets sidewalk
+    roads: tuple[Array, ...]  # disjoint polygons (K, 2) of drivable surface, without holes [m]
+    sidewalks: tuple[Array, ...]  # disjoint polygons (K, 2), raised by the kerb, with traffic islands [m]
+    kerbs: tuple[Array, ...]  # polylines (K, 2) where road meets sidewalk [m]
     buildings: Array  # (B, 6) centre x, y, yaw, length, width, height [m, rad]
     trees: Array  # (T, 4) x, y, height, crown radius [m]
-    clutter: tuple[tuple[str, Array], ...]  # (kind of `parameters.CLUTTER`, (K, 6) x, y, yaw, length, width, height)
+    clutter: tuple[tuple[str, Array], ...]  # kind of `CLUTTER`; (K, 6) x, y, yaw, length, width, height [m, rad]
     poles: Poles
     signs: Signs
     lamps: Array  # (L, 3) street lamps: x, y of the foot, height above it [m]
     geo: GeoReference = field(default_factory=GeoReference)  # geodetic position of the world frame's origin
     signals: Signals = field(default_factory=Signals.none)
     posts: Array = field(default_factory=lambda: np.zeros((0, 3)))  # (K, 3) poles of a map: x, y of foot, height [m]
-    relief: Relief | None = None  # heights of the ground; None: it is level, at z = 0
+    relief: Relief | None = None  # heights of the ground; None: level, at z = 0
 
     def __repr__(self) -> str:
         return (
@@ -91,16 +91,16 @@ class Town(Displayed):
         )
 
     def grounds(self, x: Array, y: Array) -> Array:
-        """Return the height (...) [m] of the road, or of the land beside it, at `x`, `y` (...) [m]."""
+        """Return the height (...) [m] of the road or the adjacent land at `x`, `y` (...) [m], world frame."""
         return np.zeros(np.shape(x)) if self.relief is None else self.relief.heights(x, y)
 
     def ground(self, x: float, y: float) -> float:
-        """Return the height [m] of the road, or of the land beside it, at one place."""
+        """Return the height [m] of the road or the adjacent land at the point `x`, `y` [m], world frame."""
         return 0.0 if self.relief is None else float(self.relief.heights(x, y))
 
 
 def check_town_name(name: str) -> None:
-    """Raise `InputError` unless scenes and frames can be named after a town of this name."""
+    """Check the name of a town, after which scenes and frames are named. Raises `InputError` if it is invalid."""
     if not NAME.fullmatch(name):
         raise InputError(
             f"town {shorten(name)}: the folder's name must be letters, digits, - and _, 64 at most, the first a letter "
@@ -109,11 +109,11 @@ def check_town_name(name: str) -> None:
 
 
 def load_town(name: str | Path, beside: Path | str | None = None) -> Town:
-    """Return a town of `PACKAGED`, or that of a folder with `town.net.xml`, `town.yaml` and maybe its heights.
+    """Load a town of `PACKAGED`, or that of a folder with `town.net.xml`, `town.yaml` and optionally heights.
 
-    A `Path` is that folder; any other name is a folder in `beside`, where given, or else in the working directory. The
-    same files give the same town. Raises `InputError` for an unknown name, and for files that are missing, not of their
-    format or not consistent with each other.
+    A `Path` is that folder; any other name is a folder in `beside`, if given, or else in the working directory. The
+    same files give the same town. Raises `InputError` for an unknown name, and for files that are missing, malformed or
+    inconsistent.
 
     >>> from flcav import load_town
     >>> load_town("grid").poles.id
@@ -130,14 +130,14 @@ def load_town(name: str | Path, beside: Path | str | None = None) -> Town:
 
 
 def _hash_files(folder: Path) -> str:
-    """Return a hash of the names and bytes of the files in a folder."""
+    """Return a hash of the names and contents of the files in a folder."""
     files = sorted(path for path in folder.glob("*") if path.is_file())
     return hashlib.sha256(b"".join(path.name.encode() + read_file(path) for path in files)).hexdigest()
 
 
 @lru_cache(maxsize=16)
 def _build_town(folder: Path, files: str) -> Town:
-    """Return the town of a folder whose `files` have that hash; the last ones are kept in memory."""
+    """Build the town of a folder whose `files` have this hash, the cache key."""
     parameters = read_config(TownParameters, folder / "town.yaml")
     net = read_net(folder / "town.net.xml")
     _check(net, parameters, folder / "town.yaml")
@@ -149,7 +149,7 @@ def _build_town(folder: Path, files: str) -> Town:
 
 @lru_cache(maxsize=4)
 def _raise_hills(name: str, folder: Path) -> Town:
-    """Return the level town of a folder of flcav with its slopes and camber, under another name."""
+    """Build the hilly town `name`: the level town of a folder of flcav with its slopes and camber."""
     level = load_town(folder)
     description = f"{level.parameters.description.rstrip('.')}; with slopes and camber."
     named = replace(level, name=name, parameters=level.parameters.model_copy(update={"description": description}))
@@ -171,7 +171,7 @@ def _folder(name: str, beside: Path | None) -> Path:
 
 
 def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
-    """Raise `InputError` where the parameters lack a street type, or a pole is on an edge without a sidewalk."""
+    """Check that the parameters fit the net: street types, poles, stop lines and signals. Raises `InputError`."""
     if missing := sorted({edge.type for edge in net.streets} - set(parameters.streets)):
         raise InputError(f"{origin}: field 'streets' lacks the street type '{missing[0]}' of the net")
     walked = {edge.id for edge in net.streets if edge.lanes_of("sidewalk")}
@@ -189,7 +189,7 @@ def _check(net: RoadNet, parameters: TownParameters, origin: Path) -> None:
 
 
 def lift_town(town: Town, relief: Relief) -> Town:
-    """Return a level town lifted onto a relief: poles, signs and signals by the ground at their feet.
+    """Lift a level town onto a relief: poles, signs and signals by the height of the ground at their feet.
 
     Poles, signs, signals, trees and furniture under and on bridges are left out.
     """
@@ -210,7 +210,7 @@ def lift_town(town: Town, relief: Relief) -> Town:
 
 
 def _clear_bridges(town: Town, relief: Relief) -> Town:
-    """Return a town without what stands on or under bridges, or within `BESIDE_BRIDGE_M` of them, but buildings."""
+    """Return a town without objects, except buildings, on or under bridges or within `BESIDE_BRIDGE_M` of them."""
     if not relief.decks:
         return town
     taken = shapely.union_all([deck.outline for deck in relief.decks]).buffer(BESIDE_BRIDGE_M)
@@ -237,7 +237,7 @@ def _clear_bridges(town: Town, relief: Relief) -> Town:
 
 
 def _pick(record: Placed, kept: Mask) -> Placed:
-    """Return the rows of a record's arrays and tuples for which `kept` (N,) is true."""
+    """Select the rows of a record's arrays and tuples for which `kept` (N,) is true."""
     columns = {field.name: getattr(record, field.name) for field in fields(record)}
     arrays = {name: column[kept] for name, column in columns.items() if isinstance(column, np.ndarray)}
     words = {name: tuple(compress(column, kept)) for name, column in columns.items() if isinstance(column, tuple)}
@@ -245,9 +245,9 @@ def _pick(record: Placed, kept: Mask) -> Placed:
 
 
 def furnish_town(name: str, path: Path, net: RoadNet, parameters: TownParameters) -> Town:
-    """Return the level town of the net in the file `path`.
+    """Furnish the net of the file `path` as a level town.
 
-    Ground first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
+    The ground comes first, then buildings, clutter, hedges and fences, trees, poles, signs, lamps and signals.
     """
     frontage = {kind: street.frontage_m for kind, street in parameters.streets.items()}
     ground = build_ground_surfaces(

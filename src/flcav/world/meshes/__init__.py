@@ -25,11 +25,11 @@ MAKERS: dict[str, Callable[[Shape], Mesh]] = {
 
 @lru_cache(maxsize=256)
 def actor_mesh(category: str, shape: int, size: tuple[float, ...] | None = None) -> Mesh:
-    """Return the mesh of `SHAPES[category][shape]` in its body frame: ground centre at the origin, x forward.
+    """Return the mesh of an actor, `SHAPES[category][shape]`, in its body frame: origin below its centre, x forward.
 
-    That of a "prop" is the piece of street furniture `PROPS[shape]`. It has exactly the outer dimensions `size` (3,)
-    [m], None: those of the shape; a fourth number is the bow of a vehicle's ends, see `bow_ends`. Raises `KeyError`
-    and `IndexError` for an unknown shape.
+    For the category "prop" it is the street furniture `PROPS[shape]`. The mesh has exactly the outer dimensions `size`
+    (3,) [m], by default those of the shape; a fourth number is the bow of a vehicle's ends [m], see `bow_ends`. Raises
+    `KeyError` and `IndexError` for an unknown category or shape.
     """
     if category == "prop":
         kind, *usual = PROPS[shape]

@@ -10,7 +10,7 @@ from flcav.world.meshes.mesh import Mesh, add_mirror_image, box, ellipsoid, join
 
 Outline = tuple[tuple[float, float], ...]
 
-MIRROR_M = 0.05  # width of a mirror beside the body
+MIRROR_M = 0.05  # width of a wing mirror
 FRONT_SEAT_M = 1.05  # from the foot of the windscreen back to the front seats
 REAR_SEAT_M = 1.95  # and to the rear seats
 ARCH = 1.16  # radius of a wheel arch over that of its wheel
@@ -18,12 +18,12 @@ ARCH = 1.16  # radius of a wheel arch over that of its wheel
 
 @dataclass(frozen=True)
 class Profile:
-    """Side-view profile of a body: x from -0.5 (rear) to 0.5 of its length, z from 0 to 1 of its height."""
+    """Side-view profile of a vehicle: x in lengths, from -0.5 (rear) to 0.5, and z in heights, from 0 to 1."""
 
     belt: Outline  # x, z of the upper edge of the lower body: boot, waist, bonnet
     roof: Outline  # x, z of the cabin above it, from its rear foot to the foot of the windscreen
     axles: tuple[float, float] = (-0.295, 0.305)  # x of the rear and the front axle
-    wheel_radius: float = 0.31  # [m]
+    wheel_radius: float = 0.31  # of the wheels [m]
     clearance: float = 0.17  # of the floor above the ground [m]
     windows: tuple[float, float] = (0.08, 0.93)  # start and end of the side windows, shares of the cabin's length
     pillars: tuple[float, ...] = (0.36, 0.66)  # between windows, shares of the cabin's length
@@ -34,7 +34,7 @@ class Profile:
 
 
 def vehicle_body(profile: Profile, length: float, width: float, height: float) -> Mesh:
-    """Return the mesh of a vehicle of about these outer dimensions [m], mirrors included, in its body frame."""
+    """Return the mesh of a vehicle, mirrors included, of about these outer dimensions [m], in its body frame."""
     half_width = width / 2 - MIRROR_M
     lower = _Lower.of(profile, length, half_width, height)
     parts = [add_mirror_image(_flank(lower)), _floor(lower), _end(lower, front=False), _end(lower, front=True)]
@@ -53,7 +53,7 @@ def vehicle_body(profile: Profile, length: float, width: float, height: float) -
 
 
 def wheel(radius: float, width: float, sides: int = 12) -> Mesh:
-    """Return a wheel of `radius` and `width` [m] that stands on z = 0, its outer side towards +y."""
+    """Return the mesh of a wheel of `radius` and `width` [m] that stands on z = 0, with its outer side towards +y."""
     hub, face = np.array((0.0, 0.0, radius)), width / 2
     angle = np.linspace(0, 2 * np.pi, sides + 1)
     circle = np.stack((np.cos(angle), 0 * angle, np.sin(angle)), axis=1) * radius
@@ -100,7 +100,8 @@ class _Lower:
 
 
 def _flank(lower: _Lower) -> Mesh:
-    x, half = lower.x, lower.half
+    x = lower.x
+    half = lower.half
     rows = (
         (0.955 * half, lower.sill),
         (half, lower.sill + 0.55 * (lower.belt - lower.sill)),
@@ -209,14 +210,15 @@ def _interior(profile: Profile, lower: _Lower, length: float, height: float) -> 
 def _driver(profile: Profile, lower: _Lower, length: float, height: float) -> Mesh:
     """Return the head and torso of the driver, on the left front seat."""
     _, end, waist = _cabin_frame(profile, lower, length)
-    x, side = end - FRONT_SEAT_M + 0.16, float(lower.half.max()) * 0.45
+    x = end - FRONT_SEAT_M + 0.16
+    side = float(lower.half.max()) * 0.45
     chin = min(0.22, 0.85 * _headroom(profile, length, height, x, waist) - 0.24)
     torso = box((x, side, waist + chin - 0.22), (0.20, 0.40, 0.44), Material.CLOTH)
     return join_meshes((torso, ellipsoid((x + 0.02, side, waist + chin + 0.11), (0.10, 0.08, 0.12), Material.SKIN, 6)))
 
 
 def roof_sign(x: float, z: float) -> Mesh:
-    """Return the roof sign of a taxi, at `x` and with its foot at height `z` [m]."""
+    """Return the mesh of a taxi's roof sign at `x` [m], its foot at height `z` [m], in the body frame."""
     return join_meshes(
         (
             box((x, 0, z + 0.02), (0.10, 0.30, 0.06), Material.TRIM),

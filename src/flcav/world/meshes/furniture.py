@@ -1,10 +1,7 @@
-"""Meshes of trees, street furniture and barriers about their feet: signal heads, masts, signs, clutter, hedges, fences.
+"""Meshes of trees, street furniture and barriers, with the origin at the foot: signals, signs, lamps, hedges, fences.
 
-Crowns of trees are loose leaves, so that some rays pass between them.
-
-Meshes of what stands along real streets: hedges, shrubs, walls, fences, bins, posts, parked bicycles and trailers.
-
-Each is `length` along x, `width` along y and `height` [m], about its foot.
+Crowns of trees are loose leaves, so that some rays pass between them. Barriers and clutter measure `length` along x,
+`width` along y and `height` along z [m].
 """
 
 from collections.abc import Callable, Mapping
@@ -109,8 +106,10 @@ def make_motorbike(length: float, width: float, height: float) -> Mesh:
 
 def make_trailer(length: float, width: float, height: float) -> Mesh:
     """Return a parked car trailer of these dimensions [m]: a tarpaulin on boards, one axle, and a drawbar ahead."""
-    bed, rear = 0.72 * length, -length / 2
-    middle, floor = rear + bed / 2, min(0.5, 0.4 * height)
+    bed = 0.72 * length
+    rear = -length / 2
+    middle = rear + bed / 2
+    floor = min(0.5, 0.4 * height)
     parts = [
         box((middle, 0, floor), (bed, 0.84 * width, 0.1), Material.TRIM),
         box((middle, 0, floor + 0.15 * height), (bed, 0.84 * width, 0.3 * height), Material.METAL),
@@ -134,7 +133,7 @@ def make_guard_rail(length: float, width: float, height: float) -> Mesh:
 
 
 def _barrier(length: float, width: float, height: float, pitch_m: float, full: float, material: Material) -> Mesh:
-    """Return upright slats, `full` of their pitch wide, and two rails at 20 % and 85 % of the height."""
+    """Return upright slats with a width of `full` times the pitch, and two rails at 20 % and 85 % of the height."""
     count = max(2, round(length / pitch_m))
     step = length / count
     front = (np.arange(count) - (count - 1) / 2) * step
@@ -149,9 +148,9 @@ def _barrier(length: float, width: float, height: float, pitch_m: float, full: f
 
 
 def _leafy(grid: Array, size: tuple[float, float, float], rng: np.random.Generator, closed: bool = False) -> Mesh:
-    """Return the surface through a grid (A, B, 3) of unit extents, made uneven, scaled to `size`, with loose leaves.
+    """Return a foliage mesh of this `size` [m]: the roughened surface through a unit grid (A, B, 3), and loose leaves.
 
-    With `closed` the last column of the grid continues in the first.
+    With `closed` the last column of the grid joins the first.
     """
     uneven = 1 + UNEVEN * rng.standard_normal((*grid.shape[:2], 1)).clip(-2, 2)
     if closed:
@@ -202,7 +201,7 @@ MAST_BEHIND_M = 0.40  # from a roadside sensor back to its mast
 
 
 def make_tree(height: float, crown_radius: float, rng: np.random.Generator) -> Mesh:
-    """Return a tree of these dimensions [m] about the foot of its trunk; `rng` draws its leaves."""
+    """Return the mesh of a tree of this height and crown radius [m], origin at its foot; `rng` draws the leaves."""
     crown_foot = 0.32 * height
     middle = np.array((0.0, 0.0, (height + crown_foot) / 2))
     radii = np.array((crown_radius, crown_radius, (height - crown_foot) / 2))
@@ -226,7 +225,7 @@ def scatter_leaves(center: ArrayLike, radii: ArrayLike, count: int, size_m: floa
 
 
 def signal_head(kind: str, height: float) -> Mesh:
-    """Return a signal head of a kind of `SIGNAL_LENSES`, its centre `height` [m] above the origin, facing +x."""
+    """Return the mesh of a signal head of a kind of `SIGNAL_LENSES`, facing +x, `height` [m] above the origin."""
     front = HEAD_M[0] / 2
     lenses = SIGNAL_LENSES[kind]
     housing = (*HEAD_M[:2], HEAD_M[2] - (3 - len(lenses)) * LENS_PITCH_M)
@@ -243,7 +242,7 @@ def map_pole(height: float) -> Mesh:
 
 
 def signal_mast(height: float, reach: float = 0.0) -> Mesh:
-    """Return the mast of a signal head `height` [m] above the origin; with a `reach` [m], on an arm to its left."""
+    """Return the mast of a signal head `height` [m] above the origin; with `reach` [m], on an arm to the left."""
     foot = np.array((-LIGHT_MAST_BEHIND_M, 0.0, 0.0))
     top = np.array((-LIGHT_MAST_BEHIND_M, 0.0, height + 0.25))
     mast = tube(foot, top, 0.075, Material.METAL, sides=8)

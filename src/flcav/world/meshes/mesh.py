@@ -1,6 +1,6 @@
-"""Triangle meshes, their primitives, and draping over a relief. Body frame: x forward, y left, z up, metres.
+"""Triangle meshes, primitives, and draping over a terrain relief. Body frame: x forward, y left, z up [m].
 
-Draping over a relief: polygons and lines are cut along the relief's triangles, and then lifted.
+Draping cuts polygons and lines along the relief's triangles, and then lifts the pieces onto it.
 """
 
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from flcav.geometry import rotations_about_z
 from flcav.world.map.relief import Relief
 from flcav.world.materials import Material
 
-BOWED_M = 0.6  # of a vehicle's front and rear that curve in plan
+BOWED_M = 0.6  # length of the front and rear of a vehicle that curve in plan
 _BOX_CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _BOX_QUADS = np.array([[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]], np.int32)
 _BOX_FACES = _BOX_QUADS[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3)
@@ -28,8 +28,8 @@ class Mesh:
     """A triangle mesh with one material per face."""
 
     vertices: Array32  # (V, 3) [m]
-    faces: Ints32  # (F, 3) rows of `vertices`
-    material: Bytes  # (F,) a Material
+    faces: Ints32  # (F, 3) vertex indices
+    material: Bytes  # (F,) `Material` of each face
 
     def normals(self) -> Array32:
         """Return the unit normals of the faces (F, 3), of either sign; zero where a face has no area."""
@@ -48,12 +48,15 @@ class Mesh:
         flat = self.normals().astype(np.float64)
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
         _, place = np.unique(corners.reshape(-1, 3).round(4), axis=0, return_inverse=True)
+        # Corners at the same place, to 0.1 mm, are consecutive in `order`; there are few per place, so that all pairs
+        # of their faces are compared.
         order = np.argsort(place, kind="stable")
         starts = np.searchsorted(place[order], np.arange(place.max() + 2))
         out = np.empty((len(order), 3))
         for first, last in pairwise(starts):
             shared = order[first:last]
-            normal, weight = flat[shared // 3], area[shared // 3]
+            normal = flat[shared // 3]
+            weight = area[shared // 3]
             alike = normal @ normal.T
             share = np.where(np.abs(alike) > np.cos(np.radians(crease_deg)), np.sign(alike) * weight, 0.0)
             out[shared] = share @ normal
@@ -62,12 +65,12 @@ class Mesh:
         return np.where(length > 1e-12, out / np.maximum(length, 1e-12), flat[:, None]).astype(np.float32)
 
     def bounds(self) -> tuple[Array, Array]:
-        """Return the axis-aligned bounding box: lowest and highest x, y, z, (3,) each [m]."""
+        """Return the axis-aligned bounding box: the lowest and the highest x, y, z, (3,) and (3,) [m]."""
         return self.vertices.min(axis=0).astype(np.float64), self.vertices.max(axis=0).astype(np.float64)
 
 
 def join_meshes(parts: Sequence[Mesh]) -> Mesh:
-    """Return all `parts` as one mesh."""
+    """Concatenate meshes into one."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     return Mesh(
         np.concatenate([part.vertices for part in parts]).astype(np.float32),
@@ -97,9 +100,9 @@ def fit_to_size(mesh: Mesh, length: float, width: float, height: float) -> Mesh:
 
 
 def bow_ends(mesh: Mesh, bow_m: float) -> Mesh:
-    """Return a vehicle's mesh whose front and rear curve in plan: their corners lie `bow_m` [m] behind their middles.
+    """Return a vehicle's mesh with front and rear curved in plan: their corners lie `bow_m` [m] behind their middles.
 
-    The last `BOWED_M` of either end are drawn in by the cube of the distance from the middle, as bumpers are.
+    The last `BOWED_M` of either end recede with the cube of the lateral distance from the middle, as bumpers do.
     """
     x, y, _ = mesh.vertices.T
     end, side = float(x.max()), float(y.max())
@@ -110,9 +113,9 @@ def bow_ends(mesh: Mesh, bow_m: float) -> Mesh:
 
 
 def sheet(points: ArrayLike, material: Material | Bytes) -> Mesh:
-    """Return the surface through a grid of points (A, B, 3) [m], two triangles per cell.
+    """Return the mesh of the surface through a grid of points (A, B, 3) [m], two triangles per cell.
 
-    `material` is one for all, or one per cell (A - 1, B - 1).
+    `material` is one for all cells, or an array (A - 1, B - 1).
     """
     grid = np.asarray(points, np.float64)
     rows, columns = grid.shape[:2]
@@ -139,9 +142,9 @@ def tube(
     sides: int = 8,
     capped: bool = True,
 ) -> Mesh:
-    """Return a prism of `sides` sides from `start` (3,) to `end` (3,): a cylinder or truncated cone [m].
+    """Return the mesh of a cylinder or truncated cone from `start` (3,) to `end` (3,) [m], with `sides` faces.
 
-    Its radius goes from `radius` to `end_radius`, by default the same; `capped` closes its ends.
+    The radius goes from `radius` to `end_radius` [m], by default the same; `capped` closes the ends.
     """
     first, last = np.asarray(start, np.float64), np.asarray(end, np.float64)
     along = (last - first) / np.linalg.norm(last - first)
@@ -165,19 +168,19 @@ def ellipsoid(center: ArrayLike, radii: ArrayLike, material: Material, sides: in
     return sheet(unit * np.asarray(radii) + np.asarray(center), material)
 
 
-FLAT_M = 0.01  # by which a wall may differ from the relief between its corners
-GRID_M = 1e-3  # of coordinates, where exact ones defeat GEOS
-FEW = 64  # triangles, or corners of an area, that are intersected at once
-BESIDE_M = 1.0  # around triangles, of the part of an area with which they are intersected
+FLAT_M = 0.01  # largest difference of a wall's foot from the relief between its corners
+GRID_M = 1e-3  # precision grid of coordinates where GEOS fails with exact ones
+FEW = 64  # triangles, or corners of an area, up to which they are intersected at once
+BESIDE_M = 1.0  # margin around triangles of the part of an area that is intersected with them
 
 
 def drape_polygon(polygon: Array, relief: Relief, above_m: float, material: Material) -> Mesh:
-    """Return the part of a relief inside a polygon (K, 2) [m], raised by `above_m`: exact, plane in each triangle."""
+    """Return the mesh of the relief inside a polygon (K, 2) [m], world frame, raised by `above_m`; it is exact."""
     return drape_area(shapely.make_valid(shapely.Polygon(polygon)), relief, above_m, material)
 
 
 def drape_area(area: BaseGeometry, relief: Relief, above_m: float, material: Material) -> Mesh:
-    """Return the part of a relief inside a valid area, which may have holes: see `drape_polygon`."""
+    """Return the mesh of the relief inside a valid area [m], which may have holes: see `drape_polygon`."""
     shapely.prepare(area)
     near = relief.tree.geometries[relief.tree.query(area, predicate="intersects")]
     parts = shapely.get_parts(_cut(near, area))
@@ -190,9 +193,10 @@ def drape_area(area: BaseGeometry, relief: Relief, above_m: float, material: Mat
 
 
 def _cut(triangles: NDArray[np.object_], area: BaseGeometry) -> NDArray[np.object_]:
-    """Return what of each of `triangles` (F,) is inside an area.
+    """Return the intersections (F,) of `triangles` (F,) with an area.
 
-    An intersection takes time with all corners of the area: for many triangles, it is first halved, and halved again.
+    The cost of an intersection grows with the corners of the whole area, so for many triangles the area is bisected
+    recursively.
     """
     if len(triangles) <= FEW or shapely.get_num_coordinates(area) <= FEW:
         try:
@@ -210,9 +214,9 @@ def _cut(triangles: NDArray[np.object_], area: BaseGeometry) -> NDArray[np.objec
 
 
 def drape_wall(ring: Array, relief: Relief, between_m: tuple[float, float], material: Material) -> Mesh:
-    """Return an upright wall along a closed ring (K + 1, 2) [m], between two heights above the relief.
+    """Return the mesh of an upright wall along a closed ring (K + 1, 2) [m], between two heights above the relief [m].
 
-    It is exact at the ring's corners, and to `FLAT_M` at the edges of triangles between them.
+    It is exact at the ring's corners, and within `FLAT_M` at the triangle edges between them.
     """
     line = shapely.LineString(ring)
     near = relief.tree.geometries[relief.tree.query(line, predicate="intersects")]
@@ -227,7 +231,7 @@ def drape_wall(ring: Array, relief: Relief, between_m: tuple[float, float], mate
 
 
 def _find_bends(along: Array, height: Array, corner: Mask) -> Mask:
-    """Return (N,) the corners and those between which `height` is linear to `FLAT_M` (Douglas-Peucker)."""
+    """Return (N,) the corners, and the points needed so that `height` is linear within `FLAT_M` (Douglas-Peucker)."""
     kept, waiting = corner.copy(), list(pairwise(np.flatnonzero(corner).tolist()))
     while waiting:
         first, last = waiting.pop()

@@ -23,7 +23,7 @@ class Side(NamedTuple):
 
 
 def make_figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: bool = False) -> Mesh:
-    """Return a person facing +x with these joints [m]; a `helmet` for riders."""
+    """Return the mesh of a person facing +x with the given joints [m]; `helmet` is for riders."""
     low, high = np.array(waist), np.array(neck)
     head = high + np.array((0.05, 0.0, 0.19))
     parts = [
@@ -45,7 +45,7 @@ def make_figure(waist: Point, neck: Point, sides: tuple[Side, Side], *, helmet: 
 
 
 def pedestrian(shape: Shape) -> Mesh:
-    """Return a pedestrian in mid-stride, of one size for every `shape`: `actor_mesh` scales it."""
+    """Return the mesh of a pedestrian in mid-stride, of the same size for every `shape`: `actor_mesh` scales it."""
     sides = tuple(
         Side(
             hip=(0.0, 0.09 * left, 0.92),
@@ -61,9 +61,10 @@ def pedestrian(shape: Shape) -> Mesh:
 
 
 def bicycle(shape: Shape, *, ridden: bool = True) -> Mesh:
-    """Return the bicycle `shape`, if `ridden` with its rider; that of a sport bike leans further forward."""
+    """Return the mesh of a bicycle, if `ridden` with its rider, who leans further forward on a sport bike."""
     lean = 0.42 if shape.name == "sport_bike" else 0.22
-    wheel_x, hub = 0.53, 0.34
+    wheel_x = 0.53
+    hub = 0.34
     parts = [_spoked_wheel(x, hub, 0.022) for x in (-wheel_x, wheel_x)]
     saddle, crank, head = (-0.20, 0.0, 0.93), (-0.08, 0.0, 0.30), (0.38, 0.0, 0.86)
     bars = (
@@ -89,7 +90,7 @@ def bicycle(shape: Shape, *, ridden: bool = True) -> Mesh:
 
 
 def motorcycle(shape: Shape, *, ridden: bool = True) -> Mesh:
-    """Return the motorcycle `shape`, if `ridden` with its rider; a scooter has a leg shield and a flat floor."""
+    """Return the mesh of a motorcycle, if `ridden` with its rider; a scooter has a leg shield and a flat floor."""
     scooter = shape.name == "scooter"
     radius, wheel_x = (0.26, 0.62) if scooter else (0.31, 0.72)
     parts = []

@@ -1,4 +1,4 @@
-"""Meshes of cars, vans, trucks and buses: their profiles, and what is built onto the body."""
+"""Meshes of cars, vans, trucks and buses: side-view profiles, cargo bodies and attachments."""
 
 from collections.abc import Callable
 
@@ -137,7 +137,7 @@ _BUS = Profile(
 
 
 def make_car(shape: Shape) -> Mesh:
-    """Return the car or van `shape`, in its body frame; a taxi has a roof sign."""
+    """Return the mesh of a car or van in its body frame; a taxi has a roof sign."""
     if shape.name in _MAKERS:
         return _MAKERS[shape.name](shape)
     if shape.name == "taxi":
@@ -147,7 +147,7 @@ def make_car(shape: Shape) -> Mesh:
 
 
 def make_truck(shape: Shape) -> Mesh:
-    """Return the truck `shape`, in its body frame: a cab, and a closed box or an open tipper behind it."""
+    """Return the mesh of a truck in its body frame: a cab, and behind it a closed box or an open tipper."""
     length, width, height = shape[1:]
     cab_height = min(2.75, height - 0.15)
     parts = [transform_mesh(vehicle_body(_CAB, CAB_M, width, cab_height), length / 2 - CAB_M / 2, 0)]
@@ -169,7 +169,7 @@ def make_truck(shape: Shape) -> Mesh:
 
 
 def make_bus(shape: Shape) -> Mesh:
-    """Return the bus `shape`, in its body frame, with rows of seats behind its windows."""
+    """Return the mesh of a bus in its body frame, with rows of seats behind its windows."""
     length, width, height = shape[1:]
     parts = [vehicle_body(_BUS, length, width, height)]
     row = -length / 2 + 1.2
@@ -180,10 +180,11 @@ def make_bus(shape: Shape) -> Mesh:
 
 
 def _trailer_car(shape: Shape) -> Mesh:
-    """Return a hatchback with a trailer of boards, which stands 0.5 m behind it on an axle of its own."""
+    """Return a hatchback with a single-axle box trailer 0.5 m behind it."""
     length, width, height = shape[1:]
     front, rear, bed = 4.05, -length / 2, 2.55
-    middle, wall = rear + bed / 2, width / 2 - 0.20
+    middle = rear + bed / 2
+    wall = width / 2 - 0.20
     parts = [transform_mesh(vehicle_body(PROFILES["hatchback"], front, width, height), length / 2 - front / 2, 0)]
     parts.append(box((middle, 0, 0.52), (bed, 2 * wall, 0.08), Material.TRIM))
     parts.append(add_mirror_image(box((middle, wall, 0.78), (bed, 0.04, 0.45), Material.METAL)))
@@ -196,7 +197,7 @@ def _trailer_car(shape: Shape) -> Mesh:
 
 
 def _overturned(shape: Shape) -> Mesh:
-    """Return a hatchback that lies on its right side."""
+    """Return an overturned hatchback, lying on its right side."""
     upright = vehicle_body(PROFILES["hatchback"], shape.length, shape.height, shape.width)
     x, y, z = upright.vertices.T
     low = float(y.min())

@@ -2,6 +2,6 @@
 
 Start reading at `importing`. It reads from the map what SUMO's importer leaves out (`document`), lets netconvert split
 the map into nodes, edges and connections, rewrites these as streets with sidewalks (`streets`), lets netconvert join
-them to a net, and derives the town's parameters from it (`furnishing`, `georeference`). What the map has along its
-roads, crosswalks and signal heads among it, comes from `objects`.
+them to a net, and derives the town's parameters from it (`furnishing`, `georeference`). `objects` reads what stands or
+is painted along the roads, such as crosswalks and signal heads.
 """

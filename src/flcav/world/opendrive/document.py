@@ -1,4 +1,4 @@
-"""Reading of an OpenDRIVE file, and its attributes beside the geometry: geo-reference, road types, limits, stops."""
+"""Reading of an OpenDRIVE file and its attributes other than geometry: geo-reference, road types, limits, stops."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -9,8 +9,8 @@ from flcav.config import SHOWN, InputError, read_xml, shorten
 from flcav.world.opendrive.objects.signs import read_limit
 from flcav.world.opendrive.standard import check_standard
 
-FASTEST = 100.0  # [m/s] a limit beyond is none
-STOP_SIGN = "206"  # type of <signal>: number in the German catalogue of signs, as in CARLA's maps
+FASTEST = 100.0  # highest speed limit that is believed [m/s]
+STOP_SIGN = "206"  # type of a <signal>: its number in the German catalogue of signs, as in CARLA's maps
 TO_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
 OPEN_ROADS = ("rural", "motorway", "highway")  # types of roads outside towns
 
@@ -19,13 +19,13 @@ OPEN_ROADS = ("rural", "motorway", "highway")  # types of roads outside towns
 class RoadType:
     """Type and speed limit of one road of the map."""
 
-    kind: str  # of the first <type>: town, rural, motorway, ...; "unknown" where there is none
-    speed: float | None  # limit of the first <type>, else of the first speed-limit sign [m/s]; None without both
+    kind: str  # type of the first <type>: town, rural, motorway, ...; "unknown" without one
+    speed: float | None  # speed limit of the first <type>, else of the first speed-limit sign [m/s]; None without both
 
 
 @dataclass(frozen=True)
 class MapOffset:
-    """Transformation from a map's coordinates to those of its projection, <offset> (ASAM OpenDRIVE 1.8, 8.5)."""
+    """Transformation from a map's frame to the plane of its projection, <offset> (ASAM OpenDRIVE 1.8, 8.5)."""
 
     x: float = 0.0  # [m]
     y: float = 0.0  # [m]
@@ -33,7 +33,7 @@ class MapOffset:
     hdg: float = 0.0  # rotation before the translation, counter-clockwise [rad]
 
     def apply(self, x: float, y: float) -> tuple[float, float]:
-        """Return the coordinates in the projection of a point (x, y) [m] of the map."""
+        """Transform the point (x, y) [m] of the map to the plane of its projection [m]."""
         cos, sin = math.cos(self.hdg), math.sin(self.hdg)
         return x * cos - y * sin + self.x, x * sin + y * cos + self.y
 
@@ -43,19 +43,19 @@ UNMOVED = MapOffset()
 
 @dataclass(frozen=True)
 class Document:
-    """The attributes read from an OpenDRIVE file."""
+    """The attributes of an OpenDRIVE file that the import needs besides geometry."""
 
-    geo_reference: str  # a PROJ string or an EPSG code; empty where there is none
-    offset: MapOffset  # NaN where the map writes no number
-    roads: dict[str, RoadType]  # by the road's id
+    geo_reference: str  # PROJ string or EPSG code; empty without one
+    offset: MapOffset  # NaN where the file has no number
+    roads: dict[str, RoadType]  # road id -> its type and limit
     stops: frozenset[str]  # ids of the junctions with a stop sign
-    left_hand: bool  # whether most of its roads have left-hand traffic
+    left_hand: bool  # whether most roads have left-hand traffic
 
 
 def read_map(path: Path) -> ElementTree.Element:
-    """Return the root of an OpenDRIVE file, its names without a namespace.
+    """Read an OpenDRIVE file, check it and return its root, the element names without a namespace.
 
-    Raises `InputError` where the file is missing, no map of version 1, or breaks a rule of `standard`.
+    Raises `InputError` where the file is missing, is no map of version 1, or breaks a rule of `standard`.
     """
     if path.is_dir():
         raise InputError(f"{path}: is a folder, expected an OpenDRIVE file (.xodr)")
@@ -80,13 +80,13 @@ def read_map(path: Path) -> ElementTree.Element:
 
 
 def drop_namespaces(root: ElementTree.Element) -> None:
-    """Remove the namespace from the names of elements, in place: version 1.8 has one, earlier versions have none."""
+    """Remove the namespace from the names of all elements, in place: only version 1.8 has one."""
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
 
 
 def describe_map(root: ElementTree.Element) -> Document:
-    """Return the attributes of the map below `root`."""
+    """Read the attributes of the map below `root`."""
     rows = root.findall("road")
     left = sum(row.get("rule") == "LHT" for row in rows)
     return Document(
@@ -122,7 +122,7 @@ def _road(row: ElementTree.Element) -> RoadType:
 
 
 def _stops(row: ElementTree.Element) -> list[str]:
-    """Return the ids of the junctions at the stop signs of a road: the road's own, or the one ahead of the sign."""
+    """List the ids of the junctions at a road's stop signs: the one that the road is in, or else the one ahead."""
     out = []
     for signal in row.iterfind("signals/signal"):
         if signal.get("type") != STOP_SIGN:

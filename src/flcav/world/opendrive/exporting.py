@@ -1,8 +1,8 @@
 """Export of a town's roads as an OpenDRIVE map, in the town's coordinates.
 
-netconvert writes the plan; what it leaves out or writes in its own way is put right here: the geo-reference, heights,
-where lanes may be changed, driving lanes that go on as lanes for bicycles alone, crosswalks, which end where they
-began, and traffic lights, of which each approach gets one signal of CARLA's type, named "junction_link".
+netconvert writes the plan. This module corrects or adds what netconvert omits: the geo-reference, heights, lane-change
+permissions, links from driving lanes to bicycle lanes (removed), closed outlines of crosswalks, and traffic lights: one
+signal of CARLA's type per approach, with the id "junction_link".
 """
 
 import shutil
@@ -20,11 +20,11 @@ from flcav.world.opendrive.netconvert import run_netconvert
 from flcav.world.opendrive.reference_line import ReferenceLine
 
 TRAFFIC_LIGHT = "1000001"  # type of a signal with three lenses (ASAM OpenDRIVE signal catalogue)
-HEIGHT_STEP_M = 2.0  # between two heights along a road
+HEIGHT_STEP_M = 2.0  # largest distance of two neighbouring heights along a road
 
 
 def export_town(town: Town) -> str:
-    """Return the OpenDRIVE map of a town as XML text; the same town gives the same text.
+    """Convert a town's roads to an OpenDRIVE map, as XML text; the same town always gives the same text.
 
     Raises `InputError` where netconvert is missing or refuses the net.
     """
@@ -54,21 +54,21 @@ def export_town(town: Town) -> str:
 
 
 def list_approaches(net: RoadNet) -> dict[str, str]:
-    """Return the edges that lead to a traffic light, with the link "junction:link" that stands for each.
+    """Map each edge that leads to a traffic light to its link "junction:link".
 
-    It is that of the way straight on, where there is one.
+    Of several links, the one straight on is taken, if any.
     """
-    found: dict[str, str] = {}
+    links: dict[str, str] = {}
     for edge in net.streets:
         lanes = {lane.id for lane in edge.lanes_of("driving")}
         ruled = [way for way in net.connections if way.light and way.start in lanes]
         if ruled:
-            found[edge.id] = min(ruled, key=lambda way: way.turn != "s").light
-    return found
+            links[edge.id] = min(ruled, key=lambda way: way.turn != "s").light
+    return links
 
 
 def name_signal(link: str) -> str:
-    """Return the id of the signal of a link "junction:link" in the map."""
+    """Return the id in the map of the signal of a link "junction:link"."""
     junction, _, number = link.rpartition(":")
     return f"{junction}_{number}"
 
@@ -81,7 +81,7 @@ def _format_projection(geo: GeoReference) -> str:
 
 
 def _keep_signals(root: ElementTree.Element, kept: set[str]) -> None:
-    """Remove all signals but those named, which become traffic lights, and the empty controllers."""
+    """Remove all signals except those with an id in `kept`, which become traffic lights, and empty controllers."""
     for signals in root.iter("signals"):
         for signal in list(signals):
             if signal.get("id") in kept:
@@ -98,9 +98,9 @@ def _keep_signals(root: ElementTree.Element, kept: set[str]) -> None:
 
 
 def _part_types(root: ElementTree.Element) -> None:
-    """Remove links through junctions from driving lanes to lanes of other types, which cars cannot use.
+    """Remove links between driving lanes and lanes of other types, which cars cannot use, through junctions too.
 
-    A lane across a junction that begins at a lane for bicycles is one for bicycles; netconvert calls it a driving lane.
+    A lane across a junction that begins at a bicycle lane becomes a bicycle lane; netconvert calls it a driving lane.
     """
     roads = [(road.get("id"), road) for road in root.iterfind("road")]
     lanes = {(number, lane.get("id")): lane for number, road in roads for lane in road.iter("lane")}
@@ -128,7 +128,7 @@ def _part_types(root: ElementTree.Element) -> None:
 
 
 def _raise_road(road: ElementTree.Element, town: Town) -> None:
-    """Write the heights of the ground under a road's reference line as its elevation profile."""
+    """Write the heights of the ground [m] under a road's reference line as its elevation profile."""
     line = ReferenceLine(road)
     s = np.linspace(0.0, line.length, max(2, int(np.ceil(line.length / HEIGHT_STEP_M)) + 1))
     x, y, _ = line.at(s).T

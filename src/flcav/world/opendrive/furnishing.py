@@ -1,4 +1,4 @@
-"""Parameters of an imported town: what its map has along the roads, defaults by street type, traffic, sensor sites."""
+"""Parameters of an imported town: objects of its map, defaults by street type, traffic and sensor sites."""
 
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
@@ -31,31 +31,32 @@ from flcav.world.opendrive.objects.stop_lines import add_crossing_lines, find_st
 
 @dataclass(frozen=True)
 class MapObjects:
-    """The objects and signals of a map in town coordinates, and notes on how many there are."""
+    """The objects and signals of a map, in the town's frame, and notes on their numbers."""
 
     signs: tuple[SignParameters, ...]
-    limits: bool  # whether there are speed-limit signs in the map, among `signs` or left out
+    limits: bool  # whether the map has speed-limit signs, among `signs` or left out
     posts: tuple[PostParameters, ...]
     objects: tuple[ObjectParameters, ...]
     signals: tuple[SignalParameters, ...]
     stop_lines: tuple[StopLineParameters, ...]
     parking: tuple[ParkingParameters, ...]
-    notes: tuple[str, ...]  # sentences
+    notes: tuple[str, ...]  # one sentence a kind of object
 
 
 def take_objects(
     root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet, path: Path, *, crosswalks: bool
 ) -> MapObjects:
-    """Return what a map has along the roads of `net`, and write where vehicles stop into its file, `path`.
+    """Collect the objects and signals of the map below `root`; write where vehicles stop into the net file `path`.
 
-    Town = map + `offset_m` [m]; `crosswalks` are those of the map.
+    A place in the town is that in the map + `offset_m` (x, y) [m]. `net` is the content of `path`; `crosswalks` says
+    whether its crossings are the map's, so that stop lines are added before them.
     """
     heads = find_heads(root, offset_m, net)
     parking = find_parking(root, offset_m, net)
     objects = find_standing_objects(root, offset_m, net)
     signs, posts = find_signs(root, offset_m), find_map_poles(root, offset_m)
-    found = find_stop_lines(root, offset_m, net)
-    lines = add_crossing_lines(net, found.found) if crosswalks else found.found
+    marked = find_stop_lines(root, offset_m, net)
+    lines = add_crossing_lines(net, marked.found) if crosswalks else marked.found
     stop_at_lines(path, lines)
     several, alike = count_controllers(heads.found, path)
     switched = f"Controllers with several of these heads: {several}; switched alike here: {alike}."
@@ -71,7 +72,7 @@ def take_objects(
             *signs.notes("Signs"),
             *posts.notes("Poles"),
             *heads.notes("Signal heads"),
-            *found.notes("Stop lines"),
+            *marked.notes("Stop lines"),
             *parking.notes("Parking spaces"),
             *objects.notes("Buildings, plants, barriers and obstacles"),
             *([switched] if several else []),
@@ -79,11 +80,11 @@ def take_objects(
     )
 
 
-VEHICLES_PER_KM = 9.0  # of driving lane
-PEDESTRIANS_PER_KM = 10.0  # of sidewalk
-MOST = 150  # vehicles, and pedestrians, at most
-CORNER_M = 4.0  # from a pole at a junction to the end of its edge
-STRAIGHT_M = 60.0  # straight edges of at least this length get a pole midway
+VEHICLES_PER_KM = 9.0  # vehicles per km of driving lane
+PEDESTRIANS_PER_KM = 10.0  # pedestrians per km of sidewalk
+MOST = 150  # largest number of vehicles, and of pedestrians
+CORNER_M = 4.0  # distance of a pole at a junction from the end of its edge
+STRAIGHT_M = 60.0  # least length of a straight edge with a pole midway
 BENT_M = 2.0  # largest deviation of a straight edge from its chord
 STREETS: dict[str, StreetParameters] = {
     "arterial": StreetParameters(
@@ -119,7 +120,7 @@ MIX = {"car": 0.66, "van": 0.12, "truck": 0.05, "bus": 0.03, "motorcycle": 0.05,
 def furnish(
     net: RoadNet, *, description: str, seed: int, geo: GeoReference, source: MapSource, found: MapObjects
 ) -> TownParameters:
-    """Return the parameters of a town on `net` with the objects `found` in its map.
+    """Set the parameters of a town on `net` with the objects `found` in its map.
 
     Raises `KeyError` for a street type that is not in `STREETS`.
     """
@@ -145,10 +146,10 @@ def furnish(
 
 
 def find_candidate_poles(net: RoadNet) -> list[PoleParameters]:
-    """Return the candidate sites of roadside sensors, numbered from north to south, then from west to east.
+    """List candidate sites of roadside sensors, numbered from north to south, then from west to east.
 
-    There is one at each junction of three or more streets, on the widest street that leads there, and one midway along
-    each straight edge of at least `STRAIGHT_M`. Edges without a sidewalk have none.
+    Every junction of three or more streets has one, on the widest street that leads there, and every straight edge of
+    at least `STRAIGHT_M` has one midway. Edges without a sidewalk have none.
     """
     into: dict[str, list[Edge]] = {}
     for edge in net.streets:
@@ -180,7 +181,7 @@ def find_candidate_poles(net: RoadNet) -> list[PoleParameters]:
 
 
 def _count(net: RoadNet, kind: str, per_km: float) -> int:
-    """Return the number of road users for the lanes of a kind, `MOST` at most."""
+    """Compute the number of road users, at most `MOST`, from the total length of the lanes of a kind."""
     metres = sum(LineString(lane.shape).length for edge in net.streets for lane in edge.lanes_of(kind))
     return min(round(per_km * metres / 1000), MOST)
 
@@ -190,7 +191,7 @@ def _length(edge: Edge) -> float:
 
 
 def _bend(edge: Edge) -> float:
-    """Return the largest distance of an edge's outermost lane from its chord [m]."""
+    """Compute the largest distance of an edge's outermost lane from its chord [m]."""
     line = edge.lanes[0].shape
     chord = LineString(line[[0, -1]])
     return float(np.max(shapely.distance(shapely.points(line), chord)))

@@ -1,12 +1,11 @@
 """Place of a map on the WGS 84 ellipsoid: the map projection of an OpenDRIVE header, its offset, and their inverse.
 
+The projection is read from a PROJ string or an EPSG code (ASAM OpenDRIVE 1.8, 8.5). Supported are transverse Mercator,
+UTM and Mercator on the ellipsoids of WGS 84 and GRS 80, which differ by 0.1 mm, and the spherical Mercator projection
+of web maps. Of a repeated parameter the first counts, and `k_0` before `k`, as in PROJ.
+
 Transverse Mercator is Krüger's series in the third flattening n, to n^4 (C. F. F. Karney, "Transverse Mercator with an
 accuracy of a few nanometers", J. Geodesy 85, 2011, eqs. 11, 15, 36).
-
-Map projection of an OpenDRIVE header, from its PROJ string or EPSG code (ASAM OpenDRIVE 1.8, 8.5).
-
-Understood are transverse Mercator, UTM and Mercator on the ellipsoids of WGS 84 and GRS 80, which differ by 0.1 mm, and
-the spherical Mercator projection of web maps. Of parameters given twice PROJ takes the first, and `k_0` before `k`.
 """
 
 import math
@@ -27,7 +26,7 @@ EPSG = re.compile(
     r"(?:\+?init=)?(?:urn:ogc:def:crs:)?epsg:(?:[\d.]*:)?(\d+)(?:\s+\+(?:no_defs|type=crs))*", re.IGNORECASE
 )
 MERCATOR = {3857: "webmerc", 900913: "webmerc", 3395: "merc"}  # EPSG code -> PROJ's name
-UTM = {  # first EPSG code, first zone, last zone
+UTM = {  # series of EPSG codes -> first code, first zone, last zone
     "WGS 84, north": (32601, 1, ZONES),
     "ETRS89": (25828, 28, 38),
     "NAD83": (26901, 1, 23),
@@ -35,7 +34,7 @@ UTM = {  # first EPSG code, first zone, last zone
 UTM_SOUTH = 32700  # EPSG code of WGS 84 / UTM zone 0 S
 NUMBERS = ("zone", "lat_0", "lon_0", "lat_ts", "k", "k_0", "x_0", "y_0", "a", "b", "R")
 ELSEWHERE = ("no_defs", "type", "wktext", "over", "approx", "geoidgrids", "vunits", "south")  # of height, or no number
-USUAL = {  # parameters with the values that leave a projection on WGS 84 in metres as it is, to a metre
+USUAL = {  # parameter -> values that change a projection on WGS 84 in metres by less than a metre
     "datum": ("WGS84", "NAD83"),
     "ellps": ("WGS84", "GRS80"),
     "towgs84": ("0,0,0", "0,0,0,0,0,0,0"),
@@ -45,23 +44,23 @@ USUAL = {  # parameters with the values that leave a projection on WGS 84 in met
     "axis": ("enu",),
     "pm": ("greenwich", "0"),
 }
-CENTIMETRE = 0.01
+CENTIMETRE = 0.01  # largest difference of equal axes [m]
 
 
 @dataclass(frozen=True)
 class Projection:
-    """A map projection on the WGS 84 ellipsoid; spherical Mercator takes geodetic latitudes for those of a sphere."""
+    """A map projection of the WGS 84 ellipsoid; spherical Mercator takes geodetic latitudes as those of a sphere."""
 
     kind: Literal["tmerc", "merc", "webmerc"]  # transverse, ellipsoidal or spherical Mercator
-    latitude_deg: float = 0.0  # of the origin; of a Mercator projection it is on the equator
-    longitude_deg: float = 0.0  # of the origin, on the central meridian
-    scale: float = 1.0  # on the central meridian; of a Mercator projection on the equator
+    latitude_deg: float = 0.0  # latitude of the origin; 0 in a Mercator projection
+    longitude_deg: float = 0.0  # longitude of the origin and of the central meridian
+    scale: float = 1.0  # scale factor on the central meridian; in a Mercator projection on the equator
     easting_m: float = 0.0  # x of the origin
     northing_m: float = 0.0  # y of the origin
 
 
 def read_projection(reference: str) -> Projection | None:
-    """Return the projection of the text of <geoReference>; None for one that is not understood as a whole."""
+    """Parse the text of <geoReference>; None where any part of it is not understood."""
     code = EPSG.fullmatch(reference)
     words = [word.lstrip("+").partition("=") for word in reference.split()]
     named = {name: value for name, _, value in reversed(words)}
@@ -90,7 +89,10 @@ def _utm(zone: int, *, south: bool) -> Projection | None:
 
 
 def _from_parameters(kind: str, named: dict[str, str]) -> Projection | None:
-    """Return the projection that PROJ makes of these parameters; raises `ValueError` where one is no number."""
+    """Build the projection that PROJ makes of its parameters; None if unsupported.
+
+    `kind` is the value of +proj, `named` holds the other parameters. Raises `ValueError` where one is no number.
+    """
     numbers = {name: float(named.pop(name)) for name in NUMBERS if name in named}
     south = "south" in named
     if not all(value in USUAL.get(name, ()) for name, value in named.items() if name not in ELSEWHERE):
@@ -117,15 +119,14 @@ def _from_parameters(kind: str, named: dict[str, str]) -> Projection | None:
     return _utm(int(numbers["zone"]), south=south) if kind == "utm" else None
 
 
-STEP_M = 100.0  # distance over which the axes of a map's grid are taken
+STEP_M = 100.0  # distance to both sides over which the directions of the map's axes are measured
 
 
 def locate_origin(reference: str, x: float, y: float, offset: MapOffset = UNMOVED) -> GeoReference | None:
-    """Return the position of a map around its point (x, y) [m], with its axes on the ground.
+    """Locate the point (x, y) [m] of a map on Earth, with the directions of the map's axes on the ground there.
 
-    `reference` is the text of <geoReference>, see `read_projection`; `offset` is added to the map's coordinates before
-    they are those of the projection, along whose grid the axes lie then. None where the reference is not understood,
-    and where the place is none on Earth.
+    `reference` is the text of <geoReference>, see `read_projection`; `offset` transforms the map's frame to the plane
+    of the projection. None where the reference is not understood, or where the point has no place on Earth.
     """
     projection = read_projection(reference)
     if projection is None:
@@ -154,7 +155,7 @@ def _round(axis: Array) -> tuple[float, float]:
 
 
 def _place(projection: Projection, offset: MapOffset, x: float, y: float) -> GeoReference:
-    """Return the position of the map's point (x, y) [m]; raises `ValueError` where there is none."""
+    """Locate the map's point (x, y) [m] on Earth; raises `ValueError` where it has no place there."""
     x, y = offset.apply(x, y)
     east, north = x - projection.easting_m, y - projection.northing_m
     if projection.kind == "tmerc":
@@ -175,9 +176,10 @@ def _place(projection: Projection, offset: MapOffset, x: float, y: float) -> Geo
 def inverse_mercator(
     east_m: float, north_m: float, latitude_0: float, longitude_0: float, scale: float
 ) -> tuple[float, float]:
-    """Return latitude and longitude [deg] of a point east and north of the projection's origin (Karney, section 3).
+    """Invert the transverse Mercator projection (Karney, section 3); return latitude and longitude [deg].
 
-    `latitude_0` and `longitude_0` are the origin [deg], `scale` is the scale factor on the central meridian.
+    `east_m` and `north_m` [m] are counted from the projection's origin at `latitude_0`, `longitude_0` [deg]; `scale` is
+    the scale factor on the central meridian.
     """
     n = FLATTENING / (2 - FLATTENING)
     radius = EQUATOR_M / (1 + n) * (1 + n**2 / 4 + n**4 / 64)
@@ -205,14 +207,14 @@ def inverse_mercator(
 
 
 def _conformal_tangent(tangent: float) -> float:
-    """Return the tangent of the conformal latitude, given that of the geodetic one (eqs. 7-9)."""
+    """Convert the tangent of a geodetic latitude to that of the conformal latitude (eqs. 7-9)."""
     e = math.sqrt(ECCENTRICITY2)
     sigma = math.sinh(e * math.atanh(e * tangent / math.hypot(1, tangent)))
     return tangent * math.hypot(1, sigma) - sigma * math.hypot(1, tangent)
 
 
 def _geodetic_tangent(conformal: float) -> float:
-    """Return the tangent of the geodetic latitude, given that of the conformal one, by Newton's method (eqs. 19-21)."""
+    """Convert the tangent of a conformal latitude to that of the geodetic latitude, by Newton's method (eqs. 19-21)."""
     e2 = ECCENTRICITY2
     tangent = conformal / (1 - e2)
     for _ in range(6):

@@ -1,4 +1,4 @@
-"""Sampling of the surface of an OpenDRIVE map as points of a terrain (`flcav.world.map.relief`)."""
+"""Sampling of the surface of an OpenDRIVE map as points of a terrain, and its bridges (`flcav.world.map.relief`)."""
 
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Iterator, Sequence
@@ -22,31 +22,31 @@ from flcav.world.opendrive.road_surface import Road
 from flcav.world.opendrive.standard import FARTHEST_M
 from flcav.world.opendrive.streets import SIDEWALK_M, WALKED
 
-BRIDGE_M = 2.5  # a road at least this far above another one passes over it
-CLEAR_M = 4.0  # from the end of a deck to the road below, seen from above
-JOINT_M = 0.5  # pieces of roads no farther apart than this go on as one bridge
-NEAR_M = 12.0  # the ground is sampled closely so far around a deck
-BATCH = 20_000  # pieces of roads that are compared with all others at a time
+BRIDGE_M = 2.5  # least height of a road over another one that it passes on a bridge
+CLEAR_M = 4.0  # horizontal distance from the end of a deck to the road below
+JOINT_M = 0.5  # largest distance in plan of two pieces of road that are part of one bridge
+NEAR_M = 12.0  # distance around a deck within which the ground is sampled closely
+BATCH = 20_000  # number of pieces of road that are compared with all others at a time
 
 
 class Borders(NamedTuple):
-    """Both ends of the K cross-sections of a road."""
+    """Both ends of the K cross-sections of a road, in the map's frame."""
 
-    right: Array  # (K, 3) [m]
-    left: Array  # (K, 3) [m]
+    right: Array  # (K, 3) right ends, seen along s [m]
+    left: Array  # (K, 3) left ends [m]
 
 
 class Spans(NamedTuple):
     """The bridges of one road with K cross-sections."""
 
-    decks: tuple[slice, ...]  # the cross-sections of each deck, those at both ends included
-    near: Mask  # (K,) cross-sections that the ground keeps, since they are within `NEAR_M` of a deck of any road
+    decks: tuple[slice, ...]  # indices of the cross-sections of each deck, both ends included
+    near: Mask  # (K,) whether the ground keeps a cross-section, since it is within `NEAR_M` of a deck of any road
 
 
 def find_bridges(roads: Sequence[Borders]) -> list[Spans]:
-    """Return the bridges of each road: where it lies `BRIDGE_M` or more above another road, or above itself.
+    """Find the bridges of each road: where it lies `BRIDGE_M` or more above another road, or above itself.
 
-    A deck begins and ends `CLEAR_M` before the road below, and goes on over joints of roads.
+    A deck begins and ends `CLEAR_M` before the road below, and continues over joints of roads.
     """
     counts = [max(len(road.right) - 1, 0) for road in roads]
     pieces = _join_corners(roads)
@@ -71,13 +71,13 @@ def find_bridges(roads: Sequence[Borders]) -> list[Spans]:
 
 
 def _join_corners(roads: Sequence[Borders]) -> Array:
-    """Return the corners (N, 4, 3) of the pieces of all roads, each between two neighbouring cross-sections."""
+    """Return the corners (N, 4, 3) [m] of the N pieces of all roads, each between two neighbouring cross-sections."""
     pieces = [np.stack((road.right[:-1], road.right[1:], road.left[1:], road.left[:-1]), axis=1) for road in roads]
     return np.concatenate(pieces) if pieces else np.zeros((0, 4, 3))
 
 
 def _batches(tree: shapely.STRtree, areas: NDArray, rows: Ints, within_m: float) -> Iterator[tuple[Ints, Ints]]:
-    """Yield pairs of rows of `areas`: some of `rows`, and those of the tree within `within_m` of them."""
+    """Yield pairs of indices of areas at most `within_m` [m] apart: one of `rows`, one of the tree, batch by batch."""
     for first in range(0, len(rows), BATCH):
         some = rows[first : first + BATCH]
         one, other = tree.query(areas[some], predicate="dwithin", distance=within_m)
@@ -85,9 +85,10 @@ def _batches(tree: shapely.STRtree, areas: NDArray, rows: Ints, within_m: float)
 
 
 def _find_joined(areas: NDArray, low: Array, high: Array, crossing: Mask) -> Mask:
-    """Return which of N pieces of roads are `crossing`, or connected with such a piece, directly or through others.
+    """Extend the mask `crossing` (N,) to all pieces of road that are connected with one in it, directly or not.
 
-    `low` and `high` (N,) are their heights [m].
+    Connected pieces are at most `JOINT_M` apart in plan and differ by less than `BRIDGE_M` in height; `low` and `high`
+    (N,) are the heights of their lowest and highest corners [m].
     """
     if not crossing.any():
         return crossing
@@ -102,61 +103,64 @@ def _find_joined(areas: NDArray, low: Array, high: Array, crossing: Mask) -> Mas
 
 
 def _span(over: Mask, near: Mask) -> Spans:
-    """Return the bridges of a road, given which of its K - 1 pieces are `over` another one and which are `near`."""
+    """Group a road's pieces into bridges; `over` and `near` (K - 1,) mark the pieces of decks and those near decks."""
     edges = np.flatnonzero(np.diff(np.concatenate(([False], over, [False]))))
     decks = tuple(slice(int(first), int(last) + 1) for first, last in edges.reshape(-1, 2))
     return Spans(decks, np.concatenate((near, [False])) | np.concatenate(([False], near)))
 
 
-HIGHEST_M = 10_000.0
-STEP_M = 1.0  # between two cross-sections, of which those are kept that are needed
-TOLERANCE_M = 0.003  # by which the surface may differ from a cross-section that is left out
-TWIST_M = 0.008  # and by which it may leave the plane between two of them
-NARROW_M = 0.1  # width of a road too narrow for a deck
-STRAY_M = 0.02  # in a map with bridges, by which the terrain may leave a cross-section
-BEND_SHARE = 0.1  # of an error in plan that counts as one of height
-ASIDE_M = (SIDEWALK_M, 6.0)  # beyond the outermost lanes the ground goes on at their height
-FINE_M = 2.0  # between points across a road near a bridge: so that the ground beside it begins at its edge
-MOST_FILLED = 50  # points between two borders of lanes, however wide a lane is
-CELL_M = 0.5  # points of different roads in one cell are one
-FAR_M = 400.0  # from the outermost points to the edge of the terrain
+HIGHEST_M = 10_000.0  # largest height of a surface, above or below 0
+STEP_M = 1.0  # distance of two cross-sections that are sampled; those that are needed are kept
+TOLERANCE_M = 0.003  # largest distance of the surface from a cross-section that is left out
+TWIST_M = 0.008  # largest distance of the surface from the triangles between two cross-sections
+NARROW_M = 0.1  # width up to which a road is too narrow for a deck
+STRAY_M = 0.02  # largest distance of the terrain from a cross-section, in a map with bridges
+BEND_SHARE = 0.1  # share of an error in plan that counts as an error in height
+ASIDE_M = (SIDEWALK_M, 6.0)  # distances beyond the outermost lanes at which the ground has still their height
+FINE_M = 2.0  # distance of points across a road near a bridge, so that the ground at its side begins at its edge
+MOST_FILLED = 50  # largest number of points between two borders of lanes, however wide a lane is
+CELL_M = 0.5  # side of a square cell whose points are merged into one
+FAR_M = 400.0  # distance from the outermost points to the edge of the terrain
 
 
 @dataclass(frozen=True)
 class Heights:
-    """The points of a map's terrain and of the decks of its bridges."""
+    """The points of a map's terrain and of the decks of its bridges, in the map's frame."""
 
     points: Array  # (N, 3) [m]; empty where the map is level at height 0
-    decks: tuple[tuple[Array, ...], ...]  # of each its cross-sections (T, 3) along the road, from right to left [m]
+    decks: tuple[tuple[Array, ...], ...]  # of each deck, its cross-sections (T, 3) along s, from right to left [m]
 
 
 def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
-    """Return points of the surface of the map below `root`, which keeps to `standard`.
+    """Sample the surface of the map below `root`, which keeps to `standard`.
 
-    Raises `InputError` naming `origin` where the surface leaves the Earth.
+    Raises `InputError` naming `origin` where a road reaches beyond `FARTHEST_M` in plan or `HIGHEST_M` in height.
     """
     roads = [Road(row) for row in root.iterfind("road")]
     if all(road.is_level for road in roads):
         return Heights(np.zeros((0, 3)), ())
     with np.errstate(all="ignore"):  # numbers that overflow are refused below
         strips = [_cross_sections(road) for road in roads]
-    for road, own in zip(roads, strips):
-        if not all((np.abs(p) <= (FARTHEST_M, FARTHEST_M, HIGHEST_M)).all() for strip in own for p in strip):
+    for road, strips_of_road in zip(roads, strips):
+        if not all((np.abs(p) <= (FARTHEST_M, FARTHEST_M, HIGHEST_M)).all() for strip in strips_of_road for p in strip):
             far = f"{FARTHEST_M / 1000:g} km, or {HIGHEST_M:g} m in height"
             raise InputError(f"{origin}: road {shorten(road.id)} reaches beyond {far}")
-    edges = [Borders(*(np.concatenate([strip.inner[row] for strip in own]) for row in (0, -1))) for own in strips]
+    edges = [
+        Borders(*(np.concatenate([strip.inner[row] for strip in strips_of_road]) for row in (0, -1)))
+        for strips_of_road in strips
+    ]
     spans = find_bridges(edges)
     bare = not any(lane.get("type") in WALKED for lane in root.iter("lane"))
     kinds = {name: road.kind for name, road in describe_map(root).roads.items()}
     decks = [
         deck
-        for road, own, span in zip(roads, strips, spans)
-        for deck in _list_decks(own, span, widened=bare and kinds[road.id] not in OPEN_ROADS)
+        for road, strips_of_road, span in zip(roads, strips, spans)
+        for deck in _list_decks(strips_of_road, span, widened=bare and kinds[road.id] not in OPEN_ROADS)
     ]
     points = _sample_terrain(strips, spans)
     while decks:
-        relief = Relief(points)  # its triangles may cut across a road where points beside it are few
-        strays = [_find_strays(own, span, relief) for own, span in zip(strips, spans)]
+        relief = Relief(points)  # its triangles may cut across a road with few points at its sides
+        strays = [_find_strays(strips_of_road, span, relief) for strips_of_road, span in zip(strips, spans)]
         if not any(stray.any() for stray in strays):
             break
         spans = [span._replace(near=span.near | stray) for span, stray in zip(spans, strays)]
@@ -165,14 +169,14 @@ def sample_heights(root: ElementTree.Element, origin: Path) -> Heights:
 
 
 class Strip(NamedTuple):
-    """The K cross-sections of a lane section."""
+    """The K cross-sections of a lane section, in the map's frame."""
 
-    inner: Array  # (T, K, 3) at the borders of the lanes, from right to left [m]
-    outer: Array  # (2 len(ASIDE_M), K, 3) beside the road: on its right, then on its left [m]
+    inner: Array  # (T, K, 3) points at the borders of the lanes, from right to left [m]
+    outer: Array  # (2 len(ASIDE_M), K, 3) points at the sides of the road: right, then left [m]
 
 
 def _cross_sections(road: Road) -> list[Strip]:
-    """Return the cross-sections of a road, lane section by lane section."""
+    """Compute the cross-sections of a road, lane section by lane section."""
     count = max(int(np.ceil(road.length / STEP_M)), 1)
     stations = np.unique(np.clip([*np.linspace(0.0, road.length, count + 1), *road.stations], 0.0, road.length))
     out = []
@@ -184,17 +188,17 @@ def _cross_sections(road: Road) -> list[Strip]:
         outer = []
         for side, edge in ((-1, t[0]), (1, t[-1])):
             for beyond_m in ASIDE_M:
-                beside = road.point(s, edge + side * beyond_m)
-                beside[:, 2] = road.height(s, edge)
-                outer.append(beside)
+                aside = road.point(s, edge + side * beyond_m)
+                aside[:, 2] = road.height(s, edge)
+                outer.append(aside)
         out.append(Strip(points, np.stack(outer)))
     return out
 
 
 def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tuple[Array, ...]]:
-    """Return the decks of a road, each as its cross-sections, `widened` by a sidewalk on both sides.
+    """List the decks of a road, each as its cross-sections (T, 3) [m], `widened` by a sidewalk on both sides.
 
-    Those of a road narrower than `NARROW_M` are left out.
+    Decks no wider than `NARROW_M` are left out.
     """
     sides = (slice(0, 1), slice(len(ASIDE_M), len(ASIDE_M) + 1)) if widened else (slice(0), slice(0))
     whole = [np.concatenate((strip.outer[sides[0]], strip.inner, strip.outer[sides[1]])).round(4) for strip in strips]
@@ -204,9 +208,9 @@ def _list_decks(strips: list[Strip], spans: Spans, *, widened: bool) -> list[tup
 
 
 def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> Mask:
-    """Return at which of a road's K cross-sections the terrain differs from the road by more than `STRAY_M`.
+    """Find the cross-sections (K,) of a road from which the terrain differs by more than `STRAY_M`.
 
-    Those on decks, and those that the ground keeps already, are left out.
+    Those on decks are left out, and so are those that the ground keeps already.
     """
     errors = [
         np.abs(relief.heights(*np.moveaxis(s.inner[..., :2], 2, 0)) - s.inner[..., 2]).max(axis=0) for s in strips
@@ -215,9 +219,9 @@ def _find_strays(strips: list[Strip], spans: Spans, relief: Relief) -> Mask:
 
 
 def _find_raised(spans: Spans) -> Mask:
-    """Return which of a road's K cross-sections are on decks alone.
+    """Find the cross-sections (K,) of a road that are on decks alone.
 
-    Where a deck ends within the road, its last cross-section is the ground's, too.
+    Where a deck ends within the road, its last cross-section is also part of the ground.
     """
     raised = np.zeros(len(spans.near), np.bool_)
     for deck in spans.decks:
@@ -226,8 +230,8 @@ def _find_raised(spans: Spans) -> Mask:
 
 
 def _sample_terrain(strips: list[list[Strip]], spans: list[Spans]) -> Array:
-    """Return the points (N, 3) of the terrain of all roads."""
-    grounds = [_sample_ground(own, span) for own, span in zip(strips, spans)]
+    """Compute the points (N, 3) [m] of the terrain of all roads, and those of a frame around them."""
+    grounds = [_sample_ground(strips_of_road, span) for strips_of_road, span in zip(strips, spans)]
     surface, aside = (np.concatenate([ground[i] for ground in grounds]) for i in (0, 1))
     distance, _ = KDTree(surface[:, :2]).query(aside[:, :2])
     room = np.minimum(np.array(ASIDE_M) - 0.1, CLEAR_M)
@@ -237,9 +241,9 @@ def _sample_terrain(strips: list[list[Strip]], spans: list[Spans]) -> Array:
 
 
 def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
-    """Return the points (N, 3) of a road's surface outside its bridges, and those (M, 3) beside it.
+    """Return the points (N, 3) of a road's surface outside its bridges and those (M, 3) at its sides [m].
 
-    The M are in the order of `ASIDE_M`.
+    The M points are in the order of `ASIDE_M`, over and over.
     """
     raised = _find_raised(spans)
     inner, outer, first = [np.zeros((0, 3))], [np.zeros((0, 3))], 0
@@ -248,18 +252,18 @@ def _sample_ground(strips: list[Strip], spans: Spans) -> tuple[Array, Array]:
         first += len(rows)
         for part in np.split(rows, np.flatnonzero(np.diff(raised[rows])) + 1):
             if not raised[part[0]]:
-                own = part - rows[0]
-                kept = own[_find_needed(strip.inner[:, own], spans.near[part])]
+                local = part - rows[0]
+                kept = local[_find_needed(strip.inner[:, local], spans.near[part])]
                 inner.append(strip.inner[:, kept].reshape(-1, 3))
-                inner.append(_fill_across(strip.inner[:, own[spans.near[part]]]))
+                inner.append(_fill_across(strip.inner[:, local[spans.near[part]]]))
                 outer.append(strip.outer[:, kept].reshape(2, len(ASIDE_M), -1, 3).swapaxes(1, 2).reshape(-1, 3))
     return np.concatenate(inner), np.concatenate(outer)
 
 
 def _fill_across(points: Array) -> Array:
-    """Return points (N, 3) between neighbours of each column of points (T, K, 3), `FINE_M` apart or less.
+    """Interpolate points (N, 3) [m] between neighbours of each column of points (T, K, 3), at most `FINE_M` apart.
 
-    There are `MOST_FILLED` at most between two of them.
+    Between two of them there are at most `MOST_FILLED`.
     """
     out = [np.zeros((0, 3))]
     for one, other in pairwise(points):
@@ -269,10 +273,11 @@ def _fill_across(points: Array) -> Array:
 
 
 def _find_needed(points: Array, fixed: Mask) -> Ints:
-    """Return the columns of points (T, K, 3) between which the others are linear, to `TOLERANCE_M` (Douglas-Peucker).
+    """Select the columns of points (T, K, 3) [m] that keep the others within `TOLERANCE_M` (Douglas-Peucker).
 
-    Rows are in the order of t. Height errors count in full; errors in plan as far as the cross-section is tilted, and
-    at least to `BEND_SHARE`. Those that are `fixed` (K,) are among them.
+    Others are interpolated linearly between the selected columns. Rows are in the order of t. Errors in height count in
+    full, errors in plan in proportion to the tilt of the cross-section, at least by `BEND_SHARE`. The columns `fixed`
+    (K,) are always selected.
     """
     across = points[-1] - points[0]
     tilt = np.abs(across[:, 2]) / np.maximum(np.hypot(across[:, 0], across[:, 1]), 0.1)
@@ -298,14 +303,14 @@ def _find_needed(points: Array, fixed: Mask) -> Ints:
 
 
 def _merge(points: Array) -> Array:
-    """Return one point for each cell that holds any of the points (N, 3): their mean, (M, 3)."""
+    """Average the points (N, 3) [m] in every square cell of side `CELL_M`: one point a cell, (M, 3)."""
     cells = np.unique(np.floor(points[:, :2] / CELL_M), axis=0, return_inverse=True)[1].ravel()
     count = np.bincount(cells)
     return np.stack([np.bincount(cells, column) / count for column in points.T], axis=1)
 
 
 def surround_terrain(points: Array, far_m: float = FAR_M) -> Array:
-    """Return points (K, 3) [m] on a frame `far_m` around `points` (N, 3), each at the height of the nearest of them."""
+    """Place points (K, 3) on a frame `far_m` [m] around `points` (N, 3) [m], at the height of the nearest of them."""
     low, high = points[:, :2].min(axis=0) - far_m, points[:, :2].max(axis=0) + far_m
     share = np.linspace(0.0, 1.0, 9)
     x, y = low[0] + share * (high[0] - low[0]), low[1] + share * (high[1] - low[1])

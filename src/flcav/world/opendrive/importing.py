@@ -31,15 +31,16 @@ from flcav.world.opendrive.objects.crossings import find_crosswalks
 from flcav.world.opendrive.objects.places import note_taken
 from flcav.world.opendrive.streets import read_made_net, rewrite_streets
 
-WIDEST_M = 5e5  # farthest that a street is from the middle of the town
-GAPS_M = 5000.0  # total length of the gaps between linked roads, in both directions, over which streets are drawn
-STRETCHED = 0.01  # difference between lengths of the map and on the ground that is worth a word
+WIDEST_M = 5e5  # largest coordinate of a street in the town's frame
+GAPS_M = 5000.0  # largest total length of the gaps between linked roads that streets span, both directions together
+STRETCHED = 0.01  # least relative difference between lengths in the map and on the ground that is noted
 
 
 def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
-    """Return the net that netconvert made; raises `InputError` naming `origin` where no town can be made of it.
+    """Read the net that netconvert made and check that it can be a town; raises `InputError` naming `origin` otherwise.
 
-    netconvert joins roads that are linked by straight streets, wherever they are; `roads_m` is their own length.
+    netconvert joins linked roads by straight streets, however far apart they are. `roads_m` is the total length of the
+    map's roads [m], against which that of the streets is checked.
     """
     net = read_made_net(path, origin)
     if not any(edge.lanes_of("driving") for edge in net.streets):
@@ -56,7 +57,7 @@ def _read_joined(path: Path, origin: Path, roads_m: float) -> RoadNet:
 
 
 def _format_place(geo: GeoReference) -> str:
-    """Return latitude and longitude as text, to some 10 m.
+    """Format latitude and longitude as text, rounded to about 10 m.
 
     >>> _format_place(GeoReference(latitude_deg=-33.9, longitude_deg=18.42))
     '33.9° S, 18.42° E'
@@ -67,17 +68,17 @@ def _format_place(geo: GeoReference) -> str:
 
 @dataclass(frozen=True)
 class ImportedTown:
-    """An imported town, and notes on what differs from the map."""
+    """An imported town, and notes on how it differs from the map."""
 
     town: Town
-    notes: tuple[str, ...]  # sentences
+    notes: tuple[str, ...]  # one sentence a difference
 
 
 def import_town(xodr: Path, out: Path) -> ImportedTown:
-    """Write the town of an OpenDRIVE map as the folder `out` and return it; the same map gives the same town.
+    """Convert an OpenDRIVE map to a town in the new folder `out`; the same map always gives the same town.
 
-    Raises `InputError`, and makes no folder, where `out` exists already, where the file is no OpenDRIVE map that
-    netconvert can read, and where the map has no driving lane.
+    Raises `InputError`, and makes no folder, where `out` exists already, where netconvert cannot read the file as an
+    OpenDRIVE map, and where the map has no driving lane.
     """
     check_town_name(out.name)
     with only_writer(out):
@@ -87,9 +88,9 @@ def import_town(xodr: Path, out: Path) -> ImportedTown:
 def _import(xodr: Path, out: Path) -> ImportedTown:
     if out.exists():
         raise InputError(f"{out}: is there already; give a new folder")
-    beside = find_existing(out.parent)
-    if not beside.is_dir():
-        raise InputError(f"{beside}: is a file; a town needs a folder")
+    parent = find_existing(out.parent)
+    if not parent.is_dir():
+        raise InputError(f"{parent}: is a file; a town needs a folder")
     root = read_map(xodr)
     notes = [*mend_roads(root), *mend_map(root)]
     name_safely(root)
@@ -97,7 +98,7 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
     heights = sample_heights(root, xodr)
     if heights.decks:
         notes.append(f"Bridges, on which roads pass above others: {len(heights.decks)}.")
-    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=beside) as scratch:
+    with tempfile.TemporaryDirectory(prefix=f".{out.name}.", dir=parent) as scratch:
         prefix, folder = Path(scratch) / "map", Path(scratch) / out.name
         folder.mkdir()
         split_map(root, prefix, xodr, left_hand=document.left_hand)
@@ -110,8 +111,8 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
         nowhere = Counter({"no street between two sidewalks there": len(crosswalks.found) - crossed})
         notes += note_taken("Crosswalks", crossed, crosswalks.left + nowhere)
-        found = take_objects(root, streets.offset_m, net, folder / "town.net.xml", crosswalks=crossed > 0)
-        notes += found.notes
+        objects = take_objects(root, streets.offset_m, net, folder / "town.net.xml", crosswalks=crossed > 0)
+        notes += objects.notes
         dx, dy = streets.offset_m
         geo = locate_origin(document.geo_reference, -dx, -dy, document.offset)
         if geo is None:
@@ -137,7 +138,7 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
             seed=zlib.crc32(xodr.read_bytes()) % 10_000,
             geo=geo,
             source=MapSource(file=xodr.name, offset_m=streets.offset_m),
-            found=found,
+            found=objects,
         )
         values = parameters.model_dump(mode="json", exclude_defaults=True)
         text = yaml.safe_dump(values, sort_keys=False, allow_unicode=True, default_flow_style=None, width=120)

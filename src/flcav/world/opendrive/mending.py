@@ -1,14 +1,11 @@
 """Mending of OpenDRIVE maps before they are read: roads, widths of lanes, and content that netconvert requires.
 
-Widths of the lanes of an OpenDRIVE road as netconvert needs them: no borders, none below zero (OpenDRIVE 1.8, 11.6).
+Broken content is removed, and optional content that netconvert requires is completed: a type of the centre lane (ASAM
+OpenDRIVE 1.8, 11.3), the contact point of a connection (12.4), and restrictions of access as attributes, as in edition
+1.7 (11.8.2).
 
-netconvert ignores borders, gives a lane without a positive width a usual one, and looks at a width only where an
-element of the map begins or ends.
-
-Mending of OpenDRIVE maps: completion of optional content that netconvert requires, and removal of broken content.
-
-netconvert requires more than ASAM OpenDRIVE 1.8 does: a type of the centre lane (11.3), the contact point of a
-connection (12.4), and restrictions of access as attributes, as in edition 1.7 (11.8.2).
+Lanes get widths instead of borders, and none below zero (11.6): netconvert ignores borders, gives a lane without a
+positive width a default one, and evaluates a width only where an element of the map begins or ends.
 """
 
 import math
@@ -32,17 +29,17 @@ from flcav.world.opendrive.reference_line import (
     order_geometry,
 )
 
-STRAIGHT = 1e-9  # least curvature, and difference between two [1/m]
-MOST_TOLD = 10  # changes of a kind that are listed one by one
+STRAIGHT = 1e-9  # least curvature of an arc, and least change of curvature of a spiral [1/m]
+MOST_TOLD = 10  # number of changes of a kind that are listed one by one
 PROFILES = ("planView", "elevationProfile", "lateralProfile", "lanes")  # children of a <road> with elements along s
 
 
 def mend_roads(root: ElementTree.Element) -> tuple[str, ...]:
-    """Mend the roads of the map below `root`, which keeps to `standard`, in place; return a note on each change.
+    """Mend the roads of the map below `root`, which keeps to `standard`, in place; return notes on the changes.
 
-    Elements along a road are sorted by s, those without a length are left out, gaps between geometry elements are
-    closed, widths are rewritten for netconvert, and speed limits that are none are removed. Of many changes of a kind
-    the first `MOST_TOLD` are listed.
+    Elements along a road are sorted by s, elements without a length are removed, gaps between geometry elements are
+    closed, widths are rewritten for netconvert, and invalid speed limits are removed. Of many changes of a kind, the
+    first `MOST_TOLD` are listed.
     """
     notes: list[list[str]] = [[] for _ in range(6)]
     order, empty, gaps, kinks, widths, limits = notes
@@ -60,7 +57,7 @@ def mend_roads(root: ElementTree.Element) -> tuple[str, ...]:
                 kinks.append(f"{here} turns by {math.degrees(joint.kink_rad):.0f}° at once.")
         widths += [f"{name}, {note}" for note in _mend_widths(road)]
         limits += [f"{name}{note}" for note in _drop_limits(road)]
-    return tuple(note for own in notes for note in _shorten_list(own))
+    return tuple(note for group in notes for note in _shorten_list(group))
 
 
 def _shorten_list(notes: list[str]) -> list[str]:
@@ -69,11 +66,11 @@ def _shorten_list(notes: list[str]) -> list[str]:
 
 
 def _sort(road: ElementTree.Element) -> list[tuple[str, str]]:
-    """Sort the elements along a road by s, in place, all but lateral shapes, and lanes by their number.
+    """Sort the elements along a road by s, and by t at the same s, and its lanes by their number, in place.
 
-    Return the lanes, as ", lane -1" or "" for the road itself, and names of elements that were not in order.
+    Return the lane (", lane -1", or "" for the road itself) and name of elements that were not in order.
     """
-    found = []
+    unordered = []
     parents = [("", parent) for tag in PROFILES for parent in road.iterfind(tag)]
     for section in road.iterfind("lanes/laneSection"):
         for side in section:
@@ -88,15 +85,15 @@ def _sort(road: ElementTree.Element) -> list[tuple[str, str]]:
             rows = parent.findall(tag)
             ordered = sorted(rows, key=lambda row: (read_number(row, start), read_number(row, "t")))
             if any(one is not other for one, other in zip(rows, ordered)):
-                found.append((where, tag))
+                unordered.append((where, tag))
                 places = [i for i, row in enumerate(parent) if row.tag == tag]
                 for i, row in zip(places, ordered):
                     parent[i] = row
-    return found
+    return unordered
 
 
 def _drop_empty(road: ElementTree.Element) -> Iterator[tuple[str, float]]:
-    """Remove geometry and lane sections, in order of s, that have no length; yield the name and s [m] of each."""
+    """Remove geometry and lane sections (in the order of s) without a length; yield the name and s [m] of each."""
     kept = order_geometry(road)
     for row in road.findall("planView/geometry"):
         if row not in kept:
@@ -112,16 +109,16 @@ def _drop_empty(road: ElementTree.Element) -> Iterator[tuple[str, float]]:
 
 
 def _measure(road: ElementTree.Element) -> list[tuple[ElementTree.Element, float]]:
-    """Return the lane sections of a road, in order of s, and their lengths [m]."""
+    """Return the lane sections of a road and their lengths [m]; they are in the order of s."""
     sections = road.findall("lanes/laneSection")
     ends = [*(float(section.attrib["s"]) for section in sections), float(road.attrib["length"])]
     return [(section, end - start) for section, (start, end) in zip(sections, pairwise(ends))]
 
 
 def _write_shapes(road: ElementTree.Element) -> None:
-    """Write the range of each <paramPoly3>; spirals of constant curvature become arcs, arcs without curvature lines.
+    """Write the range of each <paramPoly3>; turn spirals of constant curvature into arcs, straight arcs into lines.
 
-    netconvert takes the one at its word, and divides by zero at the others.
+    netconvert relies on the range without checking it, and divides by zero in the other two cases.
     """
     for row in road.iterfind("planView/geometry"):
         for shape in row:
@@ -137,7 +134,7 @@ def _write_shapes(road: ElementTree.Element) -> None:
 
 
 def _mend_widths(road: ElementTree.Element) -> Iterator[str]:
-    """Rewrite the widths of a road's lanes; yield a note on each lane that is cut or left out."""
+    """Rewrite the widths of a road's lanes in place; yield a note on each lane that is cut or left out."""
     several = len(road.findall("lanes/laneSection")) > 1
     for section, length in _measure(road):
         kinds = {lane.get("id"): lane.get("type") or "none" for lane in section.iterfind("*/lane")}
@@ -152,7 +149,7 @@ def _mend_widths(road: ElementTree.Element) -> Iterator[str]:
 
 
 def _drop_limits(road: ElementTree.Element) -> Iterator[str]:
-    """Remove speed limits of a road and its lanes with an unknown unit or an impossible value; yield a note on each."""
+    """Remove speed limits with an unknown unit or an invalid value from a road and its lanes; yield a note on each."""
     owners = [("", owner) for owner in road.iterfind("type")]
     owners += [(f", lane {lane.get('id')}", lane) for lane in road.iterfind("lanes/laneSection/*/lane")]
     for where, owner in owners:
@@ -168,34 +165,34 @@ def _drop_limits(road: ElementTree.Element) -> Iterator[str]:
             owner.remove(limit)
 
 
-LEAST_M = 1e-3  # a lane that is nowhere wider has no width, and a width less below zero needs no cut
-LATE_M = 0.5  # widths that begin up to here count from the beginning of their section
-NARROW_M = 1.8  # width from which on netconvert opens a lane to traffic
+LEAST_M = 1e-3  # width up to which a lane has none; a width below zero by less is not cut
+LATE_M = 0.5  # largest sOffset of a first width that counts from the beginning of its section
+NARROW_M = 1.8  # least width of a lane that netconvert opens to traffic
 ZERO = Polynomial([0.0])
 
 
 class WidthPiece(NamedTuple):
-    """A piece of a piecewise polynomial: its value [m] by the length [m] from `s` on."""
+    """A piece of a piecewise polynomial along a lane section."""
 
-    s: float  # [m] from the beginning of the lane section
-    value: Polynomial
+    s: float  # start of the piece, from the beginning of the lane section [m]
+    value: Polynomial  # value [m] by the distance from `s` [m]
 
     def at(self, s: float) -> "WidthPiece":
-        """Return the same polynomial with its origin at another `s` [m]."""
+        """Shift the origin of the polynomial to another `s` [m]; its values stay the same."""
         return self if s == self.s else WidthPiece(s, self.value(Polynomial([s - self.s, 1.0])))
 
 
 class Change(NamedTuple):
     """A change of the width of a lane."""
 
-    lane: int
-    least_m: float  # below zero: the least width, before it was cut there; 0 for a lane without a positive width
+    lane: int  # number of the lane
+    least_m: float  # least width before it was cut at zero, negative; 0 for a lane without a positive width
 
 
 def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
     """Rewrite the widths of a <laneSection> of `length` [m] in place; return the changes to report.
 
-    Borders become widths, a width below zero is zero, and so is a missing one: netconvert leaves such a lane out.
+    Borders become widths, and negative or missing widths become zero, so that netconvert leaves such a lane out.
     """
     changes = []
     for side, sign in (("left", 1.0), ("right", -1.0)):
@@ -222,17 +219,18 @@ def rewrite_widths(section: ElementTree.Element, length: float) -> list[Change]:
 
 
 def _is_plain(widths: list[ElementTree.Element]) -> bool:
-    """Return whether a lane has one constant positive width, as most have."""
-    own = [[float(row.attrib[name]) for name in ("sOffset", *"abcd")] for row in widths]
-    return len(own) == 1 and own[0][0] == 0.0 and own[0][1] > LEAST_M and not any(own[0][2:])
+    """Return whether a lane has a single constant positive width, as most lanes have."""
+    numbers = [[float(row.attrib[name]) for name in ("sOffset", *"abcd")] for row in widths]
+    return len(numbers) == 1 and numbers[0][0] == 0.0 and numbers[0][1] > LEAST_M and not any(numbers[0][2:])
 
 
 def _cut(pieces: list[WidthPiece], length: float) -> tuple[list[WidthPiece], float, float]:
-    """Return the pieces up to `length` [m], zero where they are below it, and the least and the largest value [m].
+    """Cut the pieces at `length` [m] and their values at zero; return also their least and largest value before [m].
 
-    A piece also ends where it is narrowest, if no vehicle fits there.
+    A piece is also split where it is narrowest, if no vehicle fits there.
     """
-    parts, ends = [], [*(piece.s for piece in pieces[1:]), length]
+    parts = []
+    ends = [*(piece.s for piece in pieces[1:]), length]
     for piece, end in zip(pieces, ends):
         flat = not piece.value.coef[1:].any()
         turning = [] if flat else _find_roots(piece.value.deriv(), end - piece.s)
@@ -248,7 +246,7 @@ def _cut(pieces: list[WidthPiece], length: float) -> tuple[list[WidthPiece], flo
 
 
 def _find_roots(value: Polynomial, span: float) -> list[float]:
-    """Return where a polynomial is zero, above 0 and below `span`."""
+    """Find the roots of a polynomial between 0 and `span`, both excluded."""
     if not value.coef[1:].any() or not np.isfinite(value.coef).all():
         return []
     roots = value.trim(1e-12).roots()
@@ -256,7 +254,7 @@ def _find_roots(value: Polynomial, span: float) -> list[float]:
 
 
 def _read(rows: list[ElementTree.Element]) -> list[WidthPiece]:
-    """Return the pieces of rows in the order of s, from the beginning of the section on."""
+    """Read the pieces of rows that are in the order of s; the first piece begins at 0."""
     pieces = [
         WidthPiece(float(row.attrib["sOffset"]), Polynomial([float(row.attrib[i]) for i in "abcd"])) for row in rows
     ]
@@ -270,7 +268,7 @@ def _read(rows: list[ElementTree.Element]) -> list[WidthPiece]:
 
 
 def _add(one: list[WidthPiece], other: list[WidthPiece], factor: float) -> list[WidthPiece]:
-    """Return the pieces of one piecewise polynomial plus `factor` times another."""
+    """Compute one piecewise polynomial plus `factor` times another."""
     starts = sorted({piece.s for piece in (*one, *other)})
     return [WidthPiece(s, _at(one, s).value + factor * _at(other, s).value) for s in starts]
 
@@ -280,20 +278,20 @@ def _at(pieces: list[WidthPiece], s: float) -> WidthPiece:
 
 
 def _write(piece: WidthPiece) -> dict[str, str]:
-    """Return the attributes of a <width>."""
+    """Format a piece as the attributes of a <width>."""
     coefficients = [*piece.value.coef.tolist(), 0.0, 0.0, 0.0][:4]
     return {"sOffset": repr(piece.s), **{name: repr(value) for name, value in zip("abcd", coefficients)}}
 
 
-SIGNAL = {"type": "-1", "dynamic": "no", "orientation": "none"}  # what a signal is that does not say; -1: of no type
+SIGNAL = {"type": "-1", "dynamic": "no", "orientation": "none"}  # defaults of a signal's attributes; type -1: no type
 ENDS = ("predecessor", "successor")
 
 
 def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
-    """Mend the map below `root` in place; return a note on each kind of change.
+    """Mend signals, links, connections and limits of the map below `root` in place; return a note per kind of change.
 
-    Signals get what they lack of `SIGNAL`; links and connections that lead nowhere, and infinite limits, are removed.
-    What netconvert requires beyond the standard is completed without a note.
+    Signals get the attributes of `SIGNAL` that they lack; links and connections that lead nowhere, and infinite limits,
+    are removed. What netconvert requires beyond the standard is completed without a note.
     """
     roads = {row.get("id", "") for row in root.iterfind("road")}
     known = {"road": roads, "junction": {row.get("id", "") for row in root.iterfind("junction")}}
@@ -340,7 +338,7 @@ def mend_map(root: ElementTree.Element) -> tuple[str, ...]:
 
 
 def _type_lanes(road: ElementTree.Element) -> int:
-    """Give each lane without a type the type "none"; return how many of them are not the centre lane."""
+    """Set the type "none" where a lane has no type; return the number of those lanes that are not a centre lane."""
     unknown = 0
     for side in road.iterfind("lanes/laneSection/*"):
         for lane in side.iterfind("lane"):
@@ -351,7 +349,7 @@ def _type_lanes(road: ElementTree.Element) -> int:
 
 
 def _split_restrictions(road: ElementTree.Element) -> None:
-    """Rewrite each `<access>` of edition 1.8, with `<restriction>` elements, as one of edition 1.7 for each of them."""
+    """Rewrite each <access> of edition 1.8 as one <access> of edition 1.7 per <restriction> that it contains."""
     for lane in road.iterfind("lanes/laneSection/*/lane"):
         for access in lane.findall("access"):
             if access.get("restriction"):
@@ -364,13 +362,13 @@ def _split_restrictions(road: ElementTree.Element) -> None:
 
 
 def _find_predecessor(road: ElementTree.Element) -> str | None:
-    """Return the id of the road that precedes a road, if any."""
+    """Return the id of the road that precedes a road; None without one."""
     before = road.find("link/predecessor[@elementType='road']")
     return None if before is None else before.get("elementId")
 
 
 def _clear_lane_links(road: ElementTree.Element) -> int:
-    """Remove the links of lanes that are no numbers; return how many."""
+    """Remove links of lanes whose id is no integer; return their number."""
     removed = 0
     for link in road.iterfind("lanes/laneSection/*/lane/link"):
         for end in list(link):
@@ -381,7 +379,7 @@ def _clear_lane_links(road: ElementTree.Element) -> int:
 
 
 def _clear_endless_limits(road: ElementTree.Element) -> int:
-    """Remove the speed limits that are infinite or NaN; return how many. Words like "no limit" stay."""
+    """Remove speed limits that are infinite or NaN; return their number. Words like "no limit" stay."""
     removed = 0
     for owner in [*road.iterfind("type"), *road.iterfind("lanes/laneSection/*/lane")]:
         for limit in owner.findall("speed"):

@@ -1,4 +1,4 @@
-"""SUMO's netconvert, a program of the extra `towns`: maps as it needs them, its run, and its plain files."""
+"""Runs of SUMO's netconvert, a program of the extra `towns`: preparation of maps for it, options, and plain files."""
 
 import copy
 import importlib
@@ -13,8 +13,8 @@ from flcav.interface.wording import format_install_command
 from flcav.world.opendrive.objects.crossings import Crosswalk, take_crosswalks
 
 PARTS = ("nod", "edg", "con")  # netconvert's plain XML files: nodes, edges, connections
-OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}
-JOINING = {
+OPTIONS = {"nod": "node-files", "edg": "edge-files", "con": "connection-files"}  # part -> netconvert's option for it
+JOINING = {  # options of both runs that join parts to a net
     "offset.disable-normalization": "true",
     "no-turnarounds.except-deadend": "true",
     "walkingareas": "true",
@@ -24,32 +24,33 @@ JOINING = {
     "tls.default-type": "static",
     "tls.cycle.time": "60",
 }
-FIRST = {
-    "geometry.remove": "true",  # merge the edges at a node of one street,
-    "geometry.remove.min-length": "40",  # and a short edge even where it differs a little
+FIRST = {  # further options of the first of these runs
+    "geometry.remove": "true",  # merge the edges of a street at a node where they are alike
+    "geometry.remove.min-length": "40",  # merge edges that are shorter even where they differ a little
     "geometry.remove.width-tolerance": "1",
     "crossings.guess": "true",
     "crossings.guess.speed-threshold": "20",
 }
-NAMES = {  # attributes that refer to a road or junction by its id
+NAMES = {  # element -> attributes that refer to it by its id
     "road": ("incomingRoad", "connectingRoad", "linkedRoad", "high", "low"),
     "junction": ("junction",),
 }
-UNSAFE = re.compile(r"[^A-Za-z0-9_.-]")  # what ids of SUMO's nodes and edges are without here
-NETCONVERT_S = 300.0  # longest run of netconvert
+UNSAFE = re.compile(r"[^A-Za-z0-9_.-]")  # characters that are replaced in ids of SUMO's nodes and edges
+NETCONVERT_S = 300.0  # time limit of a run of netconvert
 
 
 def run_netconvert(options: dict[str, str], folder: Path, origin: Path) -> None:
-    """Run netconvert in `folder`; raises `InputError` where it is missing, or with its first error where it fails.
+    """Run netconvert in `folder` with `options`; raises `InputError` where it is missing, or with its first error.
 
-    Options name files by their names there: in a path it would take a comma for a separator.
+    Options name files relative to `folder`, since netconvert takes a comma in a path for a separator. `origin` names
+    the map in the error.
     """
-    found = importlib.util.find_spec("sumo")
-    if found is None or not found.submodule_search_locations:
+    spec = importlib.util.find_spec("sumo")
+    if spec is None or not spec.submodule_search_locations:
         raise InputError(
             f"OpenDRIVE maps need SUMO's netconvert, which is not installed: {format_install_command('towns')}"
         )
-    binary = Path(next(iter(found.submodule_search_locations))) / "bin" / "netconvert"
+    binary = Path(next(iter(spec.submodule_search_locations))) / "bin" / "netconvert"
     command = [str(binary), *(word for name, value in options.items() for word in (f"--{name}", value))]
     try:
         done = subprocess.run(
@@ -62,9 +63,9 @@ def run_netconvert(options: dict[str, str], folder: Path, origin: Path) -> None:
         raise InputError(f"{origin}: netconvert cannot read this OpenDRIVE map ({errors[0].strip().rstrip('.')})")
 
 
-SIDES = {"left": "right", "right": "left"}
-ORDER = {"left": 0, "center": 1, "right": 2}
-TURNED: dict[str, tuple[str, ...]] = {  # attributes that change their sign, by element
+SIDES = {"left": "right", "right": "left"}  # side of a lane section -> its mirror image
+ORDER = {"left": 0, "center": 1, "right": 2}  # order of the sides in a lane section
+TURNED: dict[str, tuple[str, ...]] = {  # element -> attributes that change their sign in a mirrored map
     "geometry": ("y", "hdg"),
     "arc": ("curvature",),
     "spiral": ("curvStart", "curvEnd"),
@@ -83,7 +84,7 @@ TURNED: dict[str, tuple[str, ...]] = {  # attributes that change their sign, by 
 
 
 def mirror_map(root: ElementTree.Element) -> None:
-    """Mirror the map below `root` in place, y to -y; the rule of each road, RHT or LHT, changes too.
+    """Mirror the map below `root` in place, y to -y; the traffic rule of roads, RHT or LHT, is swapped too.
 
     Lateral shapes are removed.
     """
@@ -106,7 +107,7 @@ def mirror_map(root: ElementTree.Element) -> None:
 
 
 def mirror_parts(prefix: Path) -> None:
-    """Mirror netconvert's plain nodes, edges and connections beside `prefix` in place, y to -y."""
+    """Mirror netconvert's plain nodes, edges and connections `prefix.nod.xml` and so on in place, y to -y."""
     for part in ("nod", "edg", "con"):
         tree = ElementTree.parse(f"{prefix}.{part}.xml")
         for row in tree.getroot().iter():
@@ -119,7 +120,7 @@ def mirror_parts(prefix: Path) -> None:
 
 
 def _turn(text: str) -> str:
-    """Return a number, as text, with its sign inverted."""
+    """Invert the sign of a number given as text."""
     stripped = text.strip()
     return stripped[1:] if stripped.startswith("-") else f"-{stripped.removeprefix('+')}"
 
@@ -127,9 +128,9 @@ def _turn(text: str) -> str:
 def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_hand: bool) -> None:
     """Split the map below `root`: write its `PARTS` as `prefix.nod.xml` and so on, and its net as `prefix.net.xml`.
 
-    They are plane: heights are read on their own. netconvert knows no left-hand traffic in OpenDRIVE; such a map is
-    mirrored for it, and its parts are mirrored back. Raises `InputError` naming `origin` where netconvert is missing or
-    refuses the map.
+    The parts are plane; `heights` reads the heights separately. netconvert supports no left-hand traffic in OpenDRIVE:
+    such a map is mirrored for it, and the parts are mirrored back. Raises `InputError` naming `origin` where netconvert
+    is missing or refuses the map.
     """
     plan = copy.deepcopy(root)
     for road in plan.iterfind("road"):
@@ -160,9 +161,9 @@ def split_map(root: ElementTree.Element, prefix: Path, origin: Path, *, left_han
 def join_parts(
     prefix: Path, net: Path, origin: Path, *, left_hand: bool, crosswalks: tuple[Crosswalk, ...] = ()
 ) -> int:
-    """Join the `PARTS` beside `prefix` to the net file `net`; return how many of a map's crosswalks are its crossings.
+    """Join the `PARTS` of `prefix` to the net file `net`; return the number of crosswalks that became crossings.
 
-    Without `crosswalks` netconvert guesses where crossings are. Raises `InputError` naming `origin` where that fails.
+    Without `crosswalks` netconvert guesses where crossings are. Raises `InputError` naming `origin` where it fails.
     """
     side = {"lefthand": "true"} if left_hand else {}
     plain, made = prefix.with_name("joined"), prefix.with_name("joined.net.xml")
@@ -179,12 +180,12 @@ def join_parts(
 
 
 def _name_parts(prefix: Path) -> dict[str, str]:
-    """Return netconvert's options for reading the `PARTS` beside `prefix`."""
+    """Build netconvert's options for reading the `PARTS` of `prefix`."""
     return {OPTIONS[part]: f"{prefix.name}.{part}.xml" for part in PARTS}
 
 
 def name_safely(root: ElementTree.Element) -> None:
-    """Replace characters that SUMO's ids cannot have in the ids of roads and junctions below `root`, in place."""
+    """Replace `UNSAFE` characters in the ids of roads and junctions below `root`, and in references to them."""
     for kind, references in NAMES.items():
         known = {row.get("id", "") for row in root.iterfind(kind)}
         safe: dict[str, str] = {}
@@ -194,7 +195,7 @@ def name_safely(root: ElementTree.Element) -> None:
                 safe[name] += "_"
             known.add(safe[name])
         for row in root.iter() if safe else ():
-            own = ("id",) if row.tag == kind else ("elementId",) if row.get("elementType") == kind else ()
-            for attribute in (*own, *references):
+            id_attributes = ("id",) if row.tag == kind else ("elementId",) if row.get("elementType") == kind else ()
+            for attribute in (*id_attributes, *references):
                 if row.get(attribute) in safe:
                     row.set(attribute, safe[row.attrib[attribute]])

@@ -1,4 +1,7 @@
-"""Reference lines of OpenDRIVE roads in plan (OpenDRIVE 1.8, 9): their geometry elements, and the joints of these."""
+"""Reference lines of OpenDRIVE roads in plan (OpenDRIVE 1.8, 9): their geometry elements, and the joints of these.
+
+Places and headings are in the map's frame: x [m], y [m], and heading [rad] counter-clockwise from x.
+"""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -11,33 +14,33 @@ import numpy as np
 from flcav.arrays import Array
 from flcav.geometry import wrap_angle
 
-Curve = Callable[[Array], tuple[Array, Array, Array]]  # length along it -> u, v [m], direction [rad], in its own frame
+Curve = Callable[[Array], tuple[Array, Array, Array]]  # arc length [m] -> u, v [m], direction [rad], from its start
 
-NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # of the integrals of spirals
-TURN_RAD = 0.5  # by which a spiral turns at most over one interval of integration
-FINE = 400  # points at which a cubic's length is measured
-LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # by which the length of a curve or road may differ from what the map says
+NODES, WEIGHTS = np.polynomial.legendre.leggauss(8)  # for the integrals of spirals
+TURN_RAD = 0.5  # largest turn of a spiral over one interval of integration
+FINE = 400  # number of points at which the length of a cubic is measured
+LENGTH_SHARE, LENGTH_M = 0.01, 0.5  # largest relative and absolute error of a length in the map; their sum is allowed
 
 
 @dataclass(frozen=True)
 class GeometryPiece:
-    """One <geometry>: a curve from a place in the map."""
+    """One <geometry>: a curve and the pose of its start in the map's frame."""
 
-    s: float  # where it begins along the road [m]
-    length: float  # [m]
-    x: float  # of its start [m]
-    y: float
-    heading: float  # of its start [rad]
-    curve: Curve
+    s: float  # s of the start along the road [m]
+    length: float  # length according to the map [m]
+    x: float  # x of the start [m]
+    y: float  # y of the start [m]
+    heading: float  # heading at the start [rad]
+    curve: Curve  # shape, with u along the heading at the start and v to its left
 
     def at(self, along: Array) -> Array:
-        """Return x, y [m] and heading [rad] (N, 3) at `along` (N,) [m] from its start, limited to its length."""
+        """Compute x, y [m] and heading [rad] (N, 3) at `along` (N,) [m] from the start, limited to the length."""
         u, v, turn = self.curve(np.clip(along, 0.0, self.length))
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return np.stack((self.x + cos * u - sin * v, self.y + sin * u + cos * v, self.heading + turn), axis=1)
 
     def measure(self) -> float:
-        """Return the length of the curve [m], to some millimetres; a cubic's may differ from what the map says."""
+        """Measure the length of the curve [m], to some millimetres; that of a cubic may differ from the map's."""
         return float(np.hypot(*np.diff(self.at(np.linspace(0.0, self.length, FINE))[:, :2], axis=0).T).sum())
 
 
@@ -51,24 +54,25 @@ class ReferenceLine:
         self.length = float(road.attrib["length"])
 
     def at(self, s: Array) -> Array:
-        """Return x, y [m] and heading [rad] (N, 3) at `s` (N,) [m], limited to each piece's length."""
+        """Compute x, y [m] and heading [rad] (N, 3) at `s` (N,) [m], limited to the lengths of the pieces."""
         out = np.empty((len(s), 3))
         number = np.clip(np.searchsorted(self._starts, s, side="right") - 1, 0, None)
         for i in np.unique(number).tolist():
-            rows, piece = number == i, self._pieces[i]
+            rows = number == i
+            piece = self._pieces[i]
             out[rows] = piece.at(s[rows] - piece.s)
         return out
 
 
 def list_pieces(rows: Iterable[ElementTree.Element]) -> list[GeometryPiece]:
-    """Return the curves of <geometry> elements that keep to `standard`."""
+    """Read the pieces of <geometry> elements that keep to `standard`."""
     return [_piece(row) for row in rows]
 
 
 def is_by_length(shape: ElementTree.Element, length: float) -> bool:
-    """Return whether the parameter of a <paramPoly3> goes to `length` [m] rather than to 1.
+    """Return whether the parameter of a <paramPoly3> goes from 0 to `length` [m] rather than to 1.
 
-    That is what its `pRange` says, without one 1, unless the curve has about this length in the other case alone.
+    `pRange` decides, or 1 without it, unless the curve has about this length in the other case alone.
     """
     said = shape.get("pRange") == "arcLength"
     polynomials = [np.polynomial.Polynomial([float(shape.attrib[name + axis]) for name in "abcd"]) for axis in "UV"]
@@ -102,7 +106,7 @@ def _spiral(shape: ElementTree.Element, length: float) -> Curve:
 
 
 def _clothoid(start: float, rate: float) -> Curve:
-    """Return the curve of curvature `start` + `rate` s, by Gauss-Legendre quadrature of its direction."""
+    """Build the curve of curvature `start` [1/m] + `rate` [1/m^2] s, by Gauss-Legendre quadrature of its direction."""
 
     def curve(s: Array) -> tuple[Array, Array, Array]:
         def turn(at: Array) -> Array:
@@ -131,7 +135,10 @@ def _param_poly3(shape: ElementTree.Element, length: float) -> Curve:
 
 
 def _cubic(u: tuple[float, ...], v: tuple[float, ...], length: float, *, by_length: bool) -> Curve:
-    """Return the curve of two cubic polynomials in p; p is s, or with `by_length` the parameter at arc length s."""
+    """Build the curve of two cubic polynomials in p, where p is s, or with `by_length` the parameter at arc length s.
+
+    `u` and `v` are the coefficients of both, from that of p^0 on.
+    """
     along, across = np.polynomial.Polynomial(u), np.polynomial.Polynomial(v)
     slope_u, slope_v = along.deriv(), across.deriv()
 
@@ -155,27 +162,27 @@ CURVES: dict[str, Callable[[ElementTree.Element, float], Curve]] = {
 }
 
 
-SHORTEST_M = 1e-3  # a shorter element is left out
-WIDEST_GAP_M = 1.0  # of a gap that is closed
-NOTED_M, NOTED_RAD = 0.02, math.radians(5.0)  # smallest gap and kink worth a word
-SHARPEST_RAD = math.radians(60.0)  # of a kink; the sharpest of 84 maps of others has 45°
-EASE = 10.0  # length over which a gap is closed, as a multiple of it
-STEP_M = 1.0  # length of the straight elements there, at most
+SHORTEST_M = 1e-3  # length below which an element is left out
+WIDEST_GAP_M = 1.0  # largest gap that is closed
+NOTED_M, NOTED_RAD = 0.02, math.radians(5.0)  # smallest gap and kink that are noted
+SHARPEST_RAD = math.radians(60.0)  # largest kink of a valid map; the largest in 84 public maps is 45°
+EASE = 10.0  # length over which a gap is closed, as a multiple of the gap
+STEP_M = 1.0  # largest length of the straight elements that close a gap
 
 
 @dataclass(frozen=True)
 class Joint:
-    """The joint before a geometry element: how far it begins from where the one before it ends."""
+    """The joint of a geometry element with the one before it."""
 
-    s: float  # [m]
-    gap_m: float  # in plan or along s, whichever is larger
-    kink_rad: float  # between their headings, from 0 to pi
+    s: float  # s of the element [m]
+    gap_m: float  # distance from the end of the one before, in plan or along s, whichever is larger
+    kink_rad: float  # angle between both headings, from 0 to pi
 
 
 def order_geometry(road: ElementTree.Element) -> list[ElementTree.Element]:
-    """Return the geometry elements of a <road> in the order of s, without those that have no length.
+    """Sort the geometry elements of a <road> by s, without those that have no length.
 
-    The longest is among them in any case.
+    The longest one is kept in any case.
     """
     lengths = [(float(row.attrib["length"]), row) for row in road.iterfind("planView/geometry")]
     least = min(SHORTEST_M, max((length for length, _ in lengths), default=0.0))
@@ -183,7 +190,7 @@ def order_geometry(road: ElementTree.Element) -> list[ElementTree.Element]:
 
 
 def measure_joints(rows: list[ElementTree.Element]) -> list[Joint]:
-    """Return the joint before each geometry element, the first of which begins at s = 0 and has no kink."""
+    """Measure the joint before each geometry element; that of the first is its distance from s = 0, without a kink."""
     pieces = list_pieces(rows)
     out = [Joint(piece.s, abs(piece.s), 0.0) for piece in pieces[:1]]
     for before, after in pairwise(pieces):
@@ -196,10 +203,10 @@ def measure_joints(rows: list[ElementTree.Element]) -> list[Joint]:
 
 
 def close_gaps(road: ElementTree.Element) -> list[Joint]:
-    """Rewrite the plan view of a <road> in place without gaps of `NOTED_M` or more; return the joints to report.
+    """Close gaps of `NOTED_M` or more in the plan view of a <road>, in place; return the joints to report.
 
-    Each element begins where the file says, at its s. One that overlaps the next ends there, and the last metres before
-    a gap are shifted towards the next element, in proportion to s.
+    Every element keeps its start and its s. An element that overlaps the next one is cut there, and the last metres
+    before a gap are shifted towards the next element, in proportion to s.
     """
     rows = order_geometry(road)
     joints = [joint for joint in measure_joints(rows) if joint.gap_m >= NOTED_M or joint.kink_rad >= NOTED_RAD]
@@ -219,7 +226,7 @@ def close_gaps(road: ElementTree.Element) -> list[Joint]:
 
 
 def shorten_geometry(row: ElementTree.Element, length: float) -> None:
-    """Cut a geometry element at `length` [m], in place; up to there its shape stays."""
+    """Cut a geometry element at `length` [m], in place; its shape up to there stays the same."""
     whole = float(row.attrib["length"])
     spiral, cubic = row.find("spiral"), row.find("paramPoly3")
     if spiral is not None:
@@ -234,7 +241,7 @@ def shorten_geometry(row: ElementTree.Element, length: float) -> None:
 
 
 def _ease(before: ElementTree.Element, row: ElementTree.Element, room: float) -> list[ElementTree.Element]:
-    """Return elements that replace `before` over `room` [m] of s, and end where `row` begins."""
+    """Build elements that replace `before` over `room` [m] of s, and end where `row` begins."""
     (one, other), start = list_pieces([before, row]), float(before.attrib["s"])
     gap = other.at(np.zeros(1))[0, :2] - one.at(np.array([room]))[0, :2]
     over = min(EASE * max(float(np.hypot(*gap)), room - one.length), room)

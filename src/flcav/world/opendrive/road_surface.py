@@ -1,6 +1,7 @@
 """The surface of an OpenDRIVE road: elevation, superelevation, lateral shape and crossfall, and the borders of lanes.
 
-Sources: OpenDRIVE 1.8, 10.5 (elevation, superelevation, shape) and 11 (lanes); 1.4, 5.3.5 (crossfall).
+Sources: OpenDRIVE 1.8, 10.5 (elevation, superelevation, shape) and 11 (lanes); 1.4, 5.3.5 (crossfall). A place on a
+road is given by s [m] along its reference line and t [m] to the left of it.
 """
 
 import xml.etree.ElementTree as ElementTree
@@ -13,10 +14,10 @@ from flcav.world.opendrive.reference_line import ReferenceLine
 
 
 class Cubics:
-    """A piecewise cubic polynomial a + b d + c d^2 + d d^3, d from the start of each piece; 0 before the first."""
+    """A piecewise cubic polynomial, by the distance from the start of the piece; 0 before the first piece."""
 
     def __init__(self, rows: Iterable[ElementTree.Element], start: str = "s") -> None:
-        """Read the attributes `start` and a to d of each row."""
+        """Read the attribute `start` and the coefficients a to d of every row."""
         values = [[float(row.attrib[name]) for name in (start, *"abcd")] for row in rows]
         self._table = np.array(sorted(values, key=lambda row: row[0]), np.float64).reshape(-1, 5)
 
@@ -24,7 +25,7 @@ class Cubics:
         return bool(self._table[:, 1:].any())
 
     def at(self, s: Array) -> Array:
-        """Return the values (N,) at `s` (N,)."""
+        """Evaluate the polynomial at `s` (N,)."""
         if not len(self._table):
             return np.zeros(len(s))
         number = np.searchsorted(self._table[:, 0], s, side="right") - 1
@@ -71,7 +72,7 @@ class Road:
         return [*(section.s for section in self._sections), *(s for s, _ in self._shapes)]
 
     def point(self, s: Array, t: Array) -> Array:
-        """Return x, y, z (N, 3) [m] of the surface at `s` (N,) along the line and `t` (N,) to its left, in plan.
+        """Compute the points x, y, z (N, 3) [m] of the surface, in the map's frame, at `s` (N,) and `t` (N,) [m].
 
         A tilted cross-section is not shortened in plan: t is the horizontal distance.
         """
@@ -79,34 +80,34 @@ class Road:
         return np.stack((x - t * np.sin(heading), y + t * np.cos(heading), self.height(s, t)), axis=1)
 
     def height(self, s: Array, t: Array) -> Array:
-        """Return the height (N,) [m] of the surface."""
+        """Compute the height (N,) [m] of the surface at `s` (N,) and `t` (N,) [m]."""
         fall = np.where(t > 0, self._left_fall.at(s), self._right_fall.at(s))
         tilted = t * np.tan(self._superelevation.at(s)) - np.abs(t) * np.tan(fall)
         return self._elevation.at(s) + tilted + self._shape(s, t)
 
     def sections(self, s: Array) -> Iterator[tuple[Array, dict[int, Array]]]:
-        """Yield, for each lane section among `s` (N,), those s (K,), and lane id -> t (K,) [m] of its outer border.
+        """Split `s` (N,) [m] by lane section; yield the s (K,) of each and lane id -> t (K,) [m] of its outer border.
 
-        The border of 0 is the centre line.
+        Id 0 is the centre line.
         """
         starts = [section.s for section in self._sections]
         number = np.clip(np.searchsorted(starts, s + 1e-9, side="right") - 1, 0, None)
         for i in np.unique(number).tolist():
-            own = s[number == i]
-            yield own, self._sections[i].borders(own, self._offset.at(own))
+            inside = s[number == i]
+            yield inside, self._sections[i].borders(inside, self._offset.at(inside))
 
     def borders(self, s: float) -> dict[int, float]:
-        """Return lane id -> t [m] of its outer border at `s`; of 0 the centre line."""
-        ((_, found),) = self.sections(np.array([s]))
-        return {lane: float(t[0]) for lane, t in found.items()}
+        """Map lane id -> t [m] of its outer border at `s` [m]; id 0 is the centre line."""
+        ((_, by_lane),) = self.sections(np.array([s]))
+        return {lane: float(t[0]) for lane, t in by_lane.items()}
 
     def lane_centre(self, s: float, lane: int) -> float:
-        """Return t [m] of the middle of a lane at `s`; raises `KeyError` where there is no such lane."""
+        """Compute t [m] of the middle of a lane at `s` [m]; raises `KeyError` where there is no such lane."""
         borders = self.borders(s)
         return (borders[lane] + borders[lane - int(np.sign(lane))]) / 2
 
     def _shape(self, s: Array, t: Array) -> Array:
-        """Return the height (N,) of the lateral shape, linear in s between two of them."""
+        """Compute the height (N,) [m] of the lateral shapes, interpolated linearly in s between two of them."""
         if not self._shapes:
             return np.zeros(len(s))
         starts = np.array([start for start, _ in self._shapes])
@@ -136,7 +137,10 @@ class Section:
         }
 
     def borders(self, s: Array, offset: Array) -> dict[int, Array]:
-        """Return lane id -> t (K,) [m] of its outer border at `s` (K,); `offset` is t of the centre line, under 0."""
+        """Map lane id -> t (K,) [m] of its outer border at `s` (K,) [m].
+
+        `offset` (K,) is t of the centre line [m], which has the id 0.
+        """
         along = s - self.s
         out = {0: offset}
         for lane in sorted(self.kinds, key=abs):
@@ -149,7 +153,7 @@ class Section:
 
 
 def _is_cubic(row: ElementTree.Element) -> bool:
-    """Return whether a row has a finite s and coefficients."""
+    """Return whether the s and the coefficients of a row are finite numbers."""
     try:
         return bool(np.isfinite([float(row.get(name, "nan")) for name in ("s", *"abcd")]).all())
     except ValueError:

@@ -1,6 +1,6 @@
-"""Rules of the OpenDRIVE standard that an import relies on, each with its clause in ASAM OpenDRIVE 1.8.
+"""Check of a map against the rules of the OpenDRIVE standard that the import relies on (ASAM OpenDRIVE 1.8).
 
-A map that breaks one of them is refused; what else a map leaves out or gets wrong is mended (`mending`).
+A map that breaks one of them is refused with the rule's clause; other errors and omissions are mended (`mending`).
 """
 
 import math
@@ -21,33 +21,33 @@ from flcav.world.opendrive.reference_line import (
     order_geometry,
 )
 
-LINES, ROADS = "9.2", "10.1"  # clauses
+LINES, ROADS = "9.2", "10.1"  # clauses of the standard, as the constants of the next line
 ELEVATIONS, NUMBERS, LANES, WIDTHS, OFFSETS, JUNCTIONS = "10.5", "11.1", "11.3", "11.6", "11.4", "12.2"
-SHAPES: dict[str, tuple[str, ...]] = {  # children of <geometry> with their coefficients
+SHAPES: dict[str, tuple[str, ...]] = {  # child of <geometry> -> its coefficients
     "line": (),
     "arc": ("curvature",),
     "spiral": ("curvStart", "curvEnd"),
     "poly3": tuple("abcd"),
     "paramPoly3": (*(f"{name}U" for name in "abcd"), *(f"{name}V" for name in "abcd")),
 }
-POLYNOMIALS: dict[str, tuple[str, str]] = {  # elements that hold a cubic polynomial: clause, attribute of its start
+POLYNOMIALS: dict[str, tuple[str, str]] = {  # element with a cubic polynomial -> clause, attribute of its start
     "elevationProfile/elevation": (ELEVATIONS, "s"),
     "lateralProfile/superelevation": (ELEVATIONS, "s"),
     "lateralProfile/shape": (ELEVATIONS, "s"),
     "lanes/laneOffset": (OFFSETS, "s"),
 }
-FARTHEST_M = 1e7  # largest coordinate of a map: zones of UTM reach so far from their origin
-WIDEST_M = 100.0  # largest number of a lane's width
-EARLIEST_M = 1.0  # farthest that a road's first lane section begins from its start
-LONGEST_M = 1e6  # of all roads together
+FARTHEST_M = 1e7  # largest coordinate of a map; coordinates in a zone of UTM reach it
+WIDEST_M = 100.0  # largest width of a lane where a width or border begins
+EARLIEST_M = 1.0  # largest s of a road's first lane section
+LONGEST_M = 1e6  # largest total length of all roads
 
 
 class _Broken(ValueError):
-    """A rule that is broken: the sentence without the file's name."""
+    """A broken rule; the message is the sentence without the file's name."""
 
 
 def check_standard(root: ElementTree.Element, path: Path) -> None:
-    """Raise `InputError` for the first rule that the map below `root` breaks, with its clause."""
+    """Check the map below `root`; raises `InputError` with the clause for the first rule that it breaks."""
     try:
         _check(root)
     except _Broken as error:
@@ -87,13 +87,13 @@ def _check_reference_line(road: ElementTree.Element, name: str) -> None:
         raise _Broken(f"{name} has no <geometry> (OpenDRIVE 1.8, {LINES})")
     (length,) = _numbers(road, ("length",), name, ROADS)
     for row in rows:
-        _, x, y, _, own = _numbers(row, ("s", "x", "y", "hdg", "length"), name, LINES)
+        _, x, y, _, measured = _numbers(row, ("s", "x", "y", "hdg", "length"), name, LINES)
         shapes = [child for child in row if child.tag in SHAPES]
         if len(shapes) != 1:
             raise _Broken(f"{name}: a <geometry> needs one of {', '.join(SHAPES)} (OpenDRIVE 1.8, {LINES})")
         _numbers(shapes[0], SHAPES[shapes[0].tag], name, LINES)
-        if own < 0:
-            raise _Broken(f"{name}: a <geometry> has the length {own:g} m (OpenDRIVE 1.8, {LINES})")
+        if measured < 0:
+            raise _Broken(f"{name}: a <geometry> has the length {measured:g} m (OpenDRIVE 1.8, {LINES})")
         if max(abs(x), abs(y)) > FARTHEST_M:
             raise _Broken(f"{name} begins more than {FARTHEST_M / 1000:g} km from the origin")
     kept = order_geometry(road)
@@ -103,10 +103,10 @@ def _check_reference_line(road: ElementTree.Element, name: str) -> None:
     for piece, row in zip(list_pieces(kept), kept):
         if row.find("paramPoly3") is not None:
             with np.errstate(all="ignore"):  # numbers that overflow
-                own = piece.measure()
-            if not abs(own - piece.length) <= LENGTH_M + LENGTH_SHARE * piece.length:
+                measured = piece.measure()
+            if not abs(measured - piece.length) <= LENGTH_M + LENGTH_SHARE * piece.length:
                 at = f"{name}: its <paramPoly3> at s = {piece.s:.6g} m"
-                raise _Broken(f"{at} is {own:.4g} m long, and says {piece.length:.4g} m (OpenDRIVE 1.8, {LINES})")
+                raise _Broken(f"{at} is {measured:.4g} m long, and says {piece.length:.4g} m (OpenDRIVE 1.8, {LINES})")
     for joint in measure_joints(kept):
         at = f"{name}: its geometry at s = {joint.s:.6g} m"
         if not joint.gap_m <= WIDEST_GAP_M:
@@ -148,13 +148,13 @@ def _lane_number(lane: ElementTree.Element, name: str) -> int:
 
 
 def _side_lanes(section: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """Yield the lanes left and right of the centre lane."""
+    """Yield the lanes on the left and right of the centre lane."""
     for side in ("left", "right"):
         yield from section.iterfind(f"{side}/lane")
 
 
 def _numbers(row: ElementTree.Element, names: tuple[str, ...], where: str, clause: str) -> list[float]:
-    """Return attributes as finite numbers; raises `_Broken` for others."""
+    """Read attributes as finite numbers; raises `_Broken` for any other text."""
     out = []
     for name in names:
         text = row.get(name)

@@ -17,9 +17,11 @@ from flcav.world.opendrive.document import OPEN_ROADS, Document, RoadType
 
 FAR_M = 5000.0  # a map that reaches farther than this from its origin is moved there
 SIDEWALK_M = 2.0  # width of an added sidewalk
-PARKING_M = (1.9, 5.0)  # widths of a shoulder beside a town street that becomes a parking lane
+PARKING_M = (1.9, 5.0)  # widths of a shoulder along a town street that becomes a parking lane
 SHORT_M = 60.0  # edges shorter than this are too short to change lanes
-ARTERIAL = 16.0  # [m/s] from this limit on, or with several driving lanes a direction, a street is an arterial
+ARTERIAL = (
+    16.0  # speed limit [m/s] from which a street is an arterial; one with several driving lanes per direction is, too
+)
 WALKED = ("sidewalk", "walking")  # types of lanes for pedestrians in OpenDRIVE
 SHARED = ("allow", "disallow", "width", "speed")  # attributes that netconvert writes at the edge for all its lanes
 PRIORITY = {"arterial": "3", "open": "3", "street": "2"}  # SUMO's, by street type
@@ -36,7 +38,7 @@ ALLOWED = {  # attributes of a SUMO lane, by kind
 class MapChanges:
     """The changes made to a map."""
 
-    offset_m: tuple[float, float]  # town = map + offset
+    offset_m: tuple[float, float]  # translation x, y from map to town coordinates [m]
     sidewalks_added: bool
 
 
@@ -50,12 +52,15 @@ class _Lane:
 
 
 def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChanges:
-    """Rewrite the plain files beside `prefix` in place; raises `InputError` naming `origin` without a driving lane."""
+    """Rewrite the plain files named `prefix` in place, as a town's streets; return the changes.
+
+    Raises `InputError`, which names the map `origin`, where no road has a driving lane.
+    """
     nodes, edges, connections = (ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con"))
     rows = edges.getroot().findall("edge")
     _write_widths(rows, read_made_net(Path(f"{prefix}.net.xml"), origin))
     add = not any(lane.get("type") in WALKED for row in rows for lane in _plain_lanes(row))
-    kept: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
+    index_of: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
     added = False
     for row in rows:
         road = _road(row.attrib["id"], document)
@@ -65,14 +70,14 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
             continue
         added |= any(lane.before is None for lane in lanes)
         _write_edge(row, lanes, road)
-        kept[row.attrib["id"]] = {
+        index_of[row.attrib["id"]] = {
             lane.before: i
             for i, lane in enumerate(lanes)
             if lane.before is not None and lane.kind in ("driving", "bicycle")
         }
-    if not kept:
+    if not index_of:
         raise InputError(f"{origin}: has no road with a lane for driving")
-    _connect(connections.getroot(), kept)
+    _connect(connections.getroot(), index_of)
     places = {row.attrib["id"]: f"{row.attrib['x']},{row.attrib['y']}" for row in nodes.getroot().findall("node")}
     lengths = {row.attrib["id"]: _length(row, places) for row in edges.getroot().findall("edge")}
     _open_short_lanes(connections.getroot(), lengths)
@@ -84,7 +89,7 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
 
 
 def read_made_net(path: Path, origin: Path) -> RoadNet:
-    """Return a net that netconvert made of the map `origin`; raises `InputError` naming the map where it is none."""
+    """Return the road net that netconvert made of the map `origin`. Raises `InputError`, naming the map, if invalid."""
     try:
         return read_net(path)
     except InputError as error:
@@ -92,7 +97,7 @@ def read_made_net(path: Path, origin: Path) -> RoadNet:
 
 
 def _write_widths(rows: list[ElementTree.Element], net: RoadNet) -> None:
-    """Write each lane's width, read from the net, to its row: netconvert's plain edges leave out shared widths."""
+    """Write the lane widths of the net to the edges' rows, since netconvert's plain edges leave out shared widths."""
     width = {lane.id: lane.width for edge in net.edges.values() for lane in edge.lanes}
     for row in rows:
         lanes = _plain_lanes(row)
@@ -104,9 +109,9 @@ def _write_widths(rows: list[ElementTree.Element], net: RoadNet) -> None:
 
 
 def _road(edge: str, document: Document) -> RoadType:
-    """Return the road of an edge, which netconvert names by the road's id with a sign before and a section behind.
+    """Return the road of an edge, whose id in netconvert is the road's with a sign in front and a section behind.
 
-    A road that ends where it begins is cut: "1#0", "1#1".
+    A closed road is cut into "1#0", "1#1".
     """
     name = edge.removeprefix("-").partition("#")[0]
     while name not in document.roads and "." in name:
@@ -115,15 +120,15 @@ def _road(edge: str, document: Document) -> RoadType:
 
 
 def _lanes(row: ElementTree.Element, road: RoadType, add_sidewalk: bool) -> list[_Lane]:
-    """Return the lanes of an edge in the town, from the kerb to the middle; those beyond the sidewalk are left out."""
-    found = _plain_lanes(row)
-    kinds = [_kind(lane) for lane in found]
+    """Return the town's lanes of an edge, from kerb to centre line; those beyond the sidewalk are left out."""
+    plain = _plain_lanes(row)
+    kinds = [_kind(lane) for lane in plain]
     town = road.kind not in OPEN_ROADS
     first_driven = kinds.index("driving") if "driving" in kinds else 0
     walked = max((i for i in range(first_driven) if kinds[i] == "sidewalk"), default=None)
     out = [_Lane("sidewalk", SIDEWALK_M, None)] if walked is None and add_sidewalk and town else []
-    for i in range(walked or 0, len(found)):
-        width, kind = float(found[i].get("width", "3.2")), kinds[i]
+    for i in range(walked or 0, len(plain)):
+        width, kind = float(plain[i].get("width", "3.2")), kinds[i]
         if kind == "sidewalk" and i != walked:
             kind = "shoulder"
         if kind == "shoulder" and i < first_driven and town and PARKING_M[0] <= width <= PARKING_M[1]:
@@ -133,13 +138,13 @@ def _lanes(row: ElementTree.Element, road: RoadType, add_sidewalk: bool) -> list
 
 
 def _plain_lanes(row: ElementTree.Element) -> list[dict[str, str]]:
-    """Return the attributes of an edge's lanes by index, those that netconvert writes at the edge included."""
-    own = {int(lane.attrib["index"]): lane.attrib for lane in row.iterfind("lane")}
+    """Return the attributes of an edge's lanes by index, including those that netconvert writes at the edge."""
+    by_index = {int(lane.attrib["index"]): lane.attrib for lane in row.iterfind("lane")}
     shared = {name: row.attrib[name] for name in SHARED if name in row.attrib}
-    count = int(row.get("numLanes", len(own) or 1))
+    count = int(row.get("numLanes", len(by_index) or 1))
     types = row.get("type", "").split("|")
-    each = types if len(types) == count else types[:1] * count
-    return [{"type": each[i], **shared, **own.get(i, {})} for i in range(count)]
+    lane_types = types if len(types) == count else types[:1] * count
+    return [{"type": lane_types[i], **shared, **by_index.get(i, {})} for i in range(count)]
 
 
 def _kind(lane: dict[str, str]) -> str:
@@ -173,7 +178,7 @@ def _write_edge(row: ElementTree.Element, lanes: list[_Lane], road: RoadType) ->
 
 
 def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None:
-    """Rewrite the connections in place with the town's lane indices; those of lanes not `kept` are removed."""
+    """Rewrite the connections in place with the town's lane indices; connections of lanes not `kept` are removed."""
     for row in list(root):
         if row.tag != "connection":
             continue
@@ -190,10 +195,10 @@ def _connect(root: ElementTree.Element, kept: dict[str, dict[int, int]]) -> None
 
 
 def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> None:
-    """Connect each lane of a short edge to all edges that any lane of it leads to.
+    """Connect every lane of a short edge to all edges that any of its lanes leads to.
 
-    Without room to change lanes, two vehicles that each need the other's lane would block each other for ever.
-    `length` is that of each edge [m].
+    Without room to change lanes, two vehicles that need to swap lanes would deadlock. `length` maps edges to their
+    lengths [m].
     """
     ways: dict[str, dict[str, dict[int, int]]] = {}  # edge -> next edge -> lane -> its lane
     for row in root.findall("connection"):
@@ -212,14 +217,14 @@ def _open_short_lanes(root: ElementTree.Element, length: dict[str, float]) -> No
 
 
 def _length(row: ElementTree.Element, places: dict[str, str]) -> float:
-    """Return the length of an edge [m]; one without a shape is straight between its nodes, at `places`."""
+    """Return the length of an edge [m]; an edge without a shape is straight between its nodes at `places`."""
     shape = row.get("shape", f"{places[row.attrib['from']]} {places[row.attrib['to']]}")
     points = np.array([point.split(",")[:2] for point in shape.split()], dtype=np.float64)
     return float(np.hypot(*np.diff(points, axis=0).T).sum())
 
 
 def _rule(root: ElementTree.Element, edges: Iterable[ElementTree.Element], document: Document) -> None:
-    """Set the type of each node: traffic lights only where three or more streets meet, stop signs as in the map."""
+    """Set the types of the nodes: traffic lights only where three or more streets meet, stop signs as in the map."""
     neighbours: dict[str, set[str]] = {}
     for edge in edges:
         neighbours.setdefault(edge.attrib["from"], set()).add(edge.attrib["to"])
@@ -235,7 +240,7 @@ def _rule(root: ElementTree.Element, edges: Iterable[ElementTree.Element], docum
 def _move(
     nodes: ElementTree.Element, edges: ElementTree.Element, connections: ElementTree.Element
 ) -> tuple[float, float]:
-    """Move a map that reaches beyond `FAR_M` to the origin, in place; return the offset x, y [m]."""
+    """Translate a map that reaches beyond `FAR_M` to the origin, in place; return the offset x, y [m]."""
     rows = nodes.findall("node")
     at = np.array([(float(row.attrib["x"]), float(row.attrib["y"])) for row in rows])
     if np.abs(at).max() <= FAR_M:

@@ -1,10 +1,7 @@
 """Ray casting with Embree 4, in a two-level hierarchy: moving an instance sets its transform and rebuilds no mesh.
 
 There is one Embree device per process. It builds the bounding volume hierarchies on one thread, so that they are the
-same from run to run.
-
-Loader of the Embree 4 C library in the embreex wheel, with typed entry points through ctypes.
-
+same in every run. The C library comes from the embreex wheel, and is called through ctypes.
 API: https://github.com/RenderKit/embree/blob/v4.4.0/README.md (chapter "Embree API").
 """
 
@@ -73,7 +70,7 @@ class QueryArguments(ctypes.Structure):
 
 @lru_cache(maxsize=1)
 def embree_library() -> ctypes.CDLL:
-    """Return the Embree library, loaded once per process; raises `OSError` where it is not installed."""
+    """Return the Embree library, loaded once per process. Raises `OSError` where it is not installed."""
     spec = importlib.util.find_spec("embreex")
     if spec is None or spec.origin is None:
         raise OSError(
@@ -103,7 +100,7 @@ _ARGUMENTS = QueryArguments(flags=QUERY_COHERENT, feature_mask=0xFFFFFFFF)
 
 
 class Hierarchy:
-    """A bounding volume hierarchy of Embree that rays are traced through: a scene in Embree's terms."""
+    """A bounding volume hierarchy that rays are traced through: a scene in Embree's terms."""
 
     handle: int
 
@@ -118,9 +115,9 @@ class Hierarchy:
     ) -> Hits:
         """Return the first hit of each ray beyond `near_m` (N,) [m], by default 0, and before `far_m` [m].
 
-        All rays start at the origin of one frame: `target_from_rays` (4, 4) is its pose in the hierarchy's frame,
-        `directions` (N, 3) are unit vectors in it. Each of `threads` threads traces whole packets. Raises `ValueError`
-        where `near_m` is not of the rays' number.
+        All rays start at the origin of one frame, e.g. a sensor's: `target_from_rays` (4, 4) is its pose in the
+        hierarchy's frame, `directions` (N, 3) are unit vectors in it. The `threads` threads trace whole packets. Raises
+        `ValueError` where `near_m` has another length than `directions`.
         """
         rays, near, hits = _buffers(directions, near_m)
         origin = target_from_rays[:3, 3].astype(np.float32)
@@ -135,7 +132,7 @@ class Hierarchy:
 
 
 class Solid(Hierarchy):
-    """A triangle mesh with its bounding volume hierarchy, in the mesh's own frame."""
+    """A triangle mesh with its bounding volume hierarchy, in the mesh frame: the lower level."""
 
     def __init__(self, vertices: Array32, faces: Ints32) -> None:
         """Build the hierarchy of vertices (V, 3) [m] and faces (F, 3).
@@ -168,7 +165,7 @@ class Assembly(Hierarchy):
     """Instances of solids, placed by rigid transforms: the upper level of the hierarchy."""
 
     def __init__(self, solids: Sequence[Solid]) -> None:
-        """Make one instance of each of `solids`, none placed yet; instance i is of solid i."""
+        """Create an instance of every solid, not placed yet; instance i is of solid i."""
         api, device = embree_library(), _device()
         self._solids = tuple(solids)  # kept alive as long as their instances
         self.handle = api.rtcNewScene(device)
@@ -186,7 +183,7 @@ class Assembly(Hierarchy):
         weakref.finalize(self, api.rtcReleaseScene, self.handle)
 
     def place(self, instance: int, target_from_body: Array | None) -> None:
-        """Place an instance by its pose (4, 4), with a translation in metres, or remove it (None), as of `commit`."""
+        """Place an instance by its pose (4, 4) [m], or remove it (None); this takes effect with `commit`."""
         api, geometry = embree_library(), self._instances[instance]
         if target_from_body is None:
             api.rtcDisableGeometry(geometry)
@@ -197,19 +194,19 @@ class Assembly(Hierarchy):
         api.rtcCommitGeometry(geometry)
 
     def commit(self) -> None:
-        """Rebuild the upper level from the placed instances; raises `OSError` where Embree fails.
+        """Rebuild the upper level from the placed instances.
 
-        Not to be called while another thread traces.
+        It must not be called while another thread traces. Raises `OSError` where Embree fails.
         """
         embree_library().rtcCommitScene(self.handle)
         _check("placing meshes")
 
     def find_occluded(self, origins: Array32, directions: Array32, far_m: Array32, *, threads: int = 1) -> Mask:
-        """Return (N,) whether each ray is occluded before its end `far_m` (N,) [m]; never where that is not positive.
+        """Return (N,) whether rays are occluded before their ends `far_m` (N,) [m]; never where that is not positive.
 
         `origins` (N, 3) [m] and unit `directions` (N, 3), or (1, 3) for all, are in the assembly's frame.
         """
-        start, towards, far = (np.ascontiguousarray(each, np.float32) for each in (origins, directions, far_m))
+        start, towards, far = (np.ascontiguousarray(array, np.float32) for array in (origins, directions, far_m))
         out = np.empty(len(far), np.bool_)
         cast = np.flatnonzero(far > 0)
         arguments = ctypes.addressof(_ARGUMENTS)
@@ -219,7 +216,9 @@ class Assembly(Hierarchy):
             aimed = towards if len(towards) == 1 else towards[at]
             occlude_packets(_address("rtcOccluded16"), self.handle, arguments, start[at], aimed, far[at], out[at])
 
-        share_among_threads(part, len(cast), threads, whole=LANES)  # of rays that are cast: any number, same packets
+        share_among_threads(
+            part, len(cast), threads, whole=LANES
+        )  # counted by rays that are cast: same packets for any number
         return out
 
 
@@ -232,7 +231,7 @@ def trace_each(
     near_m: Array32 | None = None,
     far_m: float = np.inf,
 ) -> Hits:
-    """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group's number.
+    """Return the first hits of K groups of rays, group k with `solids[k]` alone; `instance` is the group index.
 
     Group k is `directions[ends[k - 1] : ends[k]]`: unit vectors in a frame whose pose in its solid's frame is
     `solid_from_rays[k]` (4, 4). `near_m` and `far_m` are as in `Assembly.trace`.
@@ -254,12 +253,12 @@ def trace_each(
 
 
 def _buffers(directions: Array32, near_m: Array32 | None) -> tuple[Array32, Array32, Hits]:
-    """Return directions (N, 3) and near distances (N,) or (1,) as Embree takes them, and unset hits.
+    """Return contiguous directions (N, 3) and near distances (N,) or (1,) in single precision, and uninitialised hits.
 
-    Raises `ValueError` where `near_m` is not of the rays' number.
+    Raises `ValueError` where `near_m` has another length than `directions`.
     """
     rays = np.ascontiguousarray(directions, np.float32).view()
-    rays.flags.writeable = False  # as some are: loops are compiled once for all
+    rays.flags.writeable = False  # as some are: Numba compiles the loops for one type only
     near = np.zeros(1, np.float32) if near_m is None else np.ascontiguousarray(near_m, np.float32)
     if near_m is not None and len(near) != len(rays):
         raise ValueError(f"near_m has {len(near)} values for {len(rays)} rays")
@@ -269,7 +268,7 @@ def _buffers(directions: Array32, near_m: Array32 | None) -> tuple[Array32, Arra
 
 @lru_cache(maxsize=1)
 def _device() -> int:
-    """Return the Embree device of this process; raises `OSError` where it cannot start."""
+    """Return the Embree device of this process. Raises `OSError` where it cannot start."""
     device = embree_library().rtcNewDevice(b"threads=1")
     if not device:
         raise OSError("Embree could not start on this machine")
@@ -278,12 +277,12 @@ def _device() -> int:
 
 @lru_cache(maxsize=2)
 def _address(function: str) -> int:
-    """Return the address of a function of the Embree library."""
+    """Return the address of an Embree function."""
     return ctypes.cast(getattr(embree_library(), function), ctypes.c_void_p).value or 0
 
 
 def _check(doing: str) -> None:
-    """Raise `OSError` where the device reports an error since the last check."""
+    """Raise `OSError` if the device has reported an error since the last check."""
     code = embree_library().rtcGetDeviceError(_device())
     if code:
         raise OSError(f"Embree failed with error {code} while {doing}")
@@ -291,9 +290,9 @@ def _check(doing: str) -> None:
 
 @lru_cache(maxsize=1)
 def check_embree() -> None:
-    """Raise `OSError` where Embree is missing, or known rays miss a known mesh, alone or as a moved instance.
+    """Check Embree once per process by tracing known rays to a known mesh, alone and as a moved instance.
 
-    It is done once per process.
+    Raises `OSError` where Embree is missing or a distance is wrong.
     """
     vertices = np.array([[2, -1, -1], [2, 1, -1], [2, 0, 1]], np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
@@ -305,6 +304,6 @@ def check_embree() -> None:
     alone = solid.trace(np.eye(4), forward)
     placed = assembly.trace(pose(10.0, 0.0, 0.0, yaw=np.pi / 2), forward)
     missed = assembly.trace(np.eye(4), forward)
-    found = [float(alone.distance[0]), float(placed.distance[0]), int(placed.instance[0]), int(missed.instance[0])]
-    if not np.allclose(found, [2.0, 7.0, 1, -1], atol=1e-5):
-        raise OSError(f"Embree traced a known scene wrongly ({found}): flcav needs embreex 4.4")
+    measured = [float(alone.distance[0]), float(placed.distance[0]), int(placed.instance[0]), int(missed.instance[0])]
+    if not np.allclose(measured, [2.0, 7.0, 1, -1], atol=1e-5):
+        raise OSError(f"Embree traced a known scene wrongly ({measured}): flcav needs embreex 4.4")

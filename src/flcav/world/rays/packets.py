@@ -1,4 +1,4 @@
-"""First hits of rays, and compiled loops over ray packets of 16 for Embree's `rtcIntersect16` and `rtcOccluded16`.
+"""Compiled loops over packets of 16 rays for Embree's `rtcIntersect16` and `rtcOccluded16`, and records of hits.
 
 Embree's function is called by its address, an integer argument, so that Numba can cache the compiled code on disk; a
 kernel that closes over a ctypes function cannot be cached.
@@ -56,12 +56,11 @@ def _allocate_packet():
 def trace_packets(
     intersect, scene, arguments, origin, rotation, directions, near, far, first_ray, last_ray, distance, instance, face
 ):
-    """Write the first hit of each ray to `distance`, `instance` and `face`, (N,) each.
+    """Write the first hits of the rays from `first_ray` to `last_ray`, exclusive, to `distance`, `instance` and `face`.
 
-    The rays are those from `first_ray` up to, not including, `last_ray`.
-    `intersect`, `scene` and `arguments` are addresses. `origin` (3,) and `rotation` (3, 3) are the pose of the rays'
-    frame in the scene, `directions` (N, 3) unit vectors in it. `near` is (N,), or (1,) for all; `far` is a scalar [m].
-    Distance is inf, and instance and face are -1, where nothing is hit.
+    `intersect`, `scene` and `arguments` are addresses. `origin` (3,) [m] and `rotation` (3, 3) are the pose of the ray
+    frame in the scene, `directions` (N, 3) unit vectors in it. `near` is (N,), or (1,) for all, `far` a scalar [m]. The
+    results are (N,); where nothing is hit, the distance is inf, and instance and face are -1.
     """
     packet, packet_words, valid = _allocate_packet()
     near_step = 1 if len(near) > 1 else 0
@@ -101,10 +100,10 @@ def trace_packets(
 def trace_groups(
     intersect, scenes, arguments, origins, rotations, directions, near, far, ends, distance, instance, face
 ):
-    """Write the first hit of each ray of K groups, group k with `scenes[k]` alone; `instance` is the group's number.
+    """Write the first hits of K groups of rays, group k with `scenes[k]` alone; `instance` is the group index.
 
-    Group k is the rays from `ends[k - 1]` to `ends[k]`; `origins` (K, 3) and `rotations` (K, 3, 3) are the poses of the
-    groups' frames. All else is as in `trace_packets`.
+    Group k has the rays from `ends[k - 1]` to `ends[k]`; `origins` (K, 3) [m] and `rotations` (K, 3, 3) are the poses
+    of the groups' frames. The other arguments are those of `trace_packets`.
     """
     first = 0
     for group in range(len(scenes)):
@@ -121,7 +120,7 @@ def trace_groups(
 
 @compiled
 def occlude_packets(occluded, scene, arguments, origins, directions, far, blocked):
-    """Write to `blocked` (N,) whether each ray is occluded before its end `far` (N,) [m]; never where `far` <= 0.
+    """Write to `blocked` (N,) whether rays are occluded before their ends `far` (N,) [m]; never where `far` <= 0.
 
     `occluded`, `scene` and `arguments` are addresses. `origins` (N, 3) and unit `directions` (N, 3), or (1, 3) for all,
     are in the scene's frame.
@@ -153,8 +152,8 @@ MISS = -1  # instance and face of a ray that hits nothing
 
 
 class Hits(NamedTuple):
-    """The first hit of each of N rays."""
+    """The first hits of N rays."""
 
     distance: Array32  # (N,) range along the unit direction [m]; inf where nothing is hit
-    instance: Ints32  # (N,) number of the instance; 0 for a solid alone; MISS where nothing is hit
-    face: Ints32  # (N,) row of that solid's faces; MISS where nothing is hit
+    instance: Ints32  # (N,) index of the instance; 0 for a solid alone; MISS where nothing is hit
+    face: Ints32  # (N,) face index in that solid; MISS where nothing is hit

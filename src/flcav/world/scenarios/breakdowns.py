@@ -1,4 +1,4 @@
-"""Scripts of breakdowns: a vehicle that stalls, and a rear-end crash of two."""
+"""Scripts of breakdowns: a stalled vehicle, and a rear-end crash."""
 
 import math
 from collections.abc import Generator
@@ -7,24 +7,24 @@ from typing import NamedTuple
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Stage
 
-AHEAD_M = (6.0, 60.0)  # gap from the vehicle under test to one that stalls
-STREETS = 3  # which is on one of the next so many edges of its route, the present one included
-STANDS_BEFORE_M = 15.0  # least distance from a stalling vehicle to the end of its lane
-MOVES = 3.0  # [m/s] least speed of a vehicle that stalls
+AHEAD_M = (6.0, 60.0)  # limits of the gap from the ego to a stalling vehicle
+STREETS = 3  # number of edges of the ego's route, with the present one, on which the vehicle may be
+STANDS_BEFORE_M = 15.0  # least distance of a stalling vehicle from the end of its lane
+MOVES = 3.0  # least speed of a stalling vehicle [m/s]
 ROLLS_OUT_S = 2.5  # time in which it comes to a stop
-SEEN_M = 70.0  # largest distance of a crash from the vehicle under test
-APART_M = (4.0, 25.0)  # gap between the two vehicles before a crash
+SEEN_M = 70.0  # largest distance of a crash from the ego
+APART_M = (4.0, 25.0)  # limits of the gap between the two vehicles before a crash
 ROOM_M = 50.0  # least length of lane ahead of the rear vehicle of a crash; half of it for the front one
-FAST = 5.0  # [m/s] least speed of both
+FAST = 5.0  # least speed of both vehicles [m/s]
 BRAKES_MPS2 = 6.5  # deceleration of the front vehicle
-OVERLAP_M = 0.05  # by which the two overlap after the crash
+OVERLAP_M = 0.05  # overlap of the two vehicles after the crash
 TWIST = (math.radians(5.0), math.radians(-3.0))  # yaw by which the crash turns the rear and the front vehicle
 TWIST_S = 0.4  # time in which it turns them
 
 
 def cast_stalled(stage: Stage, scenario: Scenario) -> str | None:
-    """Return the nearest moving vehicle ahead of a vehicle under test, in its lane or on its next edges."""
-    found: list[tuple[float, str]] = []
+    """Return the nearest moving vehicle ahead of an ego, in its lane or on its next edges; None if there is none."""
+    candidates: list[tuple[float, str]] = []
     for ego in stage.egos(scenario):
         spot, way = stage.spot(ego), stage.list_remaining_edges(ego)[1:STREETS]
         for name in stage.sumo.vehicle.getIDList():
@@ -36,12 +36,12 @@ def cast_stalled(stage: Stage, scenario: Scenario) -> str | None:
             gap_m = apart_m - stage.sumo.vehicle.getLength(name)
             on_way = in_lane or (other.edge.id in way and other.lane.kind == "driving")
             if on_way and AHEAD_M[0] <= gap_m <= AHEAD_M[1] and stage.state(name)[3] > MOVES:
-                found.append((gap_m, name))
-    return min(found)[1] if found else None
+                candidates.append((gap_m, name))
+    return min(candidates)[1] if candidates else None
 
 
 def stall(stage: Stage, scenario: Scenario, victim: str) -> Generator[None, None, None]:
-    """Slow the victim to a stop; let it drive on after `scenario.lasts_s`, if given."""
+    """Slow the victim to a stop; let it continue after `scenario.lasts_s`, if given."""
     stage.take(victim)
     stage.sumo.vehicle.slowDown(victim, 0.0, ROLLS_OUT_S)
     for _ in range(round(ROLLS_OUT_S / STEP_S)):
@@ -61,7 +61,7 @@ class CrashPair(NamedTuple):
 
 
 def cast_crash(stage: Stage, scenario: Scenario) -> CrashPair | None:
-    """Return two moving motor vehicles in one lane, one behind the other, near a vehicle under test."""
+    """Return two moving motor vehicles, one behind the other in one lane, near an ego; None if there are none."""
     egos = stage.egos(scenario)
     for behind in stage.sumo.vehicle.getIDList():
         near = any(math.dist(stage.state(behind)[:2], stage.state(ego)[:2]) <= SEEN_M for ego in egos)
@@ -78,7 +78,7 @@ def cast_crash(stage: Stage, scenario: Scenario) -> CrashPair | None:
 
 
 def crash(stage: Stage, scenario: Scenario, pair: CrashPair) -> Generator[None, None, None]:
-    """Let the front vehicle brake sharply and the rear one not react; after the impact both stand, slightly turned."""
+    """Brake the front vehicle sharply without reaction of the rear one; after the impact both stop, slightly turned."""
     vehicle = stage.sumo.vehicle
     for name in pair:
         stage.take(name)

@@ -1,4 +1,4 @@
-"""The director of scripted scenarios: casts and advances the script of each along with SUMO."""
+"""The director of scripted scenarios: it casts them, and advances their scripts along with SUMO."""
 
 from collections.abc import Callable, Generator
 from pathlib import Path
@@ -22,7 +22,7 @@ SCRIPTS: dict[Kind, tuple[Cast, Act]] = {
     "crash": (breakdowns.cast_crash, breakdowns.crash),
 }
 
-ALONE_S = 15.0  # for so long after a scenario begins, its vehicle under test is not free: see `Stage.free_egos`
+ALONE_S = 15.0  # time after the start of a scenario during which its ego is not free: see `Stage.free_egos`
 LOOKS_AGAIN = 3  # steps between two attempts to cast a scenario
 
 
@@ -32,16 +32,16 @@ class Director:
     def __init__(self, sumo: Any, net: Path, scenarios: list[Scenario]) -> None:
         """Start at the beginning of a run; `sumo` is the libsumo module, `net` the net file."""
         self.stage = Stage(sumo, read_net(net))
-        self.events: list[Event] = []  # of scenarios that have begun, in that order
-        self._busy: set[str] = set()  # actors of a scenario, which take part in no other
+        self.events: list[Event] = []  # of scenarios that have begun, in order
+        self._busy: set[str] = set()  # actors of a scenario, which do not take part in another
         self._scenarios = scenarios
         self._scripts: list[Generator[None, None, None] | None] = [
             self._play(number, scenario) for number, scenario in enumerate(scenarios)
         ]
-        self._needed: dict[int, set[str]] = {}  # number of a scenario under way -> vehicles that it needs
+        self._needed: dict[int, set[str]] = {}  # number of a running scenario -> vehicles that it needs
 
     def direct(self) -> None:
-        """Advance every script by the step that SUMO just made; end those that need a vehicle which has left."""
+        """Advance all scripts by the step that SUMO has just made; end those that need a vehicle that has left."""
         self.stage.look()
         there = set(self.stage.sumo.vehicle.getIDList())
         for i, (scenario, script) in enumerate(zip(self._scenarios, self._scripts)):
@@ -55,7 +55,7 @@ class Director:
         self.stage.react(careless=self._busy)
 
     def _play(self, number: int, scenario: Scenario) -> Generator[None, None, None]:
-        """Try to cast a scenario every `LOOKS_AGAIN` steps, then note its event and run its script."""
+        """Try to cast a scenario every `LOOKS_AGAIN` steps, then record its event and run its script."""
         cast, act = SCRIPTS[scenario.kind]
         while (roles := cast(self.stage, scenario)) is None or self._busy & set(list_actors(roles)):
             for _ in range(LOOKS_AGAIN):
@@ -74,7 +74,7 @@ class Director:
         yield from playing
 
     def props(self, step: int) -> list[tuple[str, str, State]]:
-        """Return name, vehicle type and state of every prop that is present at a step."""
+        """Return names, vehicle types and states of the props that are present at a step."""
         return [(name, kind, states[step]) for name, (kind, states) in self.stage.props.items() if step in states]
 
 

@@ -1,4 +1,4 @@
-"""Scripts of drivers' manoeuvres: cutting in, and running a red light."""
+"""Scripts of manoeuvres: cutting in, and running a red light."""
 
 import math
 from collections.abc import Generator
@@ -10,23 +10,23 @@ from flcav.world.scenarios.stage import STEP_S, Spot, Stage
 from flcav.world.shapes import SHAPES, Shape
 
 CLOSE_M = 7.0  # largest gap between the bumpers at a cut-in
-NARROW_M = 1.5  # and least gap
-NEXT_M = (-6.0, 16.0)  # gap ahead of the ego to a vehicle of the next lane that may cut in
+NARROW_M = 1.5  # least gap between the bumpers at a cut-in
+NEXT_M = (-6.0, 16.0)  # limits of the gap from the ego to a vehicle on the next lane that may cut in
 FALLS_BACK_S = 5.0  # longest time in which that vehicle adjusts its gap
 MOVES_OVER_S = 2.2  # duration of the lane change
-FAST = 4.0  # [m/s] least speed of the ego, of the vehicle of the next lane and of a moving runner
-TOO_FAST = 15.0  # [m/s] above this, the ego could not brake for a car from the kerb
+FAST = 4.0  # least speed of the ego, of the vehicle on the next lane and of a moving runner [m/s]
+TOO_FAST = 15.0  # speed above which the ego could not brake for a car from the kerb [m/s]
 ROOM_M = 45.0  # least length of lane ahead for a car from the kerb
-NEXT_ROOM_M = 30.0  # and for one from the next lane
-KERB_GAP_M = 0.25  # between a standing vehicle and the lane
-CLEAR_M = 2.0  # no vehicle has been nearer than this to where the car from the kerb stands
+NEXT_ROOM_M = 30.0  # least length of lane ahead for a car from the next lane
+KERB_GAP_M = 0.25  # gap between a standing vehicle and the lane
+CLEAR_M = 2.0  # radius around the place of the car from the kerb in which no vehicle has been
 DEFAULT_CAR = "car.hatchback"
 LIGHT_M = (6.0, 45.0)  # distance of a moving runner from the stop line
-SEEN_M = 70.0  # largest distance of a runner from the vehicle under test
-IMPATIENT_S = 8.0  # a waiting runner has stood for so long
-RUNS_AT = 9.0  # [m/s] least speed over the stop line
-TURN = 6  # index of the direction in SUMO's links; vehicles that turn right are no runners
-IGNORES_LIGHTS = 7  # SUMO's speed mode: safe gap and physical limits, no traffic light, no right of way
+SEEN_M = 70.0  # largest distance of a runner from the ego
+IMPATIENT_S = 8.0  # least waiting time of a waiting runner
+RUNS_AT = 9.0  # least speed over the stop line [m/s]
+TURN = 6  # index of the direction in SUMO's links; vehicles that turn right do not run the light
+IGNORES_LIGHTS = 7  # SUMO's speed mode: safe gap and physical limits, but no traffic light and no right of way
 NORMAL = 31  # SUMO's default speed mode
 
 
@@ -34,12 +34,12 @@ class CutIn(NamedTuple):
     """The roles of a cut-in."""
 
     ego: str  # the vehicle under test
-    spot: Spot  # of the ego at the casting
-    neighbour: str | None  # vehicle of the next lane that cuts in; None: a new car pulls out from the kerb
+    spot: Spot  # place of the ego at the casting
+    neighbour: str | None  # vehicle on the next lane that cuts in; None: a new car pulls out from the kerb
 
 
 def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
-    """Return a vehicle under test with a free lane ahead, and a vehicle on the next lane or free space at the kerb."""
+    """Return an ego with a free lane ahead, and a vehicle on the next lane or free space at the kerb, if any."""
     for ego in stage.free_egos(scenario):
         spot = stage.spot(ego)
         if not spot or stage.state(ego)[3] < FAST or spot.left < NEXT_ROOM_M or stage.find_leader(ego, 15.0):
@@ -57,11 +57,12 @@ def cast_cut_in(stage: Stage, scenario: Scenario) -> CutIn | None:
 
 
 def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
-    """Change into the lane of the vehicle under test, close ahead of it and a little slower than it."""
+    """Change into the ego's lane, close ahead of the ego and a little slower."""
     if roles.neighbour is None:
         yield from _pull_out(stage, scenario, roles)
         return
-    vehicle, name = stage.sumo.vehicle, roles.neighbour
+    vehicle = stage.sumo.vehicle
+    name = roles.neighbour
     stage.take(name)
     vehicle.setLaneChangeMode(name, 0)
     lane = int(roles.spot.lane.id.rpartition("_")[2])
@@ -80,7 +81,7 @@ def cut_in(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, No
 
 
 def _beside(stage: Stage, ego: Spot) -> str | None:
-    """Return a moving vehicle on a neighbouring lane with a gap ahead of the ego within `NEXT_M`, if any."""
+    """Return a moving vehicle on a neighbouring lane whose gap from the ego is within `NEXT_M`, if any."""
     driving = list(ego.edge.lanes_of("driving"))
     here = driving.index(ego.lane) if ego.lane in driving else -9
     for name in stage.sumo.vehicle.getIDList():
@@ -94,17 +95,17 @@ def _beside(stage: Stage, ego: Spot) -> str | None:
 
 
 def _stands_at(ego: Spot, kind: str) -> float:
-    """Return the place of the front of a car at the kerb along the lane, `CLOSE_M` ahead of the ego [m]."""
+    """Return the position along the lane [m] of the front of a car at the kerb, `CLOSE_M` ahead of the ego."""
     return ego.along + CLOSE_M + shape_of(kind).length
 
 
 def kerb_offset(lane: Lane, kind: str) -> float:
-    """Return the lateral offset from a lane's middle of a vehicle parked at its right side, left positive [m]."""
+    """Return the lateral offset [m], left positive, of a vehicle parked at the right side of a lane from its middle."""
     return -(lane.width / 2 + KERB_GAP_M + shape_of(kind).width / 2)
 
 
 def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None, None, None]:
-    """Let a car that has stood at the kerb pull out ahead of the vehicle under test and drive on with the traffic."""
+    """Let a car at the kerb pull out ahead of the ego and continue in the traffic."""
     kind = scenario.actors.get("car", DEFAULT_CAR)
     name, lane, along = stage.cast(kind), roles.spot.lane, _stands_at(roles.spot, kind)
     aside = kerb_offset(lane, kind)
@@ -124,14 +125,14 @@ def _pull_out(stage: Stage, scenario: Scenario, roles: CutIn) -> Generator[None,
 
 
 class Runner(NamedTuple):
-    """A vehicle that runs a red light, and the id of that light."""
+    """The roles of a red-light running: the vehicle, and the id of the traffic light."""
 
     name: str
     light: str
 
 
 def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
-    """Return a vehicle near a vehicle under test, first at a red light: still moving, or waiting for `IMPATIENT_S`."""
+    """Return the first vehicle at a red light near an ego, still moving or waiting for `IMPATIENT_S`, if any."""
     egos = stage.egos(scenario)
     for name in stage.sumo.vehicle.getIDList():
         lights, ways = stage.sumo.vehicle.getNextTLS(name), stage.sumo.vehicle.getNextLinks(name)
@@ -148,8 +149,9 @@ def cast_runner(stage: Stage, scenario: Scenario) -> Runner | None:
 
 
 def run_the_light(stage: Stage, scenario: Scenario, runner: Runner) -> Generator[None, None, None]:
-    """Cross the stop line on red; one second after, obey lights and right of way again."""
-    vehicle, name = stage.sumo.vehicle, runner.name
+    """Cross the stop line on red; one second later, obey lights and right of way again."""
+    vehicle = stage.sumo.vehicle
+    name = runner.name
     stage.take(name)
     vehicle.setSpeedMode(name, IGNORES_LIGHTS)
     vehicle.setSpeed(name, max(RUNS_AT, stage.state(name)[3]))
@@ -169,5 +171,5 @@ def shape_of(kind: str) -> Shape:
 
 
 def ease(share: float) -> tuple[float, float]:
-    """Return the smoothstep 3 s² - 2 s³ of the share s of a move's time, and its derivative."""
+    """Return the smoothstep 3 s² - 2 s³ and its derivative, with s the elapsed share of a manoeuvre's time."""
     return share**2 * (3 - 2 * share), 6 * share * (1 - share)

@@ -1,4 +1,4 @@
-"""Script of oncoming overtaking: a car overtakes a slow one in the lane of the vehicle under test."""
+"""Script of oncoming overtaking: an oncoming car overtakes a slow one in the ego's lane."""
 
 import math
 from collections.abc import Generator
@@ -11,34 +11,34 @@ from flcav.world.scenarios.stage import STEP_S, Spot, Stage, State, braking_m
 
 KIND = "car.sedan"
 BEHIND_M = 4.0  # gap between the bumpers before the car pulls out
-AHEAD_M = 3.0  # and before it moves back
+AHEAD_M = 3.0  # gap between the bumpers before the car moves back
 TAKES_S = 5.5  # estimated duration of the manoeuvre, after which oncoming vehicles can still stop
-WITHIN_M = 70.0  # largest distance of the vehicle under test beyond that
-STREETS = 4  # the overtaken vehicle comes along one of the next so many edges of the ego's route
+WITHIN_M = 70.0  # largest additional distance of the ego
+STREETS = 4  # number of edges of the ego's route on which the overtaken vehicle may be oncoming
 ROOM_M = 42.0  # least length of lane ahead of the overtaken vehicle
-SLOW = 3.0  # [m/s] speed to which the overtaken vehicle slows down
-FAST = 17.0  # [m/s] largest speed of it before
-ROLLS = 1.0  # [m/s] least speed of the vehicle under test
-FASTER = 8.0  # [m/s] speed of the car over that of the slowed vehicle
+SLOW = 3.0  # speed to which the overtaken vehicle slows down [m/s]
+FAST = 17.0  # largest speed of the overtaken vehicle before [m/s]
+ROLLS = 1.0  # least speed of the ego [m/s]
+FASTER = 8.0  # speed of the car relative to the slowed vehicle [m/s]
 GAINS_MPS2, SLOWS_MPS2 = 4.5, 2.5  # acceleration of the car; deceleration of both
 SHARPEST = math.radians(25.0)  # largest angle of the car to its lane
 STANDS_M = 2.0  # gap at which the car stops behind a queue
 SWINGS_S = 1.8  # duration of a lane change
-WAY_M = (4.0, 12.0, 20.0, 28.0)  # ahead of the car, places for which oncoming traffic brakes
+WAY_M = (4.0, 12.0, 20.0, 28.0)  # distances ahead of the car of places for which oncoming traffic brakes
 OUT = 0.6  # share of the lane change after which the car accelerates
-NEIGHBOUR_M = 4.8  # least distance between the front of the car and those of other vehicles before it acts
+NEIGHBOUR_M = 4.8  # least distance between the fronts of the car and of other vehicles before the manoeuvre
 SEEN_STEPS = 60  # steps before the present over which this distance is checked
 
 
 class Overtaking(NamedTuple):
-    """The roles of an overtaking."""
+    """The roles of an oncoming overtaking."""
 
     slow: str  # the vehicle that is overtaken
     spot: Spot  # its place at the casting
 
 
 def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
-    """Return a vehicle oncoming to a vehicle under test, with nobody close behind and room to be overtaken."""
+    """Return a vehicle oncoming to an ego, with no vehicle close behind and room to be overtaken, if any."""
     for ego in stage.egos(scenario):
         if stage.state(ego)[3] < ROLLS:
             continue
@@ -63,7 +63,7 @@ def cast_overtaking(stage: Stage, scenario: Scenario) -> Overtaking | None:
 
 
 def _meets(one: State, other: State) -> bool:
-    """Return whether two vehicles drive towards each other, with road enough to overtake `one` in between."""
+    """Return whether two vehicles approach head-on, with enough road in between to overtake `one`."""
     dx, dy = other[0] - one[0], other[1] - one[1]
     # SUMO's angles are clockwise from north
     (x, y), (other_x, other_y) = (rotate(0.0, 1.0, -math.radians(state[2])) for state in (one, other))
@@ -78,7 +78,7 @@ def _takes_m(speed: float) -> float:
 
 
 def _way_is_free(stage: Stage, name: str) -> bool:
-    """Return whether the lane to the left of a vehicle is free as far as overtaking it takes, braking included."""
+    """Return whether the oncoming lane is free over the length needed to overtake a vehicle, including braking."""
     x, y, angle, own_speed = stage.state(name)
     heading = math.radians(90.0 - angle)
     for other in stage.sumo.vehicle.getIDList():
@@ -90,7 +90,7 @@ def _way_is_free(stage: Stage, name: str) -> bool:
 
 
 def _alone(stage: Stage, name: str) -> bool:
-    """Return whether a follower `BEHIND_M` behind a vehicle would lately have kept `NEIGHBOUR_M` from all others."""
+    """Return whether a follower `BEHIND_M` behind a vehicle would recently have been `NEIGHBOUR_M` from all others."""
     behind = BEHIND_M + stage.sumo.vehicle.getLength(name)
     trail = dict(stage.trail(name, behind))
     if stage.step not in trail:
@@ -105,7 +105,10 @@ def _alone(stage: Stage, name: str) -> bool:
 
 
 def overtake(stage: Stage, scenario: Scenario, roles: Overtaking) -> Generator[None, None, None]:
-    """Let a new car follow the slow vehicle, pull out, pass and move back into the traffic; oncoming traffic brakes."""
+    """Let a new car follow the slow vehicle, pull out, pass and merge back into the traffic.
+
+    Oncoming traffic brakes.
+    """
     vehicle, slow, lane = stage.sumo.vehicle, roles.slow, roles.spot.lane
     kind = scenario.actors.get("car", KIND)
     name, length = stage.cast(kind), shape_of(kind).length

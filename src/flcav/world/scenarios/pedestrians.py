@@ -1,4 +1,4 @@
-"""Script of an occluded pedestrian: somebody runs into the road from behind a parked van."""
+"""Script of an occluded pedestrian, who runs into the road from behind a parked van."""
 
 import math
 from collections.abc import Generator
@@ -10,26 +10,26 @@ from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import CAREFUL_MPS2, STEP_S, Spot, Stage
 
 VAN, PEDESTRIAN = "van.high_van", "pedestrian.child"
-FAST = 4.0  # [m/s] least speed of the vehicle under test
-AHEAD_M = (22.0, 45.0)  # limits of the distance from the vehicle under test to the crossing
-BEFORE_VAN_M = 0.9  # from the van's front bumper to the pedestrian's path
-RUNS_AT = 2.6  # [m/s]
-NOTICED_S = 0.9  # the run begins so long, less the time to the lane, before the last moment to brake
-WALK_ON_M = 1.5  # by which the pedestrian goes on beyond the far kerb
-CLEAR_M = 2.2  # no vehicle has been nearer than this to where the van stands
+FAST = 4.0  # least speed of the ego [m/s]
+AHEAD_M = (22.0, 45.0)  # limits of the distance from the ego to the crossing
+BEFORE_VAN_M = 0.9  # distance from the van's front bumper to the pedestrian's path
+RUNS_AT = 2.6  # speed of the pedestrian [m/s]
+NOTICED_S = 0.9  # the run begins this long, less the time to reach the lane, before the last moment to brake
+WALK_ON_M = 1.5  # distance that the pedestrian walks beyond the far kerb
+CLEAR_M = 2.2  # radius around the van's place in which no vehicle has been
 
 
 class BehindVan(NamedTuple):
     """The roles of a pedestrian who runs out from behind a van."""
 
     ego: str  # the vehicle under test
-    spot: Spot  # of the ego at the casting
-    along: float  # place of the crossing along the ego's lane [m]
+    spot: Spot  # place of the ego at the casting
+    along: float  # position of the crossing along the ego's lane [m]
     kinds: tuple[str, str]  # vehicle types of the van and the pedestrian
 
 
 def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
-    """Return a vehicle under test in free flow on the rightmost lane, with room for a van at the kerb ahead."""
+    """Return an ego in free flow on the rightmost lane, with room for a van at the kerb ahead, if any."""
     kinds = scenario.actors.get("van", VAN), scenario.actors.get("pedestrian", PEDESTRIAN)
     for ego in stage.free_egos(scenario):
         spot, speed = stage.spot(ego), stage.state(ego)[3]
@@ -48,15 +48,17 @@ def cast_behind_van(stage: Stage, scenario: Scenario) -> BehindVan | None:
 def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[None, None, None]:
     """Let a pedestrian wait behind the van until the ego is near, then run across the street; traffic brakes.
 
-    The run begins so that the ego can just stop. Van and pedestrian stand there from the start of the run on.
+    The pedestrian starts so that the ego can just stop. Van and pedestrian are there from the start of the traffic run.
     """
-    lane, vehicle = roles.spot.lane, stage.sumo.vehicle
+    lane = roles.spot.lane
+    vehicle = stage.sumo.vehicle
     van, pedestrian = (stage.cast(kind) for kind in roles.kinds)
     hidden = kerb_offset(lane, roles.kinds[0])
     stands = stage.point(lane, roles.along - BEFORE_VAN_M, hidden)
     stage.place_from_start(van, *stands)
     stage.place_from_start(pedestrian, *_walker(stage, roles, hidden))
-    at, far = hidden, _far_kerb(stage, roles.spot.edge, lane.width) + WALK_ON_M
+    at = hidden
+    far = _far_kerb(stage, roles.spot.edge, lane.width) + WALK_ON_M
     running = False
     while True:
         yield
@@ -77,13 +79,13 @@ def run_out(stage: Stage, scenario: Scenario, roles: BehindVan) -> Generator[Non
 
 
 def _walker(stage: Stage, roles: BehindVan, left: float) -> tuple[float, float, float]:
-    """Return x, y [m] and heading [rad] of the pedestrian, `left` metres to the left of the lane's middle."""
+    """Return x, y [m] and heading [rad] of the pedestrian, `left` [m] to the left of the lane's middle, world frame."""
     x, y, heading = stage.point(roles.spot.lane, roles.along, left)
     return x, y, heading + math.pi / 2
 
 
 def _far_kerb(stage: Stage, edge: Edge, width: float) -> float:
-    """Return the lateral offset of the far kerb from the middle of an edge's rightmost lane, left positive [m]."""
+    """Return the lateral offset [m], left positive, of the far kerb from the middle of an edge's rightmost lane."""
     ours = sum(lane.width for lane in edge.lanes_of("driving"))
     back = [other for other in stage.net.streets if (other.start, other.end) == (edge.end, edge.start)]
     theirs = sum(lane.width for other in back[:1] for lane in other.lanes if lane.kind != "sidewalk")

@@ -22,7 +22,7 @@ ROLES: dict[str, tuple[str, ...]] = {  # role of an actor created for a scenario
     "pedestrian": ("pedestrian",),
 }
 LONGEST_S = 36_000.0
-NEAR_M = 50.0  # from `Scenario.position` to the vehicle under test, at most
+NEAR_M = 50.0  # largest distance of the ego from `Scenario.position`
 
 Ego = Annotated[str, Field(pattern=r"^cav[0-9]{1,4}$")]
 Duration = Annotated[float, Field(ge=0.1, le=LONGEST_S)]

@@ -1,7 +1,7 @@
-"""Actors on bridges and below them: which of two streets, one above the other, an actor is on.
+"""Assignment of actors to the levels of bridges: on the deck, or on the street below it.
 
-SUMO's net has no heights. An actor above or below a deck is on it where lanes that lead over it are nearer, and point
-more in the actor's direction, than those that lead below, all in all while it passes above or below.
+SUMO's net has no heights. An actor within the outline of a deck is on it if, over its whole passage, the lanes over the
+deck are nearer and better aligned with the actor's heading than those below.
 """
 
 from collections.abc import Callable
@@ -18,25 +18,26 @@ from flcav.geometry import heading_vectors
 from flcav.world.map.relief import Deck, Relief
 from flcav.world.map.roads import RoadNet, read_net
 
-REACH_M = 15.0  # half a long vehicle, and the way of .3 s: nearer to a deck, actors are on it or below it
-ALONG = np.cos(np.pi / 4)  # lanes that lead over a deck keep to its direction
-TURNED_M = 6.0  # distance that counts as much as a right angle between an actor and a lane
+REACH_M = 15.0  # half a long vehicle, and the distance of 0.3 s: closer to a deck, an actor is on it or below it
+ALONG = np.cos(np.pi / 4)  # least alignment of lanes over a deck with its direction
+TURNED_M = 6.0  # distance that is weighted like a right angle between an actor and a lane
 BATCH = 1000  # actors that are compared with all lanes at a time
-BESIDE_SHARE = 1e-3  # of a moment beside a deck in what is decided by the moments above or below it
-EDGE_M = 0.05  # a point so far beside a deck still is on it
+BESIDE_SHARE = 1e-3  # weight of instants next to a deck, relative to those within its outline
+EDGE_M = 0.05  # margin around a deck within which a point counts as on it
 
 
 class Segments(NamedTuple):
-    """S pieces of lanes, seen from above."""
+    """S pieces of lanes in plan, world frame."""
 
-    start: Array  # (S, 2) [m]
-    along: Array  # (S, 2) to their ends [m]
+    start: Array  # (S, 2) start [m]
+    along: Array  # (S, 2) vector from start to end [m]
 
 
 def find_footing(relief: Relief, net: Path, centre: Array, yaw: Array) -> Callable[[Array, Array], Array]:
-    """Return the function from x, y (T, A) [m] to the height [m] of the surface below each actor: ground or deck.
+    """Return a function from x, y (T, A) [m] to the heights (T, A) [m] of the actors' surfaces: ground or deck.
 
-    The actors are at `centre` (T, A, 2) [m] with `yaw` (T, A) [rad], NaN where absent; `net` is the streets' file.
+    The actors are at `centre` (T, A, 2) [m] with `yaw` (T, A) [rad], world frame, NaN where absent; `net` is the file
+    of the road net.
     """
     if not relief.decks:
         return relief.heights
@@ -49,22 +50,23 @@ def find_footing(relief: Relief, net: Path, centre: Array, yaw: Array) -> Callab
             area = deck.outline.buffer(EDGE_M)
             shapely.prepare(area)
             at = np.nonzero(rows)
-            own = np.maximum(out[at], deck.surface.heights(x[at], y[at]))
-            out[at] = np.where(shapely.contains_xy(area, x[at], y[at]), own, out[at])
+            on_deck = np.maximum(out[at], deck.surface.heights(x[at], y[at]))
+            out[at] = np.where(shapely.contains_xy(area, x[at], y[at]), on_deck, out[at])
         return out
 
     return heights
 
 
 def _find_on(deck: Deck, net: RoadNet, centre: Array, yaw: Array) -> Mask:
-    """Return (T, A) whether each actor is on a deck or enters it; constant while an actor stays near the deck."""
+    """Return (T, A) whether actors are on a deck or approach it; constant while an actor stays near the deck."""
     zone = deck.outline.buffer(REACH_M)
     shapely.prepare(zone)
     out = shapely.contains_xy(zone, centre[..., 0], centre[..., 1])
     over, below = split_lanes(deck, net, zone)
     if not len(over.start):
         return np.zeros_like(out)
-    place, ahead = centre[out], heading_vectors(yaw[out])
+    place = centre[out]
+    ahead = heading_vectors(yaw[out])
     worse = [
         _misfit(over, place[rows], ahead[rows]) - _misfit(below, place[rows], ahead[rows])
         for rows in np.split(np.arange(len(place)), np.arange(BATCH, len(place), BATCH))
@@ -72,15 +74,17 @@ def _find_on(deck: Deck, net: RoadNet, centre: Array, yaw: Array) -> Mask:
     weight = np.where(shapely.contains_xy(deck.outline, *place.T), 1.0, BESIDE_SHARE)
     begins = np.ones(out.shape, np.bool_)
     begins[1:] = ~out[:-1] | (np.linalg.norm(np.diff(centre, axis=0), axis=2) > REACH_M)
-    stay = np.cumsum((begins & out).T).reshape(out.T.shape).T[out]  # numbers of stays near the deck, one actor's each
+    stay = (
+        np.cumsum((begins & out).T).reshape(out.T.shape).T[out]
+    )  # index of an uninterrupted stay of one actor near the deck
     out[out] = (np.bincount(stay, weight * np.concatenate(worse)) < 0)[stay]
     return out
 
 
 def split_lanes(deck: Deck, net: RoadNet, zone: BaseGeometry) -> tuple[Segments, Segments]:
-    """Return the pieces of the lanes within `zone` that lead over a deck, and of those that do not.
+    """Split the lanes within `zone` into the pieces that lead over a deck, and those that do not.
 
-    A lane that leads over it keeps to its direction and crosses neither of its sides.
+    A lane over the deck is aligned with it, and does not cross its sides.
     """
     right, left = (side[:, :2] for side in deck.sides)
     middle = (right + left) / 2
@@ -109,9 +113,9 @@ def _join(parts: list[Segments]) -> Segments:
 
 
 def _misfit(lanes: Segments, place: Array, ahead: Array) -> Array:
-    """Return (N,) [m] the distance, in place and direction, of bodies from the lane that fits best.
+    """Return (N,) [m] the combined distance in place and direction of actors from their best-fitting lanes.
 
-    Bodies are at `place` (N, 2) [m] with the headings `ahead` (N, 2), unit vectors.
+    Actors are at `place` (N, 2) [m] with the unit headings `ahead` (N, 2).
     """
     if not len(lanes.start):
         return np.full(len(place), np.inf)

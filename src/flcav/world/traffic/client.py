@@ -1,4 +1,4 @@
-"""Client of the SUMO process, which is kept for the next run when one has ended."""
+"""Client of the SUMO process, which is reused for the next run."""
 
 import atexit
 import contextlib
@@ -13,38 +13,38 @@ from typing import Any
 from flcav.world.traffic.demand import Demand
 from flcav.world.traffic.simulation import NET, ROUTES, States, StepRequest, TrafficJob
 
-SERVE = "flcav.world.traffic.process:serve_traffic"  # what that process runs
-ROOT = str(Path(__file__).parents[3])  # where flcav is, installed or not
+SERVE = "flcav.world.traffic.process:serve_traffic"  # entry point of the process
+ROOT = str(Path(__file__).parents[3])  # folder that contains flcav, installed or not
 
 _idle: list[tuple[int, subprocess.Popen[str]]] = []  # processes without a run, with the id of their parent
 
 
 def write_job(folder: Path, net: Path, demand: Demand, seed: int) -> TrafficJob:
-    """Return the job of a run, whose files are in `folder` until it has begun."""
+    """Write the files of a run, which must exist until it has begun, into `folder`; return its job."""
     (folder / NET).symlink_to(net.absolute())
     (folder / ROUTES).write_text(demand.routes, encoding="utf-8")
     return TrafficJob(str(folder.absolute()), seed, demand.followers)
 
 
 class Sumo:
-    """A SUMO run in a child process, which it keeps until it is closed."""
+    """A SUMO run in a child process, which it occupies until it is closed."""
 
     def __init__(self, job: TrafficJob, failure: str = "SUMO failed") -> None:
-        """Start a run; where SUMO fails, now or later, that is a `RuntimeError` that begins with `failure`."""
+        """Start a run. Raises `RuntimeError`, beginning with `failure`, where SUMO fails, now or later."""
         self._failure = failure
         self._process: subprocess.Popen[str] | None = _take_process()
         self.begun: States = self._ask(job._asdict())
 
     def step(self, request: StepRequest) -> States:
-        """Advance by a step that obeys the request, and return the states after it."""
+        """Advance by a step with these external inputs; return the states after it."""
         return self._ask({"step": request._asdict()})
 
     def record(self, steps: Sequence[int], out: Path) -> None:
-        """Record a run that has made no step yet, see `process.record_traffic`."""
+        """Record a run that has not made a step yet: see `process.record_traffic`."""
         self._ask({"record": {"steps": steps, "out": str(out.absolute())}})
 
     def close(self) -> None:
-        """End the run; its process is kept for the next one."""
+        """End the run; its process is reused for the next one."""
         if self._process is not None:
             with contextlib.suppress(RuntimeError):
                 self._ask(None)
@@ -52,7 +52,7 @@ class Sumo:
             self._process = None
 
     def _ask(self, request: Any) -> dict[str, Any]:
-        """Return the answer to a request."""
+        """Send a request, and return its answer."""
         if self._process is None:
             raise RuntimeError("the live world is closed")
         assert self._process.stdin is not None
@@ -64,7 +64,7 @@ class Sumo:
         except BrokenPipeError:
             line = ""
         except BaseException:
-            self._kill()  # or its answer would be taken for that to the next request
+            self._kill()  # otherwise its answer would be mistaken for that to the next request
             raise
         answer = json.loads(line) if line else {"error": "its process has ended"}
         if "error" in answer:
@@ -79,7 +79,7 @@ class Sumo:
 
 
 def _take_process() -> subprocess.Popen[str]:
-    """Return a SUMO process without a run, started where there is none; a fork of this process starts its own."""
+    """Return an idle SUMO process, or start one; a fork of this process does not share its processes."""
     with contextlib.suppress(IndexError):  # there is none, or another thread has taken it
         while True:
             parent, process = _idle.pop()

@@ -1,6 +1,6 @@
-"""Traffic demand: SUMO's route file of random tours, and parked vehicles along the streets.
+"""Traffic demand: SUMO's route file with random tours, and parked vehicles along the streets.
 
-Vehicles and pedestrians are under way to the end of the run. Both parts are redrawn for every traffic seed.
+Vehicles and pedestrians travel until the end of the run. Tours and parked vehicles are redrawn for every traffic seed.
 """
 
 from collections.abc import Iterator, Sequence
@@ -21,15 +21,15 @@ from flcav.world.map.street_furniture import Verge, outline_space
 from flcav.world.shapes import ANGLED, RARE, SHAPES
 from flcav.world.traffic.passages import find_driven, find_passages, find_walked
 
-FROM_JUNCTION_M = 6.0  # kept free at both ends of a parking lane
+FROM_JUNCTION_M = 6.0  # length without vehicles at both ends of a parking lane
 KERB_GAP_M = (0.1, 0.3)  # limits of the gap between wheels and kerb
-BUMPER_GAP_M = (0.6, 1.8)  # limits of the gap between neighbours
+BUMPER_GAP_M = (0.6, 1.8)  # limits of the gap between neighbouring vehicles
 CROOKED = 0.12  # share of vehicles parked at a larger angle
-ANGLE_RAD = (0.35, 0.75)  # of vehicles parked at an angle: half on the pavement
+ANGLE_RAD = (0.35, 0.75)  # limits of the angle of vehicles parked half on the pavement
 BACKWARDS = 0.06  # share of vehicles parked against the driving direction
 VANS = 0.1  # share of vans in the parking spaces of a map
-DOOR_M = 0.2  # by which a parking space is wider than the vehicle in it, at least
-OVERHANG_M = 0.1  # by which a vehicle may stand out of its lane, at most
+DOOR_M = 0.2  # least excess width of a parking space over its vehicle
+OVERHANG_M = 0.1  # greatest overhang of a parked vehicle over its lane
 DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ from the defaults
     "car": {"vClass": "passenger", "speedFactor": "normc(1,0.1,0.75,1.2)", "minGap": "2.0"},
     "van": {"vClass": "delivery", "speedFactor": "normc(0.95,0.1,0.7,1.1)", "minGap": "2.0"},
@@ -41,27 +41,27 @@ DRIVER = {  # attributes of SUMO's vehicle types by category, where they differ 
 }
 CAV_TYPE = "car.sedan"
 HEADWAY_S = 2.0  # least time between two vehicles that enter at the same place
-NEXT_M = 5.0  # least distance between two destinations, where there is a choice
-FASTEST = 20.0  # speed for which tours are long enough, of vehicles [m/s]
-FASTEST_WALK = 1.7  # and of pedestrians [m/s]
+NEXT_M = 5.0  # least distance between consecutive destinations, if there is a choice
+FASTEST = 20.0  # vehicle speed for which tours are long enough [m/s]
+FASTEST_WALK = 1.7  # pedestrian speed for which tours are long enough [m/s]
 
 
 @dataclass(frozen=True)
 class Parked:
-    """One parked vehicle: its shape, ground centre [m] and yaw [rad], world frame."""
+    """A parked vehicle: its shape and pose, world frame."""
 
     category: str
     shape: int  # row of SHAPES[category]
-    x: float
-    y: float
-    yaw: float
+    x: float  # ground centre [m]
+    y: float  # ground centre [m]
+    yaw: float  # [rad]
 
 
 def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) -> list[Parked]:
-    """Return the parked vehicles on the parking lanes of all streets, drawn by the parameters of the street types.
+    """Draw the parked vehicles on the parking lanes of all streets, by the parameters of the street types.
 
-    They do not overlap and stand out of their lane by `OVERHANG_M` at most. Parking spaces of a map are taken at
-    random, and a parking lane with some has no other vehicles.
+    They do not overlap, and overhang their lane by at most `OVERHANG_M`. Parking spaces of a map are occupied at
+    random; a parking lane with such spaces has no other vehicles.
     """
     spaces = shapely.union_all([outline_space(space) for space in parameters.parking])
     out = []
@@ -100,7 +100,7 @@ def park(net: RoadNet, parameters: TownParameters, random: np.random.Generator) 
 
 
 def _park_in_spaces(parameters: TownParameters, random: np.random.Generator) -> Iterator[Parked]:
-    """Yield the vehicles in the parking spaces of a map: of those that fit, in the middle, either way round."""
+    """Yield vehicles in the parking spaces of a map that they fit into: centred, in either direction."""
     for space in parameters.parking:
         taken, category = random.random() < parameters.parking_taken, "van" if random.random() < VANS else "car"
         shape = _draw_parked_shape(category, parameters, random)
@@ -111,38 +111,38 @@ def _park_in_spaces(parameters: TownParameters, random: np.random.Generator) -> 
 
 
 def _draw_parked_shape(category: str, parameters: TownParameters, random: np.random.Generator) -> int:
-    """Return the row of `SHAPES[category]` of a parked vehicle."""
+    """Draw the shape of a parked vehicle: a row of `SHAPES[category]`."""
     return int(random.choice(len(SHAPES[category]), p=parameters.shape_weights(category, parked=True)))
 
 
 class Successor(NamedTuple):
-    """A vehicle that enters when another has left."""
+    """A vehicle that enters when another one has left."""
 
     name: str
-    type: str  # SUMO's
+    type: str  # SUMO's vehicle type
     edges: list[str]  # its whole route
 
 
 @dataclass(frozen=True)
 class Demand:
-    """The road users of a run."""
+    """The traffic demand of a run."""
 
     routes: str  # SUMO's route file (XML)
-    followers: dict[str, Successor]  # by the name of the vehicle before; none where all tours are long enough
+    followers: dict[str, Successor]  # by the name of the predecessor; empty if all tours are long enough
 
 
 def write_demand(
     net: RoadNet, parameters: TownParameters, *, seed: int, cavs: int, from_s: float, until_s: float, fill_s: float
 ) -> Demand:
-    """Return the demand of a town: a trip for every vehicle and pedestrian.
+    """Draw the traffic demand of a town: a trip for every vehicle and pedestrian.
 
-    CAVs depart at 0 s, all others at a uniform time before `fill_s` [s]. Each has a tour of random destinations too
+    CAVs depart at 0 s, all others at a uniformly random time before `fill_s` [s]. A tour of random destinations is too
     long to be finished by `until_s` [s] at `FASTEST` or `FASTEST_WALK`. Vehicles draw destinations by the street type's
     `traffic`, pedestrians by its `footfall`; CAVs draw the approaches of the candidate poles, if there are any.
 
-    Where the net has open ends, so that no tour is long enough, a CAV enters shortly before `from_s` [s] and drives on
-    to beyond `until_s`, where all ways are short below the limit; another vehicle drives to an exit, and when it has
-    left, the next one enters. Raises `InputError` where no way is long enough for a CAV.
+    In a net with open ends, where no tour is long enough, a CAV enters shortly before `from_s` [s] and drives on until
+    after `until_s`, below the speed limit if all routes are short; another vehicle drives to an exit, and its successor
+    enters when it has left. Raises `InputError` where no route is long enough for a CAV.
     """
     root = Element("routes")
     for category, shapes in SHAPES.items():
@@ -161,7 +161,7 @@ def write_demand(
     reach = FASTEST * until_s
     trips: list[tuple[float, Element]] = []
     passages = find_passages(net, driven)
-    exits = {edge.id for edge, left_s in zip(driven, passages.left_s) if np.isfinite(left_s)}  # none in a closed net
+    exits = {edge.id for edge, left_s in zip(driven, passages.left_s) if np.isfinite(left_s)}  # empty in a closed net
     for i in range(cavs):
         random = stream(seed, "cav", i)
         weight, depart, share = watching if watching.any() else traffic, 0.0, None
@@ -183,7 +183,8 @@ def write_demand(
         if tour[-1] not in exits:
             trips.append((depart, _vehicle(f"veh{i}", kind, depart, tour)))
             continue
-        name, rest = f"veh{i}", until_s - depart
+        name = f"veh{i}"
+        rest = until_s - depart
         rows = passages.draw(traffic, random, least_s=0.0, most_s=rest)
         trips.append((depart, _vehicle(name, kind, depart, [driven[row].id for row in rows])))
         while (rest := rest - max(float(passages.time_s[rows].sum()), HEADWAY_S)) > 0:
@@ -197,7 +198,9 @@ def write_demand(
         kind = draw_type("pedestrian", parameters, random)
         depart = round(float(random.uniform(0.0, fill_s)), 1)
         tour = draw_tour(walked, mid_foot, on_foot, footfall, FASTEST_WALK * until_s, random)
-        tour = [edge for i, edge in enumerate(tour) if edge != tour[i - 1] or not i]  # nobody walks on the spot
+        tour = [
+            edge for i, edge in enumerate(tour) if edge != tour[i - 1] or not i
+        ]  # without walks from an edge to itself
         if len(tour) > 1:
             trips.append((depart, _person(f"ped{i}", kind, depart, tour)))
     for _, trip in sorted(trips, key=lambda item: item[0]):
@@ -206,24 +209,24 @@ def write_demand(
 
 
 def weigh_pole_approaches(net: RoadNet, parameters: TownParameters) -> dict[str, float]:
-    """Return the weights, by edge, of the edges that lead past the candidate poles; each pole adds 1 in total.
+    """Return the weights of the edges that lead past the candidate poles, by edge; a pole adds 1 in total.
 
-    The edges of a straight pole are both directions of its street; those of another lead into the junction it faces.
+    The edges of a straight pole are both directions of its street; those of another pole lead into its junction.
     """
     out: dict[str, float] = {}
     for pole in parameters.poles:
-        own = net.edges[pole.edge]
+        street = net.edges[pole.edge]
         if pole.kind == "straight":
-            past = [edge.id for edge in net.streets if {edge.start, edge.end} == {own.start, own.end}]
+            past = [edge.id for edge in net.streets if {edge.start, edge.end} == {street.start, street.end}]
         else:
-            past = [edge.id for edge in net.streets if edge.end == own.end]
+            past = [edge.id for edge in net.streets if edge.end == street.end]
         for edge in past:
             out[edge] = out.get(edge, 0.0) + 1.0 / len(past)
     return out
 
 
 def find_middles(edges: Sequence[Edge]) -> Array:
-    """Return the middle (N, 2) of the first lane of each edge [m]."""
+    """Return the middles (N, 2) of the edges' first lanes [m], world frame."""
     return np.array([edge.lanes[0].shape.mean(axis=0) for edge in edges]).reshape(-1, 2)
 
 
@@ -237,17 +240,19 @@ def draw_tour(
     *,
     anywhere: bool = False,
 ) -> list[str]:
-    """Return the ids of edges to visit in order, drawn by `weight` (N,), at least `length_m` long as the crow flies.
+    """Draw a tour by `weight` (N,): the ids of edges to visit, at least `length_m` [m] long as the crow flies.
 
-    `middle` (N, 2) are the edges' places [m], see `find_middles`; `reach` (N, N) says which edges can be reached from
-    which. The tour starts where it can go on, if there is such an edge, and ends early where it cannot; with `anywhere`
-    it goes on where no weight is, if that leads to a circle. Weights that are all zero count as equal.
+    `middle` (N, 2) are the edges' places [m], see `find_middles`; `reach` (N, N) whether an edge (column) can be
+    reached from another (row). The tour starts where it can continue, if there is such an edge, and ends early where it
+    cannot; with `anywhere` it continues on edges without weight if these lead to a loop. Weights that are all zero
+    count as equal.
     """
     weight = weight if weight.any() else np.ones(len(edges))
     going_on = weight * (reach & (weight > 0)).any(axis=1)
     share = going_on / going_on.sum() if going_on.any() else weight / weight.sum()
     at = int(random.choice(len(edges), p=share))
-    out, done = [edges[at].id], 0.0
+    out = [edges[at].id]
+    done = 0.0
     while done < length_m:
         steps = np.hypot(*(middle - middle[at]).T)
         share = weight * reach[at]
@@ -256,7 +261,7 @@ def draw_tour(
         if not share.any():
             break
         if not (share * (steps >= NEXT_M)).any():
-            steps = np.maximum(steps, NEXT_M)  # nothing farther: round and round
+            steps = np.maximum(steps, NEXT_M)  # no destination is farther: repeated visits count
         to = int(random.choice(len(edges), p=share / share.sum()))
         if steps[to] < NEXT_M:
             continue
@@ -266,7 +271,7 @@ def draw_tour(
 
 
 def draw_type(category: str, parameters: TownParameters, random: np.random.Generator) -> str:
-    """Return SUMO's vehicle type of a random shape of the category, "category.shape"."""
+    """Draw a shape of the category; return its SUMO vehicle type, "category.shape"."""
     weights = parameters.shape_weights(category)
     return f"{category}.{SHAPES[category][int(random.choice(len(weights), p=weights))].name}"
 
@@ -274,9 +279,9 @@ def draw_type(category: str, parameters: TownParameters, random: np.random.Gener
 def _vehicle(
     name: str, kind: str, depart: float, edges: list[str], *, entering: bool = False, share: float | None = None
 ) -> Element:
-    """Return SUMO's <trip> of a vehicle along `edges`: from rest somewhere on the first, or `entering` it in motion.
+    """Return SUMO's <trip> of a vehicle along `edges`: from rest on the first one, or `entering` it in motion.
 
-    It drives at that `share` of the limits, or one that SUMO draws.
+    It drives at `share` of the speed limits, or one that SUMO draws.
     """
     pace = {} if share is None else {"speedFactor": f"{share:.3f}"}
     start = {"departPos": "base", "departSpeed": "max"} if entering else {"departPos": "random_free"}
@@ -285,7 +290,7 @@ def _vehicle(
 
 
 def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:
-    """Return SUMO's <person> who walks along `edges`."""
+    """Return SUMO's <person> element of a pedestrian who walks along `edges`."""
     person = Element("person", {"id": name, "type": kind, "depart": f"{depart:.1f}", "departPos": "random"})
     SubElement(person, "walk", {"from": edges[0], "to": edges[1]})
     for edge in edges[2:]:
@@ -294,7 +299,7 @@ def _person(name: str, kind: str, depart: float, edges: list[str]) -> Element:
 
 
 def list_vehicle_types() -> Iterator[tuple[str, str, int]]:
-    """Yield each of SUMO's vehicle types with its category and its row of `SHAPES[category]`."""
+    """Yield SUMO's vehicle types with their categories and rows of `SHAPES[category]`."""
     for category, shapes in SHAPES.items():
         for i, shape in enumerate(shapes):
             yield f"{category}.{shape.name}", category, i

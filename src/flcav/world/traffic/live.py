@@ -1,7 +1,6 @@
-"""The traffic of a live world: SUMO's actors between the steps of SUMO, and the traffic lights.
+"""The traffic of a live world: SUMO's actors, interpolated between SUMO's steps, and the traffic lights.
 
-Traffic lights: the programs of a SUMO net, phases of fixed durations that repeat, and what overrides them.
-
+Traffic lights follow the programs of a SUMO net, phases of fixed durations that repeat, unless they are overridden.
 Format: https://sumo.dlr.de/docs/Simulation/Traffic_Lights.html
 """
 
@@ -28,19 +27,19 @@ from flcav.world.traffic.demand import list_vehicle_types, park, write_demand
 from flcav.world.traffic.simulation import Body, StepRequest, TrafficJob
 from flcav.world.traffic.traffic import number_of
 
-FILL_S = 20.0  # all actors have departed by then
+FILL_S = 20.0  # time by which all actors have departed
 WARM_UP_S = 30.0  # time of SUMO at the start of a live world
-TOUR_S = 900.0  # length of a vehicle's tour, at least; it then sets out again
-SLOW_MPS = 1.0  # traffic brakes for a slower vehicle wherever it stands, and for a faster one in its lane
-DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, over a body's length from its middle
-SOON_S = 0.7  # for so long ahead traffic considers crossing vehicles
-BERTH_M = 1.0  # half the width of a vehicle that passes
+TOUR_S = 900.0  # least duration of a vehicle's tour, after which it departs again
+SLOW_MPS = 1.0  # traffic brakes for a slower vehicle anywhere in its way, and for a faster one in its lane
+DANGERS = (-0.4, 0.0, 0.4)  # places to brake for, in body lengths from the centre
+SOON_S = 0.7  # look-ahead time for crossing vehicles
+BERTH_M = 1.0  # half width of a passing vehicle
 
 
 def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedestrians: int) -> TrafficJob:
-    """Return the job of a live world's run, whose files are in `folder`.
+    """Write the files of a live world's run into `folder`; return its job.
 
-    Raises `InputError` as `write_demand`.
+    Raises `InputError` as `write_demand` does.
     """
     parameters = town.parameters.model_copy(update={"vehicles": vehicles, "pedestrians": pedestrians})
     net = read_net(town.net)
@@ -56,12 +55,12 @@ def write_live_job(town: Town, folder: Path, *, seed: int, vehicles: int, pedest
 
 
 class SumoTraffic:
-    """SUMO's traffic in a town, in a SUMO process that it keeps until it is closed."""
+    """SUMO's traffic in a town, in a SUMO process that it occupies until it is closed."""
 
     def __init__(self, town: Town, ground: TownGround, *, seed: int, vehicles: int, pedestrians: int) -> None:
-        """Start with the traffic under way; raises `InputError` as `write_demand`, `RuntimeError` where SUMO fails."""
+        """Start after the warm-up. Raises `InputError` as `write_demand` does, `RuntimeError` where SUMO fails."""
         self.ticks = 0  # steps of SUMO since the start
-        self._actors = NOBODY  # those present before and after the step of SUMO under way, at their last places
+        self._actors = NOBODY  # those present before and after SUMO's present step, at their last poses
         self._ground, self._town = ground, town
         self._kinds = {name: (category, shape) for name, category, shape in list_vehicle_types()}
         self._lights: dict[str, str] = {}
@@ -73,9 +72,9 @@ class SumoTraffic:
         self.advance(NOBODY, {}, [])
 
     def advance(self, bodies: Actors, lights: Mapping[str, str], halted: Sequence[str]) -> None:
-        """Advance SUMO by a step, in which its traffic reacts to the `bodies` under control.
+        """Advance SUMO by a step, in which its traffic reacts to the controlled `bodies`.
 
-        `lights` are the letters of each junction's links. Vehicles that are `halted` stand for a while. Raises
+        `lights` are the state letters of the links, by junction. Vehicles that are `halted` stop for a while. Raises
         `RuntimeError` where SUMO fails.
         """
         changed = {name: state for name, state in lights.items() if self._lights.get(name) != state}
@@ -87,13 +86,13 @@ class SumoTraffic:
         self._line_up()
 
     def remove(self, name: str) -> None:
-        """Let a vehicle or pedestrian leave at once; no other sets out in its place."""
+        """Remove a vehicle or pedestrian, without replacement."""
         del self._before[name]
         self._gone.append(name)
         self._line_up()
 
     def _line_up(self) -> None:
-        """Keep the actors that are present both before and after SUMO's present step."""
+        """Select the actors that are present both before and after SUMO's present step."""
         names = sorted((name for name in self._before if name in self._after), key=number_of)
         self._ends = tuple(
             np.array([state[name][1:] for name in names], np.float64).reshape(-1, 4)
@@ -103,9 +102,9 @@ class SumoTraffic:
             self._recast(names)
 
     def at(self, time_s: float) -> Actors:
-        """Return the actors at a time [s] since the start within SUMO's present step, interpolated linearly.
+        """Return the actors at a time since the start [s] within SUMO's present step, interpolated linearly.
 
-        Times must ascend, since an actor stays on the bridge, or below it, where it was.
+        Times must ascend, since an actor stays on a bridge, or below it, by its last height.
         """
         share = time_s / STEP_S - (self.ticks - 1)
         first, last = self._ends
@@ -132,17 +131,20 @@ class SumoTraffic:
         return self._actors
 
     def _recast(self, names: Sequence[str]) -> None:
-        """Set up these actors; new ones stand on the ground, or on the bridge that their lane leads over."""
+        """Set up these actors; new ones are on the ground, or on the bridge that their lane leads over."""
         kinds = [self._kinds[self._after[name][0]] for name in names]
         size = np.array([SHAPES[category][shape][1:] for category, shape in kinds], np.float64).reshape(-1, 3)
         count = len(names)
-        front, turned = self._ends[0][:, :2], np.pi / 2 - np.radians(self._ends[0][:, 2])
+        front = self._ends[0][:, :2]
+        turned = np.pi / 2 - np.radians(self._ends[0][:, 2])
         position = np.column_stack((front - size[:, :1] / 2 * heading_vectors(turned), np.full(count, np.nan)))
         known = dict(zip(self._actors.name, self._actors.position[:, 2].tolist()))
         position[:, 2] = [known.get(name, np.nan) for name in names]
-        relief, new = self._town.relief, np.flatnonzero(np.isnan(position[:, 2]))
+        relief = self._town.relief
+        new = np.flatnonzero(np.isnan(position[:, 2]))
         if relief is not None and relief.decks and len(new):
-            centre, yaw = position[None, new, :2], turned[None, new]
+            centre = position[None, new, :2]
+            yaw = turned[None, new]
             footing = find_footing(relief, self._town.net, centre, yaw)
             position[new, 2] = footing(centre[..., 0], centre[..., 1])[0]
         self._actors = Actors(
@@ -165,7 +167,7 @@ class SumoTraffic:
 
 
 def _list_vehicles(bodies: Actors) -> list[Body]:
-    """Return the rows of `bodies` in a request."""
+    """Return the vehicles among `bodies` as rows of a request."""
     front = bodies.position[:, :2] + bodies.size[:, :1] / 2 * heading_vectors(bodies.yaw)
     angle = (90.0 - np.degrees(bodies.yaw)) % 360.0
     speed = np.linalg.norm(bodies.velocity[:, :2], axis=1)
@@ -179,10 +181,10 @@ def _list_vehicles(bodies: Actors) -> list[Body]:
 
 
 def _list_dangers(bodies: Actors) -> list[list[float]]:
-    """Return x, y, half width [m], cosine and sine of the heading, of places to brake for, now and `SOON_S` later.
+    """Return the places to brake for, now and `SOON_S` later: x, y, half width [m], cosine and sine of the heading.
 
-    The heading of walkers, props and vehicles that hardly move is 0, 0: all brake for them, and for others only those
-    whose way they cross.
+    The heading of walkers, props and vehicles that hardly move is 0, 0: all vehicles brake for them; for moving ones,
+    only those whose way they cross.
     """
     moves = np.isin(bodies.category, VEHICLES) & (np.linalg.norm(bodies.velocity[:, :2], axis=1) >= SLOW_MPS)
     heading = heading_vectors(bodies.yaw)
@@ -197,7 +199,7 @@ def _list_dangers(bodies: Actors) -> list[list[float]]:
 
 
 def stand_parked(town: Town, ground: TownGround, seed: int) -> Actors:
-    """Return the vehicles parked along a town's streets, the same as in a recording with this seed."""
+    """Return the vehicles parked along a town's streets, which are those of a recording with this seed."""
     cars = park(read_net(town.net), town.parameters, stream(seed, "parked")) if town.net.exists() else []
     if not cars:
         return NOBODY
@@ -218,15 +220,15 @@ LETTERS = frozenset("GgyruosO")  # SUMO's states of a link
 
 @dataclass(frozen=True)
 class LightProgram:
-    """The program of one junction's lights."""
+    """The traffic light program of a junction."""
 
     junction: str
-    durations_s: tuple[float, ...]  # of each phase
-    states: tuple[str, ...]  # of each phase, one of `LETTERS` for each link
-    offset_s: float  # the first phase begins at this time
+    durations_s: tuple[float, ...]  # per phase [s]
+    states: tuple[str, ...]  # per phase, one of `LETTERS` per link
+    offset_s: float  # time at which the first phase begins [s]
 
     def at(self, time_s: float) -> str:
-        """Return the letters of the links at a time [s]."""
+        """Return the state letters of the links at a time [s]."""
         left = (time_s - self.offset_s) % sum(self.durations_s)
         for duration, state in zip(self.durations_s, self.states):
             if left < duration - 1e-6:
@@ -236,26 +238,26 @@ class LightProgram:
 
 
 class TrafficLights:
-    """The lights of a town, which follow their programs unless they are set or frozen."""
+    """The traffic lights of a town, which follow their programs unless they are set or frozen."""
 
     def __init__(self, programs: tuple[LightProgram, ...], time_s: float) -> None:
-        """Start at a time of the programs [s]."""
+        """Start the programs at a time [s]."""
         self.frozen = False
-        self._programs = {each.junction: each for each in programs}
+        self._programs = {program.junction: program for program in programs}
         self._time_s = time_s
         self._set: dict[str, str] = {}
 
     def advance(self, dt_s: float) -> None:
-        """Let the programs go on by `dt_s` [s], unless they are frozen."""
+        """Advance the programs by `dt_s` [s], unless they are frozen."""
         if not self.frozen:
             self._time_s += dt_s
 
     def states(self) -> dict[str, str]:
-        """Return the letters of the links of each junction."""
-        return {name: self._set.get(name) or each.at(self._time_s) for name, each in self._programs.items()}
+        """Return the state letters of the links, by junction."""
+        return {name: self._set.get(name) or program.at(self._time_s) for name, program in self._programs.items()}
 
     def set(self, junction: str, state: str | None) -> None:
-        """Let a junction show these letters, or its program again (None); raises `InputError` for others."""
+        """Set the state letters of a junction, or return it to its program (None). Raises `InputError` if invalid."""
         if junction not in self._programs:
             raise InputError(f"light {shorten(junction)}: the town has no such junction with lights")
         if state is None:
@@ -269,21 +271,22 @@ class TrafficLights:
 
 
 def read_light_programs(net: Path) -> tuple[LightProgram, ...]:
-    """Return the first program of each junction with lights; none where there is no net file.
+    """Read the first program of every signalised junction; none without a net file.
 
-    Phases of programs that react to traffic keep their nominal durations. Raises `InputError` for a damaged net.
+    Phases of traffic-actuated programs have their nominal durations. Raises `InputError` for a damaged net.
     """
     if not net.exists():
         return ()
-    found: dict[str, LightProgram] = {}
+    programs: dict[str, LightProgram] = {}
     try:
         for row in read_xml(net, "a SUMO net").iterfind("tlLogic"):
-            name, phases = row.attrib["id"], row.findall("phase")
+            name = row.attrib["id"]
+            phases = row.findall("phase")
             durations = tuple(float(phase.attrib["duration"]) for phase in phases)
             states = tuple(phase.attrib["state"] for phase in phases)
             if not 0 < sum(durations) < 1e6 or len({len(state) for state in states}) != 1:
                 raise ValueError(f"the phases of light {name}")
-            found.setdefault(name, LightProgram(name, durations, states, float(row.get("offset", "0"))))
+            programs.setdefault(name, LightProgram(name, durations, states, float(row.get("offset", "0"))))
     except (LookupError, ValueError) as error:
         raise InputError(f"{net}: not a SUMO net ({type(error).__name__}: {error})") from None
-    return tuple(found[name] for name in sorted(found))
+    return tuple(programs[name] for name in sorted(programs))

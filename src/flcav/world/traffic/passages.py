@@ -1,4 +1,4 @@
-"""Reachability in a road net, and passages: routes from where vehicles enter an open net to where they leave it."""
+"""Reachability in a road net, and passages: routes from the entries of an open net to its exits."""
 
 from dataclasses import dataclass, replace
 
@@ -11,27 +11,27 @@ from flcav.config import InputError
 from flcav.world.map.roads import Edge, RoadNet
 
 HASTE = 1.2  # highest speed of a car, as a multiple of the limit
-ENTERING_S = 1.0  # a vehicle enters with its whole length on the first edge, and leaves with its front
-SHORT_S = 10.0  # a way that takes less time at the limit is driven more slowly where a drive has to last longer
-SLOWEST = 1.0  # but no more slowly than this [m/s]
-ENTERING_M, LEAVING_S = 6.0, 0.6  # parts of such a way that are not driven: a vehicle's length, and the last moments
-ALIKE = 1.05  # of two ways, whose lengths differ by less than this factor, either may be taken
+ENTERING_S = 1.0  # time that is lost since a vehicle enters with its whole length, and leaves with its front
+SHORT_S = 10.0  # a route that takes less time at the limit is driven more slowly if a drive has to last longer
+SLOWEST = 1.0  # least speed on such a route [m/s]
+ENTERING_M, LEAVING_S = 6.0, 0.6  # parts of such a route that are not driven: a vehicle's length, and the last moments
+ALIKE = 1.05  # factor of lengths up to which two routes count as equally long
 
 
 @dataclass(frozen=True)
 class Passages:
-    """The driven edges of a net, where each leads, and for how long a vehicle can drive on from there."""
+    """The N driven edges of a net, their successors, and the longest remaining driving times."""
 
     edges: list[Edge]
-    onward: list[list[int]]  # per edge, the rows of those that follow it
-    time_s: Array  # (N,) on each edge at the limit
-    left_s: Array  # (N,) longest from the beginning of each edge to where the net ends; infinite on a circle
-    entries: Mask  # (N,) whether nothing leads to it
+    onward: list[list[int]]  # per edge, the rows of its successors
+    time_s: Array  # (N,) travel time on the edge at the limit [s]
+    left_s: Array  # (N,) longest travel time from the edge's beginning to an exit [s]; infinite on a cycle
+    entries: Mask  # (N,) whether the edge has no predecessor
 
     def slow_down(self, least_s: float) -> tuple["Passages", float | None]:
-        """Return the passages at the speed at which the longest way takes `least_s` [s], and its share of the limit.
+        """Return the passages at the speed at which the longest route takes `least_s` [s], and its share of the limit.
 
-        The share is None where the way is long enough for a vehicle of any speed, or not short, and where that speed
+        The latter is None if the route is long enough for a vehicle of any speed, if it is not short, and if the speed
         would be too low.
         """
         longest, enough = float(self.left_s.max(initial=0.0)), HASTE * (least_s + ENTERING_S)
@@ -43,7 +43,7 @@ class Passages:
 
     @property
     def _limit(self) -> float:
-        """Return the limit where the longest way begins [m/s]."""
+        """The speed limit at the beginning of the longest route [m/s]."""
         return self.edges[int(self.left_s.argmax())].lanes_of("driving")[0].speed
 
     def _measure_crawl(self) -> float:
@@ -51,10 +51,10 @@ class Passages:
         return max(float(self.left_s.max(initial=0.0)) * self._limit - ENTERING_M, 0.0) / SLOWEST
 
     def draw(self, weight: Array, random: np.random.Generator, *, least_s: float, most_s: float) -> list[int]:
-        """Return the rows of a route that takes `least_s` [s] even at `HASTE`, and goes on for `most_s` or to an exit.
+        """Draw a route (rows) that takes `least_s` [s] even at `HASTE`, and continues for `most_s` [s] or to an exit.
 
-        The first edge is drawn by `weight` (N,), each following one uniformly, both among those that lead far enough.
-        Raises `InputError` where no way does.
+        The first edge is drawn by `weight` (N,), the following ones uniformly, among those that lead far enough. Raises
+        `InputError` where none does.
         """
         left = HASTE * (least_s + ENTERING_S) if least_s else 0.0
         most = max(left, most_s)
@@ -70,7 +70,8 @@ class Passages:
                 "or fewer vehicles"
             )
         at = int(random.choice(len(self.edges), p=share / share.sum()))
-        route, driven_s = [at], self.time_s[at]
+        route = [at]
+        driven_s = self.time_s[at]
         while self.onward[at] and driven_s < most:
             far = [row for row in self.onward[at] if self.left_s[row] >= left - driven_s]
             at = far[int(random.integers(len(far)))]
@@ -80,11 +81,12 @@ class Passages:
 
 
 def find_passages(net: RoadNet, edges: list[Edge]) -> Passages:
-    """Return the passages through the net by its driven `edges`."""
+    """Return the passages through a net by its driven `edges`."""
     row = {edge.id: i for i, edge in enumerate(edges)}
     graph = make_drive_graph(net, edges).subgraph(row)
     time_s = np.array([measure_edge(edge) / edge.lanes_of("driving")[0].speed for edge in edges])
     left_s = np.zeros(len(edges))
+    # The condensation has no cycles: in reverse topological order, all successors of a part are already known.
     whole = networkx.condensation(graph)
     for part in reversed(list(networkx.topological_sort(whole))):
         names = whole.nodes[part]["members"]
@@ -103,7 +105,7 @@ def measure_edge(edge: Edge) -> float:
 
 
 def make_drive_graph(net: RoadNet, edges: list[Edge]) -> networkx.DiGraph:
-    """Return the graph of the edges that vehicles can drive on, the `edges` first, and which leads to which."""
+    """Return the directed graph of the edges that vehicles can drive on, with `edges` first."""
     graph = networkx.DiGraph()
     graph.add_nodes_from(edge.id for edge in edges)
     driven = {lane.id for edge in net.edges.values() for lane in edge.lanes_of("driving")}
@@ -114,29 +116,29 @@ def make_drive_graph(net: RoadNet, edges: list[Edge]) -> networkx.DiGraph:
 
 
 def find_driven(net: RoadNet, edges: list[Edge]) -> Mask:
-    """Return (N, N) whether a vehicle can drive from each of the `edges` to each of them; in a circle to itself."""
+    """Return (N, N) whether a vehicle can drive from one of the `edges` (row) to another or itself (column)."""
     graph = make_drive_graph(net, edges)
     row = {edge.id: i for i, edge in enumerate(edges)}
     whole = networkx.condensation(graph)
     out = np.zeros((len(edges), len(edges)), np.bool_)
-    onward: dict[int, Mask] = {}  # of each strongly connected part, the edges from there on
+    onward: dict[int, Mask] = {}  # strongly connected component -> edges reachable from it, with its members
     for part in reversed(list(networkx.topological_sort(whole))):
         members = whole.nodes[part]["members"]
         mask = np.zeros(len(edges), np.bool_)
         for following in whole.successors(part):
             mask |= onward[following]
         cyclic = len(members) > 1 or any(graph.has_edge(name, name) for name in members)
-        own = [row[name] for name in members if name in row]
-        mask[own] |= cyclic
-        out[own] = mask
+        rows = [row[name] for name in members if name in row]
+        mask[rows] |= cyclic
+        out[rows] = mask
         mask = mask.copy()
-        mask[own] = True
+        mask[rows] = True
         onward[part] = mask
     return out
 
 
 def find_walked(net: RoadNet, edges: list[Edge]) -> Mask:
-    """Return (N, N) whether a pedestrian can walk between each two of the `edges`, by sidewalks and crossings."""
+    """Return (N, N) whether a pedestrian can walk between two of the `edges`, by sidewalks and crossings."""
     graph = networkx.Graph()
     graph.add_nodes_from(edge.id for edge in edges)
     walked = {

@@ -1,6 +1,6 @@
-"""The SUMO process, which makes the steps of recordings and of live worlds, and the states that a recording keeps.
+"""The SUMO process, which makes the steps of recordings and of live worlds, and the recorded states.
 
-`serve_traffic` reads requests and writes an answer to each, JSON on a line. The first request of a run is its
+`serve_traffic` reads requests and writes their answers, one line of JSON each. The first request of a run is its
 `TrafficJob`; the run is a fork of this process, since libsumo holds one simulation per process and takes longer to load
 than a minute of traffic. `{"step": StepRequest}` makes a step,
 `{"record": {"steps": [...], "out": FILE}}` records the run into a file; the answer is `States`, as at the start. `null`
@@ -23,11 +23,11 @@ from flcav.world.traffic.simulation import Simulation, States, StepRequest, Traf
 
 
 def serve_traffic() -> None:
-    """Run each job that is read from stdin, in a fork."""
+    """Run the jobs that are read from stdin in forks."""
     import libsumo  # noqa: F401 - for the forks
 
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # left to the process that asks, which ends this one
-    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # where the process that asks is gone, end silently
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # left to the parent process, which ends this one
+    signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # end silently if the parent process is gone
     for line in sys.stdin.buffer:
         fork = os.fork()
         if not fork:
@@ -59,8 +59,8 @@ def _run(first: bytes) -> None:
             answer(simulation.states())
             while request := json.loads(sys.stdin.buffer.readline() or "null"):
                 said.truncate(0)
-                if asked := request.get("record"):
-                    record_traffic(simulation, asked["steps"], Path(asked["out"]))
+                if recording := request.get("record"):
+                    record_traffic(simulation, recording["steps"], Path(recording["out"]))
                 else:
                     simulation.step(StepRequest(**request["step"]))
                 answer(simulation.states())
@@ -72,19 +72,20 @@ def _run(first: bytes) -> None:
 
 
 class RecordedTraffic(NamedTuple):
-    """The states of A actors and the letters of J lights' links at T instants."""
+    """The states of A actors and J signalised junctions at T instants."""
 
     id: Words  # (A,)
-    type: Words  # (A,) SUMO's
+    type: Words  # (A,) SUMO's vehicle types
     state: Array  # (T, A, 4) SUMO's front x, y [m], angle [deg], speed [m/s]; NaN where absent
-    light: Words  # (J,)
-    light_state: Words  # (T, J)
-    events: Words  # () scenarios that took place, as JSON
+    light: Words  # (J,) junctions
+    light_state: Words  # (T, J) state letters of a junction's links
+    events: Words  # () scenarios that have happened, as JSON
 
 
 def record_traffic(simulation: Simulation, steps: Sequence[int], out: Path) -> None:
-    """Make the steps up to the last of `steps` (T,), ascending, and write the `RecordedTraffic` at these into `out`."""
-    lights, director = simulation.sumo.trafficlight, simulation.director
+    """Simulate up to the last of `steps` (T,), ascending, and write the `RecordedTraffic` at these steps to `out`."""
+    lights = simulation.sumo.trafficlight
+    director = simulation.director
     junctions, now = lights.getIDList(), 0
     seen: list[States] = []
     letters: list[list[str]] = []
@@ -97,11 +98,13 @@ def record_traffic(simulation: Simulation, steps: Sequence[int], out: Path) -> N
     if director:
         for states, step in zip(seen, steps):  # only now, since a script may place a prop at earlier steps
             states |= {name: (kind, *state) for name, kind, state in director.props(step)}
-    kinds = {name: each[0] for states in seen for name, each in states.items()}
+    kinds = {name: actor_state[0] for states in seen for name, actor_state in states.items()}
     column = {name: i for i, name in enumerate(kinds)}
     state = np.full((len(steps), len(kinds), 4), np.nan)
     for row, states in zip(state, seen):
-        row[[column[name] for name in states]] = np.array([each[1:] for each in states.values()]).reshape(-1, 4)
+        row[[column[name] for name in states]] = np.array([actor_state[1:] for actor_state in states.values()]).reshape(
+            -1, 4
+        )
     recorded = RecordedTraffic(
         id=np.array(list(kinds), dtype=np.str_),
         type=np.array(list(kinds.values()), dtype=np.str_),

@@ -1,13 +1,12 @@
-"""Stepped traffic: a SUMO run that is the same for recordings and for live worlds, and reacts to what is driven there.
+"""Stepped traffic: a SUMO run, the same for recordings and for live worlds, that reacts to controlled vehicles.
 
-A step of `STEP_S` obeys a `StepRequest`: the vehicles under control are placed, SUMO's brake for what is in their way,
-and then all move. Nobody is under control in a recording.
+A step of `STEP_S` executes a `StepRequest`: the controlled vehicles are placed, SUMO's vehicles brake for obstacles in
+their way, and then all move. A recording has no controlled vehicles.
 
-Pedestrians of limited speed.
-
-In SUMO's "striping" model they jump: up to three stripes aside in one step, and from one end of a junction's corner to
-the other where they wait for one crossing and another turns green. Here a pedestrian who falls behind follows the path
-of SUMO's pedestrian at no more than `HURRY_MPS` until caught up. Nothing of later steps is used.
+The speed of pedestrians is limited. In SUMO's "striping" model they jump: up to three stripes aside in one step, and
+from one end of a junction's corner to the other if they wait for one crossing and another turns green. Here a
+pedestrian who falls behind follows the path of SUMO's pedestrian at no more than `HURRY_MPS` until caught up. This is
+causal: later steps are not used.
 """
 
 import math
@@ -20,38 +19,38 @@ from flcav.world.scenarios.director import Director
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.scenarios.stage import STEP_S, Brakes, Danger, State
 
-OWN = "own:"  # begins the names of vehicles under control
-NEAR_LANE_M = 5.0  # a vehicle under control is on a lane whose middle is so near, else off the road
-HALT_STEPS = round(5.0 / STEP_S)  # for so long a vehicle stands after a collision
+OWN = "own:"  # prefix of the names of controlled vehicles
+NEAR_LANE_M = 5.0  # a controlled vehicle farther from all lanes' centre lines is off the road
+HALT_STEPS = round(5.0 / STEP_S)  # steps for which a vehicle stops after a collision
 NET, ROUTES = "town.net.xml", "town.rou.xml"
 
 States = dict[str, tuple[str, float, float, float, float]]
 """By name of a vehicle or pedestrian: SUMO's type, front x, y [m], angle [deg clockwise from north], speed [m/s]."""
 
 Body = tuple[str, str, Sequence[float]]
-"""A vehicle under control: name, SUMO's type; length, width, front x, y [m], angle [deg], speed [m/s]."""
+"""A controlled vehicle: name, SUMO's type; length, width, front x, y [m], angle [deg], speed [m/s]."""
 
 
 class TrafficJob(NamedTuple):
-    """Inputs of a run; its folder holds SUMO's files `NET` and `ROUTES`."""
+    """Inputs of a run; its folder has SUMO's files `NET` and `ROUTES`."""
 
     folder: str
     seed: int
-    followers: Mapping[str, tuple[str, str, list[str]]]  # by a vehicle that leaves: name, type, edges of the next
-    again: int | None = None  # vehicles without one set out again, numbered from this; None where they do not
-    edge: str = ""  # a route for the vehicles under control; without one, SUMO does not see them
+    followers: Mapping[str, tuple[str, str, list[str]]]  # by predecessor: name, type, edges of the successor
+    again: int | None = None  # number from which vehicles without successor depart again; None: they do not
+    edge: str = ""  # a route for the controlled vehicles; without one, SUMO ignores them
     scenarios: Sequence[Mapping[str, object]] = ()  # as JSON
-    steps: int = 0  # that are made at the start
+    steps: int = 0  # number of steps at the start
 
 
 class StepRequest(NamedTuple):
     """External inputs of a step."""
 
-    bodies: Sequence[Body] = ()  # under control
-    dangers: Sequence[Danger] = ()  # to brake for
-    lights: Mapping[str, str] = {}  # letters of each junction's links, where they changed
+    bodies: Sequence[Body] = ()  # controlled vehicles
+    dangers: Sequence[Danger] = ()  # places to brake for
+    lights: Mapping[str, str] = {}  # state letters of junctions' links that have changed
     halted: Sequence[str] = ()  # vehicles that a collision has stopped
-    gone: Sequence[str] = ()  # SUMO's own vehicles and pedestrians that leave at once, and are not followed
+    gone: Sequence[str] = ()  # SUMO's vehicles and pedestrians to be removed without replacement
 
 
 class Simulation:
@@ -78,9 +77,9 @@ class Simulation:
         self._walkers = Walkers(STEP_S)
         self._brakes = Brakes(sumo.vehicle)
         self._followers, self._again = job.followers, job.again
-        self._tours: dict[str, tuple[str, list[str]]] = {}  # of SUMO's vehicles: type and edges
+        self._tours: dict[str, tuple[str, list[str]]] = {}  # SUMO's vehicle -> type and edges
         self._own: set[str] = set()
-        self._halted: dict[str, int] = {}  # vehicle -> steps that it still stands
+        self._halted: dict[str, int] = {}  # vehicle -> remaining steps of its stop
         self._drives = bool(job.edge)
         if self._drives:
             sumo.route.add("own", [job.edge])
@@ -88,7 +87,7 @@ class Simulation:
             self.advance()
 
     def step(self, request: StepRequest) -> None:
-        """Make a step that obeys the request."""
+        """Make a step with these external inputs."""
         for light, state in request.lights.items():
             self.sumo.trafficlight.setRedYellowGreenState(light, state)
         for name in request.gone:
@@ -102,7 +101,7 @@ class Simulation:
         self.advance()
 
     def states(self) -> States:
-        """Return the states of SUMO's vehicles and pedestrians, with the shifts and turns of scenarios."""
+        """Return the states of SUMO's vehicles and pedestrians, with displacements by scenarios."""
         seen = self.director.stage.seen if self.director else None
         out: States = {}
         for name in self.sumo.vehicle.getIDList():
@@ -114,7 +113,7 @@ class Simulation:
         return out
 
     def advance(self) -> None:
-        """Advance by a step; vehicles that have arrived are replaced by the next ones, or set out again."""
+        """Advance by a step; vehicles that have arrived are replaced by their successors, or depart again."""
         sumo = self.sumo
         sumo.simulationStep()
         for name in sumo.simulation.getArrivedIDList():
@@ -144,7 +143,7 @@ class Simulation:
             self.sumo.person.remove(name)
 
     def _follow(self, name: str, kind: str, edges: list[str]) -> None:
-        """Let the next vehicle enter when one has arrived, if there is a next one."""
+        """Insert the successor of a vehicle that has arrived, if there is one."""
         if name in self._followers:
             follower, kind, edges = self._followers[name]
         elif self._again is not None:
@@ -156,7 +155,7 @@ class Simulation:
         self.sumo.vehicle.add(follower, follower, kind, departPos="base", departSpeed="max", departLane="best")
 
     def _mirror(self, bodies: Sequence[Body]) -> None:
-        """Mirror the vehicles under control in SUMO: place `bodies`, and remove those that are no longer among them."""
+        """Mirror the controlled vehicles in SUMO: place `bodies`, and remove vehicles that are no longer among them."""
         vehicle = self.sumo.vehicle
         names = {OWN + row[0] for row in bodies}
         for name in sorted(self._own - names):
@@ -180,7 +179,7 @@ def _state_of(domain: Any, name: str) -> State:
 
 
 def _type_of(domain: Any, name: str) -> str:
-    """Return the type of a vehicle or pedestrian; "type@vehicle" is SUMO's copy of a type for one vehicle."""
+    """Return the type of a vehicle or pedestrian, without the suffix of SUMO's copy for one vehicle, "type@vehicle"."""
     return domain.getTypeID(name).partition("@")[0]
 
 
@@ -188,21 +187,21 @@ HURRY_MPS = 2.5  # jogging speed; the pedestrians of the demand walk at no more 
 
 
 class Walkers:
-    """The pedestrians of a run, with limited speed: they follow SUMO's pedestrians step by step."""
+    """The pedestrians of a run: they follow SUMO's pedestrians with limited speed."""
 
     def __init__(self, step_s: float) -> None:
         """Start without pedestrians; `step_s` is the duration of a step [s]."""
-        self.states: dict[str, State] = {}  # of those present now, in SUMO's order
+        self.states: dict[str, State] = {}  # of the present pedestrians, in SUMO's order
         self._step_s = step_s
         self._behind: dict[str, deque[tuple[float, float]]] = {}  # path between a pedestrian and SUMO's
 
     def follow(self, targets: Mapping[str, State]) -> None:
-        """Advance by one step, in which SUMO's pedestrians reach `targets`; those not among them leave."""
+        """Advance by one step, in which SUMO's pedestrians reach `targets`; others are removed."""
         self.states = {name: self._follow(name, target) for name, target in targets.items()}
         self._behind = {name: path for name, path in self._behind.items() if path and name in targets}
 
     def _follow(self, name: str, target: State) -> State:
-        """Return `target`, or where it is out of reach the state on the path to it, with its own angle and speed."""
+        """Return `target`, or, if it is out of reach, the reached state on the path to it."""
         if name not in self.states:
             return target
         path = self._behind.setdefault(name, deque())

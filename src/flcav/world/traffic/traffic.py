@@ -1,8 +1,7 @@
 """Traffic simulation of a town by SUMO: the smoothed motion of all actors and the parked vehicles, as a `Trace`.
 
-Actors on a relief: their heights, pitch and roll, and how fast they climb.
-
-SUMO moves them in plan. Their horizontal velocity stays as it is; the vertical one follows from the ground they pass.
+SUMO moves actors in plan. On a relief, heights, pitch, roll and vertical velocities follow from the ground; horizontal
+velocities are unchanged.
 """
 
 import contextlib
@@ -36,20 +35,20 @@ from flcav.world.traffic.client import Sumo, write_job
 from flcav.world.traffic.demand import Demand, Parked, list_vehicle_types, park, write_demand
 from flcav.world.traffic.process import RecordedTraffic
 
-FILL_S = 30.0  # all actors have departed by then
+FILL_S = 30.0  # time by which all actors have departed
 SMOOTHING_STEPS = 4  # half width of the moving average of poses, since SUMO turns and changes lanes abruptly
-REACH_S = (SMOOTHING_STEPS + 1) * STEP_S  # a trace's state depends on SUMO's up to this much later, by its rates
+REACH_S = (SMOOTHING_STEPS + 1) * STEP_S  # look-ahead: a trace's state depends on SUMO's states up to so much later
 
 
 def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: Sequence[Scenario] = ()) -> Trace:
-    """Return the traffic of `town` at `times_s` (T,), ascending multiples of 0.1 s; at time 0 the town is empty.
+    """Simulate the traffic of `town`; return it at `times_s` (T,), ascending multiples of 0.1 s.
 
-    Actors are "cav<i>" (sedans, under way from the start), "veh<i>", "ped<i>", "parked<i>", and "scripted<i>" for those
-    created for a scenario; actors absent at all of `times_s` are left out. Until `FILL_S` the town is still filling.
-    Each of the `scenarios` waits from its `at_s` on until the traffic allows it; `events` of the trace are those that
-    took place. The same arguments give the same trace. Raises `InputError` for other times, for a negative `cavs`,
-    where not all CAVs are on the road at all times, and for a red-light scenario in a town without traffic lights;
-    `RuntimeError` where SUMO fails.
+    At time 0 the town is empty, and it fills until `FILL_S`. Actors are "cav<i>" (sedans, travelling from the start),
+    "veh<i>", "ped<i>", "parked<i>", and "scripted<i>" for those created for a scenario; actors absent at all of
+    `times_s` are left out. A scenario waits from its `at_s` on until the traffic allows it; `events` of the trace are
+    those that have happened. The same arguments give the same trace. Raises `InputError` for other times, for a
+    negative `cavs`, where not all CAVs are on the road at all times, and for a red-light scenario in a town without
+    traffic lights; `RuntimeError` where SUMO fails.
     """
     return simulate_drives(town, seed=seed, cavs=cavs, times_s=times_s, lead_s=0.0, scenarios=scenarios)[0]
 
@@ -57,10 +56,10 @@ def simulate(town: Town, *, seed: int, cavs: int, times_s: NDArray, scenarios: S
 def simulate_drives(
     town: Town, *, seed: int, cavs: int, times_s: NDArray, lead_s: float, scenarios: Sequence[Scenario] = ()
 ) -> tuple[Trace, Trace]:
-    """Return the traffic as `simulate` does, and the motion of the CAVs alone at every step.
+    """Return the traffic as `simulate` does, and the motion of only the CAVs at every step.
 
-    The latter is from `lead_s` before the first of `times_s` to the last; a CAV that was not yet under way is absent.
-    Raises `InputError` and `RuntimeError` as `simulate` does.
+    The latter is from `lead_s` [s] before the first of `times_s` to the last; a CAV that has not departed yet is
+    absent. Raises `InputError` and `RuntimeError` as `simulate` does.
     """
     times_s = np.asarray(times_s, dtype=np.float64)
     steps = np.rint(times_s / STEP_S).astype(np.int64)
@@ -81,7 +80,7 @@ def simulate_drives(
     read = np.unique(np.concatenate((*windows, *drive_windows)))
     raw = _run(town.net, demand, derive_seed(seed, "sumo"), read, scenarios)
     parked = _drop_obstructing(raw, park(net, town.parameters, stream(seed, "parked")))
-    rows, drive_rows = (tuple(np.searchsorted(read, each) for each in own) for own in (windows, drive_windows))
+    rows, drive_rows = (tuple(np.searchsorted(read, window) for window in spans) for spans in (windows, drive_windows))
     trace = _build_trace(town, np.asarray(times_s.round(1)), raw, rows, parked)
     under_way = trace.present[:, np.char.startswith(trace.actor, "cav")]
     if under_way.sum() < cavs * len(times_s):
@@ -92,20 +91,22 @@ def simulate_drives(
 
 
 def _of_cavs(raw: RecordedTraffic) -> RecordedTraffic:
-    """Return the states of CAVs alone."""
-    own = np.char.startswith(raw.id, "cav")
-    return raw._replace(id=raw.id[own], type=raw.type[own], state=raw.state[:, own])
+    """Select the states of CAVs."""
+    is_cav = np.char.startswith(raw.id, "cav")
+    return raw._replace(id=raw.id[is_cav], type=raw.type[is_cav], state=raw.state[:, is_cav])
 
 
 def _windows(steps: Ints) -> Ints:
-    """Return the steps (T, W) over which the state at each of `steps` (T,) is averaged; none before 1."""
+    """Return the steps (T, W) over which the states at `steps` (T,) are averaged; at least 1."""
     return np.maximum(steps[:, None] + np.arange(-SMOOTHING_STEPS, SMOOTHING_STEPS + 1), 1)
 
 
 def _run(net: Path, demand: Demand, seed: int, steps: Ints, scenarios: Sequence[Scenario]) -> RecordedTraffic:
-    """Return the states at these steps of a run with nobody under control; raises `RuntimeError` where SUMO fails."""
+    """Run SUMO without controlled vehicles; return its states at these steps. Raises `RuntimeError` where it fails."""
     with tempfile.TemporaryDirectory(prefix="flcav_traffic_") as name:
-        job = write_job(Path(name), net, demand, seed)._replace(scenarios=[each.model_dump() for each in scenarios])
+        job = write_job(Path(name), net, demand, seed)._replace(
+            scenarios=[scenario.model_dump() for scenario in scenarios]
+        )
         with contextlib.closing(Sumo(job, f"SUMO failed on {net}")) as sumo:
             sumo.record(steps.tolist(), out := Path(name) / "out.npz")
         with np.load(out) as arrays:
@@ -115,7 +116,7 @@ def _run(net: Path, demand: Demand, seed: int, steps: Ints, scenarios: Sequence[
 def _build_trace(
     town: Town, time_s: Array, raw: RecordedTraffic, windows: tuple[Ints, ...], parked: list[Parked]
 ) -> Trace:
-    """Return the trace of SUMO's states, averaged over `windows` (rows of the steps before, at and after the times)."""
+    """Build a trace from SUMO's states, averaged over `windows` (rows of the steps before, at and after the times)."""
     before, now, after = windows
     earlier, state, later = (_smooth(raw, window) for window in (before, now, after))
     rates = _rates(earlier, state, later)
@@ -167,11 +168,16 @@ def _build_trace(
 
 
 def _smooth(raw: RecordedTraffic, windows: Ints) -> Array:
-    """Return front x, y, yaw, speed (T, A, 4), averaged over each window (T, W); NaN where absent at its middle."""
+    """Return front x, y [m], yaw [rad], speed [m/s] (T, A, 4), averaged over windows (T, W).
+
+    NaN if absent in the middle.
+    """
     rows = np.unique(windows)
     dense, windows = _dense(raw, rows), np.searchsorted(rows, windows)
     total, count = np.zeros((len(windows), *dense.shape[1:])), np.zeros((len(windows), dense.shape[1], 1))
-    for column, opposite in zip(windows.T, windows.T[::-1]):  # both or neither: no shift of new actors
+    for column, opposite in zip(
+        windows.T, windows.T[::-1]
+    ):  # symmetric pairs, so that the mean of an actor that has just appeared is not shifted
         there = ~np.isnan(dense[column, :, :1] + dense[opposite, :, :1])
         total += np.where(there, dense[column], 0.0)
         count += there
@@ -182,7 +188,7 @@ def _smooth(raw: RecordedTraffic, windows: Ints) -> Array:
 
 
 def _dense(raw: RecordedTraffic, rows: Ints) -> Array:
-    """Return front x, y, unwrapped yaw, speed (R, A, 4) at `rows` (R,) of the steps read; NaN where absent."""
+    """Return front x, y [m], unwrapped yaw [rad], speed [m/s] (R, A, 4) at `rows` (R,); NaN where absent."""
     out = raw.state[rows]
     yaw = np.pi / 2 - np.radians(out[..., 2])
     out[..., 2] = np.where(np.isnan(yaw), np.nan, np.unwrap(np.nan_to_num(yaw), axis=0))
@@ -192,7 +198,7 @@ def _dense(raw: RecordedTraffic, rows: Ints) -> Array:
 def _rates(before: Array, now: Array, after: Array) -> Array:
     """Return acceleration [m/s^2] and yaw rate [rad/s] (T, A, 4) by central differences of states one step apart.
 
-    One-sided where an actor is absent before or after; NaN where it is absent now.
+    Differences are one-sided where an actor is absent before or after; NaN where it is absent now.
     """
 
     def motion(state: Array) -> Array:
@@ -207,12 +213,12 @@ def _rates(before: Array, now: Array, after: Array) -> Array:
 
 
 def _centre(state: Array, half_length: Array) -> Array:
-    """Return the centres (T, A, 2) of actors whose front x, y, yaw and speed are `state` (T, A, 4)."""
+    """Return the centres (T, A, 2) [m] of actors with the states (T, A, 4): front x, y [m], yaw [rad], speed [m/s]."""
     return state[..., :2] - half_length[:, None] * heading_vectors(state[..., 2])
 
 
 def _walk(before: Array, now: Array, after: Array) -> tuple[Array, Array]:
-    """Return velocity [m/s] and acceleration [m/s^2] (T, A, 3) by central differences of positions (T, A, 2).
+    """Return velocity [m/s] and acceleration [m/s^2] (T, A, 3) by central differences of positions (T, A, 2) [m].
 
     Positions are those a step before, now and a step after. Where an actor is absent before or after, the velocity is
     one-sided and the acceleration 0; NaN where it is absent now.
@@ -254,18 +260,18 @@ def _pavement(town: Town) -> BaseGeometry:
 
 
 def number_of(name: str) -> tuple[str, int]:
-    """Return the key that sorts names by their number: "veh2" before "veh10"."""
+    """Return the sort key of a name by kind and number: "veh2" before "veh10"."""
     kind = name.rstrip("0123456789")
     return kind, int(name[len(kind) :])
 
 
-DIFFERENCE_S = 0.3  # of the central differences along an actor's way: longer than it takes over a triangle's edge
+DIFFERENCE_S = 0.3  # step of the central differences along an actor's path, longer than crossing a triangle's edge
 
 
 class OnRelief(NamedTuple):
-    """The motion of A actors at T instants on a relief; NaN where absent."""
+    """The motion of A actors on a relief at T instants, world frame; NaN where absent."""
 
-    height: Array  # (T, A) of the ground under them [m]
+    height: Array  # (T, A) height of the ground under the actors [m]
     tilt: Array  # (T, A, 2) pitch and roll [rad]
     velocity: Array  # (T, A, 3) [m/s]
     acceleration: Array  # (T, A, 3) [m/s^2]
@@ -280,10 +286,11 @@ def stand_on_relief(
     size: Array,
     upright: Mask,
 ) -> OnRelief:
-    """Return the motion of actors on a relief, given that in plan.
+    """Return the motion of actors on a relief, given their motion in plan, world frame.
 
-    `heights` are those of what each actor stands on, at x, y (T, A) [m]. `centre` (T, A, 2) [m], `yaw` (T, A) [rad],
-    `velocity` and `acceleration` (T, A, 3); `size` (A, 3) [m]. Actors that are `upright` (A,) do not tilt.
+    `heights` gives the heights [m] of the surfaces that the actors are on, at x, y (T, A) [m]. `centre` is (T, A, 2)
+    [m], `yaw` (T, A) [rad], `velocity` (T, A, 3) [m/s], `acceleration` (T, A, 3) [m/s^2], `size` (A, 3) [m]. Actors
+    that are `upright` (A,) do not tilt.
     """
 
     def height_at(time_s: float) -> Array:

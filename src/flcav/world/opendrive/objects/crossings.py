@@ -1,6 +1,6 @@
 """Crosswalks of an OpenDRIVE map, and the crossings that they become in a town's net, in netconvert's plain files.
 
-Crosswalks of an OpenDRIVE map: objects with an outline, and markings that are signals (OpenDRIVE 1.8, 13 and 14).
+A crosswalk is an object with an outline, or a marking that is a signal (OpenDRIVE 1.8, 13 and 14).
 """
 
 import copy
@@ -18,23 +18,23 @@ from flcav.world.map.roads import CARRIAGEWAY, Edge, Lane, RoadNet, read_net
 from flcav.world.opendrive.objects.places import TakenOver, enclose_outline, locate_thing, outline_object, read_number
 from flcav.world.opendrive.road_surface import Road
 
-PAINTED_CROSSWALK = "1000003"  # type of a signal that is a painted crosswalk: its width is that across the road,
-WIDE_M = (1.0, 15.0)  # its value that of the walkers' way; widths that are believed
-LONG_M = (2.0, 60.0)  # lengths of a crosswalk that are believed
+PAINTED_CROSSWALK = "1000003"  # type of a signal that is a painted crosswalk
+WIDE_M = (1.0, 15.0)  # least and largest width of a crosswalk that is believed
+LONG_M = (2.0, 60.0)  # least and largest length, across the road, that is believed
 
 
 @dataclass(frozen=True)
 class Crosswalk:
-    """A crosswalk of the map, as the rectangle around it."""
+    """A crosswalk of the map, as the rectangle around it, in the town's frame."""
 
-    centre: Array  # (2,) town [m]
-    axes: Array  # (2, 2) unit vectors along its sides, one a row
+    centre: Array  # (2,) x, y of the centre [m]
+    axes: Array  # (2, 2) unit vectors along the sides, one a row
     sides: Array  # (2,) lengths of these sides [m]
 
     def along(self, walked: Array) -> tuple[Array, float, float]:
-        """Return the unit vector of the walkers' way, its length and its width [m].
+        """Return the unit vector (2,) in which pedestrians walk, and the crosswalk's length and width [m] along it.
 
-        It is that axis which is nearest to the direction `walked` (2,), and points along it.
+        It is the axis nearest to the direction `walked` (2,), with the sign that points along it.
         """
         share = self.axes @ walked
         first = int(np.argmax(np.abs(share)))
@@ -42,8 +42,9 @@ class Crosswalk:
 
 
 def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[Crosswalk]:
-    """Return the crosswalks of a map in town coordinates: map + `offset_m` [m]."""
-    found, left = [], Counter[str]()
+    """Find the crosswalks of the map below `root`; a place in the town is that in the map + `offset_m` (x, y) [m]."""
+    found = []
+    left = Counter[str]()
     for row in root.iterfind("road"):
         named = [thing for thing in row.iterfind("objects/object") if thing.get("type") == "crosswalk"]
         painted = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_CROSSWALK]
@@ -63,7 +64,11 @@ def find_crosswalks(root: ElementTree.Element, offset_m: tuple[float, float]) ->
 
 
 def _outline(road: Road, marking: ElementTree.Element) -> Array | None:
-    """Return the corners (4, 2) of a crosswalk that is a signal; None where it lacks its place or extents."""
+    """Compute the corners (4, 2) [m], in the map's frame, of a crosswalk that is a signal.
+
+    The signal's width is the length across the road, its value the width along it. None without a place or believed
+    extents.
+    """
     place = locate_thing(road, marking)
     across, along = read_number(marking, "width"), read_number(marking, "value")
     if place is None or not (LONG_M[0] <= across <= LONG_M[1] and WIDE_M[0] <= along <= WIDE_M[1]):
@@ -77,37 +82,37 @@ CORNERS = ((1, 1), (-1, 1), (-1, -1), (1, -1))
 
 
 def _enclose(outline: Array) -> Crosswalk | None:
-    """Return the smallest rectangle around an outline (K, 2); None where its sides are not those of a crosswalk."""
-    found = enclose_outline(outline)
-    if found is None:
+    """Enclose an outline (K, 2) [m] in the smallest rectangle; None where its sides are not those of a crosswalk."""
+    rectangle = enclose_outline(outline)
+    if rectangle is None:
         return None
-    sides = found.sides
+    sides = rectangle.sides
     if not (WIDE_M[0] <= sides.min() <= WIDE_M[1] and LONG_M[0] <= sides.max() <= LONG_M[1]):
         return None
-    return Crosswalk(found.centre, found.edges / sides[:, None], sides)
+    return Crosswalk(rectangle.centre, rectangle.edges / sides[:, None], sides)
 
 
-NEAR_M = 8.0  # from a crosswalk to the crossing at a junction that it is
-ALIGNED = np.cos(np.radians(30.0))  # least cosine of the angle between them
-ENDS_M = 12.0  # no crossing of a street is nearer to its ends than this: it is one of the junction
-ON_ROAD_M = 1.5  # from the middle of a crosswalk to the road that it crosses
-BEYOND_M = 3.0  # from the kerb of a street to the end of a crosswalk, at most
-SAME_M = 1.0  # between the middle lines of the two directions of a street
+NEAR_M = 8.0  # largest distance of a crosswalk from the guessed crossing at a junction that it replaces
+ALIGNED = np.cos(np.radians(30.0))  # least cosine of the angle between the two
+ENDS_M = 12.0  # least distance of a crossing from the ends of its street; nearer ones belong to the junction
+ON_ROAD_M = 1.5  # largest distance of the middle of a crosswalk from the lanes that it crosses
+BEYOND_M = 3.0  # largest distance of the end of a crosswalk from the kerb
+SAME_M = 1.0  # largest distance of the middle lines of both directions of a street
 
 
 @dataclass(frozen=True)
 class _Guess:
-    """A crossing that netconvert has guessed at a junction: its row, and its middle line (2, 2) [m]."""
+    """A crossing that netconvert has guessed at a junction."""
 
-    row: ElementTree.Element
-    line: Array
+    row: ElementTree.Element  # <crossing> of the plain connections
+    line: Array  # (2, 2) ends of the middle line, in the town's frame [m]
 
 
 def take_crosswalks(prefix: Path, net: Path, crosswalks: tuple[Crosswalk, ...]) -> int:
-    """Replace the guessed crossings in the plain files beside `prefix` by a map's crosswalks; return how many.
+    """Replace the guessed crossings in the plain files of `prefix` by a map's crosswalks; return their number.
 
-    `net` is the net with the guesses, of the same edges. A crosswalk at a junction takes the place of the guess next to
-    it; one across a street cuts the street in two there. Others are left out: they lead to no sidewalk.
+    `net` is the net file of the same edges with the guesses. A crosswalk at a junction replaces the guess next to it; a
+    crosswalk in the middle of a street splits the street there. Others are left out, since they lead to no sidewalk.
     """
     trees = {part: ElementTree.parse(f"{prefix}.{part}.xml") for part in ("nod", "edg", "con")}
     plain = {part: tree.getroot() for part, tree in trees.items()}
@@ -126,7 +131,7 @@ def take_crosswalks(prefix: Path, net: Path, crosswalks: tuple[Crosswalk, ...]) 
 
 
 def _guesses(connections: ElementTree.Element, net: Path) -> list[_Guess]:
-    """Return the crossings of the plain connections with their middle lines, which are read from the net."""
+    """List the crossings of the plain connections, with their middle lines from the file `net`."""
     lines: dict[tuple[str, frozenset[str]], Array] = {}
     for row in ElementTree.parse(net).getroot().iterfind("edge"):
         lane = row.find("lane")
@@ -139,7 +144,7 @@ def _guesses(connections: ElementTree.Element, net: Path) -> list[_Guess]:
 
 
 def _match(crosswalks: tuple[Crosswalk, ...], guesses: list[_Guess]) -> dict[int, int]:
-    """Return the guess of each crosswalk that has one, by their numbers: the nearest pairs first, each once."""
+    """Match crosswalks with guesses, by their indices: the nearest pairs first, and none of them twice."""
     pairs = []
     for i, crosswalk in enumerate(crosswalks):
         for j, guess in enumerate(guesses):
@@ -156,9 +161,10 @@ def _match(crosswalks: tuple[Crosswalk, ...], guesses: list[_Guess]) -> dict[int
 
 
 def _move(guess: _Guess, crosswalk: Crosswalk) -> ElementTree.Element:
-    """Return a guessed crossing moved onto the crosswalk: from kerb to kerb, in the middle of it and as wide.
+    """Move a guessed crossing onto the crosswalk: from kerb to kerb, in its middle and of its width.
 
-    It goes on as far as the crosswalk does, `BEYOND_M` at most: kerbs are farther apart in the corners of a junction.
+    It extends beyond the kerbs to the crosswalk's ends, by at most `BEYOND_M`: kerbs are farther apart in the corners
+    of a junction.
     """
     way, length, width = crosswalk.along(guess.line[1] - guess.line[0])
     low, high = (guess.line - crosswalk.centre) @ way
@@ -175,25 +181,25 @@ def _crossing(node: str, edges: str, priority: str, width: float, line: Array) -
 
 @dataclass(frozen=True)
 class _Part:
-    """One direction of a street, or of what is left of it after cuts: its plain row, line and sidewalk."""
+    """One direction of a street, or a piece of it after cuts."""
 
-    row: ElementTree.Element
-    line: LineString  # of the plain row: the middle of the road [m]
-    sidewalk: Lane
+    row: ElementTree.Element  # <edge> of the plain file
+    line: LineString  # shape of the row, the middle of the road, in the town's frame [m]
+    sidewalk: Lane  # outermost lane for pedestrians
 
     def at(self, place: Array) -> float:
-        """Return how far along the line it is to the point nearest to `place` (2,) [m]."""
+        """Compute the distance along the line [m] to its point nearest to `place` (2,) [m]."""
         return float(self.line.project(Point(place)))
 
 
 class _Streets:
-    """The streets of the plain files, which crosswalks cut in two."""
+    """The streets of the plain files, which crosswalks split."""
 
     def __init__(self, parts: dict[str, ElementTree.Element], net: RoadNet) -> None:
-        """Take netconvert's plain `nod`, `edg` and `con` files, and the net of the same edges."""
+        """Keep the roots of netconvert's plain `nod`, `edg` and `con` files, and the net of the same edges."""
         self._plain, self._net = parts, net
         places = {row.attrib["id"]: f"{row.attrib['x']},{row.attrib['y']}" for row in parts["nod"].iterfind("node")}
-        self._rows: dict[str, list[tuple[ElementTree.Element, LineString]]] = {}  # by the edge that they were
+        self._rows: dict[str, list[tuple[ElementTree.Element, LineString]]] = {}  # id of the uncut edge -> its pieces
         for row in parts["edg"].iterfind("edge"):
             text = row.get("shape", f"{places[row.attrib['from']]} {places[row.attrib['to']]}")
             points = [[float(value) for value in point.split(",")[:2]] for point in text.split()]
@@ -202,12 +208,12 @@ class _Streets:
     def cross(self, crosswalk: Crosswalk, name: str) -> bool:
         """Cut both directions of the street below a crosswalk at the new node `name`; return whether there is one.
 
-        Both need a sidewalk, and a place that is not near their ends.
+        Both need a sidewalk, and a place that is at least `ENDS_M` from their ends.
         """
-        found = self._find(crosswalk)
-        if found is None:
+        directions = self._find(crosswalk)
+        if directions is None:
             return False
-        one, other = found
+        one, other = directions
         across = [_nearest(part.sidewalk.shape, crosswalk.centre) for part in (other, one)]  # netconvert's direction
         walked = across[1] - across[0]
         way, _, width = crosswalk.along(walked)
@@ -224,7 +230,7 @@ class _Streets:
         return True
 
     def _find(self, crosswalk: Crosswalk) -> tuple[_Part, _Part] | None:
-        """Return both directions of the street below a crosswalk; None without two that can be cut there."""
+        """Find both directions of the street below a crosswalk; None without two that can be cut there."""
         near = []
         for edge in self._net.streets:
             lanes = [lane for lane in edge.lanes if lane.kind in CARRIAGEWAY and len(lane.shape) > 1]
@@ -242,7 +248,7 @@ class _Streets:
         return None
 
     def _part(self, edge: Edge, place: Array) -> _Part | None:
-        """Return the part of an edge that is at `place`; None near the ends of it."""
+        """Return the part of an edge at `place` (2,) [m]; None near the ends of the part."""
         rows = self._rows.get(edge.id, [])
         if not rows:
             return None
@@ -251,8 +257,9 @@ class _Streets:
         return part if ENDS_M <= part.at(place) <= line.length - ENDS_M else None
 
     def _cut(self, part: _Part, place: Array, node: str) -> str:
-        """Cut a part at the node and return the id of the second piece, which takes the ways onward."""
-        before, along = part.row.attrib["id"], part.at(place)
+        """Cut a part at the node; return the id of the second piece, from which the connections onward start."""
+        before = part.row.attrib["id"]
+        along = part.at(place)
         after = f"{before}.{node}"
         second = copy.deepcopy(part.row)
         second.attrib |= {"id": after, "from": node}
@@ -274,7 +281,7 @@ class _Streets:
 
 
 def _nearest(line: Array, place: Array) -> Array:
-    """Return the point (2,) of a line (K, 2) that is nearest to a place (2,)."""
+    """Find the point (2,) of a line (K, 2) that is nearest to a place (2,), all [m]."""
     whole = LineString(line)
     at = whole.interpolate(whole.project(Point(place)))
     return np.array([at.x, at.y])

@@ -16,11 +16,11 @@ from flcav.world.opendrive.road_surface import Road
 
 Part = TypeVar("Part")
 
-LARGEST_M = 200.0  # farthest corner of an object from its place, or from the middle of its road
+LARGEST_M = 200.0  # largest distance of an object's corner from its place, or from its road's reference line
 
 
 def repeat_object(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
-    """Yield an object, and its further copies: every `distance` over a `length` from `s` on."""
+    """Yield an object and its further copies: with every <repeat>, one per `distance` over `length`, from `s` on."""
     yield thing
     for row in thing.iterfind("repeat"):
         start, length, distance = (read_number(row, name) for name in ("s", "length", "distance"))
@@ -35,44 +35,45 @@ def repeat_object(thing: ElementTree.Element) -> Iterator[ElementTree.Element]:
 
 
 def outline_object(road: Road, thing: ElementTree.Element) -> Array | None:
-    """Return the outline (K, 2) of an object in the map [m]: its corners, or its length and width; None without.
+    """Compute the outline (K, 2) [m] of an object in the map's frame, from its corners, or else from its extents.
 
-    Corners are in the object's own frame (u, v), which its heading turns against the road, or on the road (s, t).
+    Corners are given in the object's frame (u, v), which its heading turns against the road, or on the road (s, t).
+    None where the object has no place, or neither corners nor extents.
     """
     place = locate_thing(road, thing)
     if place is None:
         return None
     corners = [*thing.iter("cornerLocal")]
     if len(corners) > 2:
-        own = np.array([(read_number(row, "u"), read_number(row, "v")) for row in corners])
+        local = np.array([(read_number(row, "u"), read_number(row, "v")) for row in corners])
     elif len(on_road := [*thing.iter("cornerRoad")]) > 2:
         s, t = (np.array([read_number(row, name) for row in on_road]) for name in ("s", "t"))
         return road.point(np.clip(s, 0.0, road.length), t)[:, :2] if np.abs(t).max() < LARGEST_M else None
     else:
         length, width = read_number(thing, "length") / 2, read_number(thing, "width") / 2
-        own = np.array([(length, width), (-length, width), (-length, -width), (length, -width)])
-    if not 0.0 < np.abs(own).max() < LARGEST_M:
+        local = np.array([(length, width), (-length, width), (-length, -width), (length, -width)])
+    if not 0.0 < np.abs(local).max() < LARGEST_M:
         return None
     yaw = place[2] + read_number(thing, "hdg")
     cos, sin = np.cos(yaw), np.sin(yaw)
-    return own @ np.array([[cos, sin], [-sin, cos]]) + place[:2]
+    return local @ np.array([[cos, sin], [-sin, cos]]) + place[:2]
 
 
 @dataclass(frozen=True)
 class TakenOver(Generic[Part]):
-    """What a town takes over of one kind of a map's things, and how many things were left out, by the reason."""
+    """What a town takes over from the things of one kind in a map."""
 
-    found: tuple[Part, ...]
-    left: Counter[str]
-    taken: int | None = None  # how many things of the map these are; None: as many
+    found: tuple[Part, ...]  # parts of the town
+    left: Counter[str]  # reason -> number of things that were left out
+    taken: int | None = None  # number of things in the map that became `found`; None: the same as the parts
 
     def notes(self, what: str) -> list[str]:
-        """Return the sentence of `note_taken` about these things."""
+        """Write the sentence of `note_taken` about these things; `what` is their name."""
         return note_taken(what, len(self.found) if self.taken is None else self.taken, self.left)
 
 
 def note_taken(what: str, taken: int, left: Counter[str]) -> list[str]:
-    """Return a sentence on how many of a map's things were taken over, and why others were not; none without any."""
+    """Write a sentence on how many things of a map were taken over and why others were not; empty without things."""
     if not taken and not left:
         return []
     reasons = "".join(f"; left out: {count} ({reason})" for reason, count in sorted(left.items()))
@@ -82,7 +83,7 @@ def note_taken(what: str, taken: int, left: Counter[str]) -> list[str]:
 def list_objects(
     root: ElementTree.Element, wanted: Callable[[ElementTree.Element], bool]
 ) -> Iterator[tuple[Road, ElementTree.Element]]:
-    """Yield the objects of a map for which `wanted` holds, each with its road."""
+    """Yield the objects of a map for which `wanted` is true, with their roads."""
     for row in root.iterfind("road"):
         things = [thing for thing in row.iterfind("objects/object") if wanted(thing)]
         if things:
@@ -92,11 +93,11 @@ def list_objects(
 
 @dataclass(frozen=True)
 class Rectangle:
-    """A rectangle in the plane, by its centre (2,), two edges (2, 2), one a row, and their lengths (2,) [m]."""
+    """A rectangle in the plane."""
 
-    centre: Array
-    edges: Array
-    sides: Array
+    centre: Array  # (2,) x, y of the centre [m]
+    edges: Array  # (2, 2) vectors along two neighbouring sides, one a row [m]
+    sides: Array  # (2,) lengths of these sides [m]
 
     @property
     def extents(self) -> tuple[float, float, float]:
@@ -107,7 +108,7 @@ class Rectangle:
 
 
 def enclose_outline(outline: Array) -> Rectangle | None:
-    """Return the smallest rectangle around an outline (K, 2); None where it has no area."""
+    """Enclose an outline (K, 2) [m] in the smallest rectangle; None where it has no area."""
     rectangle = shapely.oriented_envelope(shapely.MultiPoint(outline))
     if not isinstance(rectangle, Polygon):
         return None
@@ -119,7 +120,10 @@ def enclose_outline(outline: Array) -> Rectangle | None:
 def locate_thing(
     road: Road, thing: ElementTree.Element, offset_m: tuple[float, float] = (0.0, 0.0)
 ) -> tuple[float, float, float] | None:
-    """Return x, y [m] and the road's heading [rad] where a thing stands; None where it says no place on the road."""
+    """Locate an object or signal of a road by its s and t: x, y [m], + `offset_m` [m], and the road's heading [rad].
+
+    None where it has no valid place on the road.
+    """
     s, t = read_number(thing, "s", math.nan), read_number(thing, "t", math.nan)
     if not (0 <= s <= road.length and abs(t) < 100):
         return None
@@ -129,7 +133,7 @@ def locate_thing(
 
 
 def read_number(row: ElementTree.Element, name: str, otherwise: float = 0.0) -> float:
-    """Return an attribute as a finite number, `otherwise` where it is none."""
+    """Read an attribute as a finite number; `otherwise` where it is missing or none."""
     try:
         value = float(row.get(name, ""))
     except ValueError:

@@ -1,4 +1,4 @@
-"""Signal heads of an OpenDRIVE map: where they stand, and which way of the net they are for (OpenDRIVE 1.8, 14)."""
+"""Signal heads of an OpenDRIVE map: their places, and the connections of the net they control (OpenDRIVE 1.8, 14)."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -22,29 +22,35 @@ from flcav.world.opendrive.road_surface import Road
 Placed = tuple[ElementTree.Element, ElementTree.Element]  # a road, and a signal or a reference to one on it
 
 LIGHT, WALKERS = "1000001", "1000002"  # types of traffic lights: for vehicles, for pedestrians
-HEAD_M, WALKERS_HEAD_M = 1.0, 0.7  # heights of heads, for pedestrians too; a higher signal includes its post
-HEIGHT_M = (1.8, 9.0)  # heights of a head's centre that are believed
-WALKERS_M = (1.5, 4.0)  # the same, of a head for pedestrians
-WALKERS_UP_M = 2.4  # height of the centre of such a head that says none to be believed
-KERB_SIDE_M = 6.0  # from such a head to its end of a crossing
-PLACE_M = 15.0  # from the end of a road of the map to that of its lane in the net
-WAY_M = 40.0  # the same, of both ends of a way through a junction together
-ASKEW = np.cos(np.radians(60.0))  # a head whose axis is turned farther from its approach faces this instead
-KERB_M = 0.3  # from a mast to the road
-FARTHEST_M, STEP_M = 20.0, 0.25  # reach of an arm at most, and steps in which a place for its mast is sought
+HEAD_M, WALKERS_HEAD_M = 1.0, 0.7  # heights of a head for vehicles and for pedestrians
+HEIGHT_M = (1.8, 9.0)  # least and largest height of the centre of a head for vehicles that is believed
+WALKERS_M = (1.5, 4.0)  # the same of a head for pedestrians
+WALKERS_UP_M = 2.4  # height of the centre of a head for pedestrians without a believed one
+KERB_SIDE_M = 6.0  # largest distance of a head for pedestrians from its end of a crossing
+PLACE_M = 15.0  # largest distance of the end of a road in the map from that of its lane in the net
+WAY_M = 40.0  # the same for a connection through a junction, the sum over both of its ends
+ASKEW = np.cos(np.radians(60.0))  # cosine of the largest angle of a head's axis to its approach; else it faces that
+KERB_M = 0.3  # least distance of a mast from the road
+FARTHEST_M, STEP_M = 20.0, 0.25  # largest reach of an arm, and step in which a place for its mast is searched
 
 
 def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet) -> TakenOver[SignalParameters]:
-    """Return the heads of the traffic lights of a map that stand at a light of `net`, town = map + `offset_m` [m].
+    """Find the heads of the traffic lights of the map below `root` that belong to a light of `net`.
 
-    The way that a head is for follows from the roads that it, or a reference to it, is on. Its axis is that of the map,
-    and it faces the traffic there. A head for pedestrians belongs to the crossing of its road beside which it stands.
+    A place in the town is that in the map + `offset_m` (x, y) [m]. The connection that a head controls follows from the
+    roads that it, or a reference to it, is on. The head has the axis of the map and faces the traffic of the
+    connection. A head for pedestrians belongs to the nearest crossing of its road.
     """
     roads = {row.get("id", ""): row for row in root.iterfind("road")}
     named = _list_references(root)
-    controllers = {row.get("signalId", ""): each.get("id", "") for each in root.iterfind("controller") for row in each}
+    controllers = {
+        row.get("signalId", ""): controller.get("id", "")
+        for controller in root.iterfind("controller")
+        for row in controller
+    }
     ways = _Ways(net, offset_m)
-    found, left = [], Counter[str]()
+    found = []
+    left = Counter[str]()
     for row in roads.values():
         for signal in row.iterfind("signals/signal"):
             if signal.get("dynamic") != "yes":
@@ -66,7 +72,7 @@ def find_heads(root: ElementTree.Element, offset_m: tuple[float, float], net: Ro
 
 
 def _list_references(root: ElementTree.Element) -> dict[str, list[tuple[str, ElementTree.Element]]]:
-    """Return the roads and references that name each signal."""
+    """Map the id of a signal to the ids of the roads with references to it, and these references."""
     out: dict[str, list[tuple[str, ElementTree.Element]]] = {}
     for row in root.iterfind("road"):
         for reference in row.iterfind("signals/signalReference"):
@@ -75,7 +81,7 @@ def _list_references(root: ElementTree.Element) -> dict[str, list[tuple[str, Ele
 
 
 class _Ways:
-    """The ways through the junctions of a net that have a light."""
+    """The connections of a net that have a light and start at a driving lane."""
 
     def __init__(self, net: RoadNet, offset_m: tuple[float, float]) -> None:
         self._lanes = {lane.id: lane for edge in net.edges.values() for lane in edge.lanes}
@@ -87,29 +93,30 @@ class _Ways:
         shapely.prepare(self._road)
 
     def find(self, references: list[Placed], own: Placed) -> LaneConnection | None:
-        """Return the way that a signal is for: by its references in junctions, else by others, else by its own road.
+        """Find the connection that a signal controls; None without one.
 
-        Of several from the street of the nearest one, the straight one is taken first.
+        It is searched by the signal's references in junctions, else by its other references, else by its road, `own`.
+        Of several connections from the street of the nearest one, one straight on is preferred.
         """
         inside = [place for place in references if _is_inside(place)]
         outside = [place for place in references if not _is_inside(place)]
         for places in (inside, outside, [own]):
-            found = [
+            candidates = [
                 way
                 for row, signal in places
                 for start, end in _travelled(row, signal)
                 if (way := self._nearest(start + self._offset, end + self._offset, inside=_is_inside((row, signal))))
             ]
-            if found:
-                street = min(found, key=lambda item: item[0])[1].start.rpartition("_")[0]
-                own_street = [way for _, way in found if way.start.rpartition("_")[0] == street]
+            if candidates:
+                street = min(candidates, key=lambda item: item[0])[1].start.rpartition("_")[0]
+                own_street = [way for _, way in candidates if way.start.rpartition("_")[0] == street]
                 return min(own_street, key=lambda way: way.turn != "s")
         return None
 
     def _nearest(self, start: Array, end: Array, *, inside: bool) -> tuple[float, LaneConnection] | None:
-        """Return the way next to a road travelled from `start` to `end`, and how far it is [m].
+        """Find the connection nearest to a road travelled from `start` (2,) to `end` (2,) [m], and its distance [m].
 
-        Outside junctions only the end counts; of the ways of one lane the straight one is taken.
+        Outside junctions only the end counts; of the connections of one lane, the one straight on is taken.
         """
         rated = []
         for way in self._lit:
@@ -125,12 +132,12 @@ class _Ways:
         return None if nearest is None else (nearest[0], nearest[3])
 
     def heading(self, way: LaneConnection) -> Array:
-        """Return the unit vector in which traffic comes to the light of a way."""
+        """Compute the unit vector (2,) in which traffic approaches the light of a connection."""
         step = np.diff(self._lanes[way.start].shape[-2:], axis=0)[0]
         return step / max(float(np.hypot(*step)), 1e-9)
 
     def on_road(self, x: float, y: float) -> bool:
-        """Return whether a place is on a lane, or within `KERB_M` of one."""
+        """Return whether a place [m] in the town is on a driving lane, or within `KERB_M` of one."""
         return bool(shapely.dwithin(self._road, shapely.Point(x, y), KERB_M))
 
 
@@ -140,9 +147,10 @@ def _is_inside(place: Placed) -> bool:
 
 
 def _travelled(row: ElementTree.Element, signal: ElementTree.Element) -> Iterator[tuple[Array, Array]]:
-    """Yield both ends of a road in the direction of the traffic that a signal on it is for, in the map [m].
+    """Yield both ends (2,) of a road [m], in the map's frame, in the direction of the traffic that a signal controls.
 
-    The direction is that of the lanes for which it is valid; where these go both ways, that of its orientation.
+    The direction is that of the lanes for which the signal is valid; if these go both ways, that of its orientation; if
+    that is missing, both directions are yielded.
     """
     side = -1 if row.get("rule") == "LHT" else 1
     lanes = [
@@ -168,7 +176,10 @@ def _place(
     ways: _Ways,
     controller: str,
 ) -> SignalParameters | str:
-    """Return the head of a signal at x, y and the road's heading, or the reason why there is none."""
+    """Build the head of a signal, or return the reason why there is none.
+
+    `place` is the signal's x, y [m] in the town and the road's heading [rad]; `way` is the connection that it controls.
+    """
     if way is None:
         return "no junction with lights"
     x, y, heading = place
@@ -197,9 +208,9 @@ def _place(
 
 
 def _find_crossing(net: RoadNet, place: tuple[float, float, float]) -> tuple[float, str] | None:
-    """Return the direction [rad] and the light of the crossing with an end near x, y; None without one.
+    """Find the crossing with an end nearest to `place`: its direction [rad], away from that end, and its light.
 
-    It leads across the road, whose heading is the third number, and the direction is that from this end to the other.
+    `place` is x, y [m] in the town and the heading [rad] of the road that the crossing leads across. None without one.
     """
     along = heading_vectors(place[2])
     lights = {way.end: way.light for way in net.connections if way.light}
@@ -218,7 +229,10 @@ def _find_crossing(net: RoadNet, place: tuple[float, float, float]) -> tuple[flo
 def _place_walkers(
     signal: ElementTree.Element, place: tuple[float, float, float], net: RoadNet, ways: _Ways, controller: str
 ) -> SignalParameters | str:
-    """Return the head for pedestrians of a signal at x, y, facing those who come across, or why there is none."""
+    """Build the head for pedestrians of a signal, which faces those who come across, or return why there is none.
+
+    `place` is the signal's x, y [m] in the town and the road's heading [rad].
+    """
     facing = _find_crossing(net, place)
     if facing is None:
         return "for pedestrians, no crossing with lights"
@@ -237,13 +251,13 @@ def _place_walkers(
 
 
 def _read_height(signal: ElementTree.Element, head_m: float) -> float:
-    """Return the height of the centre of a signal's head [m]; one twice as high as a head includes its post."""
+    """Compute the height of the centre of a signal's head [m]; a signal higher than two heads includes its post."""
     low, high = read_number(signal, "zOffset"), read_number(signal, "height")
     return low + (high / 2 if high <= 2 * head_m else high - head_m / 2)
 
 
 def count_controllers(heads: tuple[SignalParameters, ...], net: Path) -> tuple[int, int]:
-    """Return the number of a map's controllers with several heads, and of those whose heads a net switches alike."""
+    """Count a map's controllers with several heads, and those of them whose heads a net file switches alike."""
     states: dict[str, list[str]] = {}
     for row in ElementTree.parse(net).getroot().iterfind("tlLogic"):
         states[row.get("id", "")] = [phase.get("state", "") for phase in row.iterfind("phase")]

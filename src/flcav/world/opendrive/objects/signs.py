@@ -1,4 +1,4 @@
-"""Signs and poles of an OpenDRIVE map, where it says what and where they are (OpenDRIVE 1.8, 13 and 14)."""
+"""Signs and poles of an OpenDRIVE map with a known type and place (OpenDRIVE 1.8, 13 and 14)."""
 
 import math
 import xml.etree.ElementTree as ElementTree
@@ -14,13 +14,13 @@ from flcav.world.opendrive.objects.places import TakenOver, list_objects, locate
 from flcav.world.opendrive.objects.stop_lines import PAINTED_STOP_LINE
 from flcav.world.opendrive.road_surface import Road
 
-SIGNS: dict[str, Literal["stop", "yield"]] = {"206": "stop", "205": "yield"}  # numbers of the German catalogue
-LIMIT_SIGN = "274"
-KMH = {"km/h": 1.0, "mph": 1.609344, "m/s": 3.6}
-LIMITS_KMH = (5.0, 200.0)  # least and largest limit that is believed
-PLATE_M = (1.2, 4.5)  # heights at which a plate is believed to hang
-POST_M = (0.3, 15.0)  # heights of poles that are taken over
-PAINTED = (PAINTED_CROSSWALK, PAINTED_STOP_LINE)  # types of signals that are paint
+SIGNS: dict[str, Literal["stop", "yield"]] = {"206": "stop", "205": "yield"}  # number in the German catalogue -> kind
+LIMIT_SIGN = "274"  # number of a speed-limit sign there
+KMH = {"km/h": 1.0, "mph": 1.609344, "m/s": 3.6}  # unit -> km/h
+LIMITS_KMH = (5.0, 200.0)  # least and largest speed limit that is believed
+PLATE_M = (1.2, 4.5)  # least and largest height of a plate's centre that is believed
+POST_M = (0.3, 15.0)  # least and largest height of a pole that is taken over
+PAINTED = (PAINTED_CROSSWALK, PAINTED_STOP_LINE)  # types of signals that are markings on the road
 
 
 @dataclass(frozen=True)
@@ -31,10 +31,11 @@ class MappedSigns(TakenOver[SignParameters]):
 
 
 def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> MappedSigns:
-    """Return the stop, give-way and speed-limit signs of a map, in town coordinates: map + `offset_m` [m].
+    """Find the stop, give-way and speed-limit signs of the map below `root`.
 
-    A sign faces the traffic that it is for, by its orientation. Left out are signs of other types, limits that say no
-    number or for which there is no sign, and signs without a place on their road.
+    A place in the town is that in the map + `offset_m` (x, y) [m]. A sign faces the traffic of its orientation. Left
+    out are signs of other types, limits without a number or without a sign for it, and signs without a place on their
+    road.
     """
     found, left, limits = [], Counter[str](), False
     for row in root.iterfind("road"):
@@ -48,7 +49,7 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Mapp
             kind = SIGNS.get(name) or _limit_kind(limit)
             place = locate_thing(road, signal, offset_m)
             if kind is None:
-                left[f"of the type {shorten(name)}" if name != LIMIT_SIGN else _tell_limit(limit)] += 1
+                left[f"of the type {shorten(name)}" if name != LIMIT_SIGN else _explain_limit(limit)] += 1
                 continue
             if place is None:
                 left["no place on the road"] += 1
@@ -69,8 +70,9 @@ def find_signs(root: ElementTree.Element, offset_m: tuple[float, float]) -> Mapp
 
 
 def find_map_poles(root: ElementTree.Element, offset_m: tuple[float, float]) -> TakenOver[PostParameters]:
-    """Return the poles of a map with a height, in town coordinates: map + `offset_m` [m]."""
-    found, left = [], Counter[str]()
+    """Find the poles with a height of the map below `root`; a place in the town is that in the map + `offset_m` [m]."""
+    found = []
+    left = Counter[str]()
     for road, thing in list_objects(root, lambda thing: thing.get("type") == "pole"):
         height = read_number(thing, "height")
         for one in repeat_object(thing):
@@ -85,19 +87,19 @@ def find_map_poles(root: ElementTree.Element, offset_m: tuple[float, float]) -> 
 
 
 def read_limit(signal: ElementTree.Element) -> float | None:
-    """Return the limit [m/s] of a speed-limit sign; None for other signs, and where it says no number in a known unit.
+    """Read the limit [m/s] of a speed-limit sign; None for other signs, and without a number in a known unit.
 
-    A number without a unit is one in km/h.
+    A number without a unit is in km/h.
     """
     limit = read_number(signal, "value") * KMH.get(signal.get("unit") or "km/h", 0.0)
     return limit / 3.6 if signal.get("type") == LIMIT_SIGN and LIMITS_KMH[0] <= limit <= LIMITS_KMH[1] else None
 
 
 def _limit_kind(limit: float | None) -> Literal["speed_30", "speed_60", "speed_90"] | None:
-    """Return the kind of sign that shows a limit [m/s]; None where none does, and without a limit."""
+    """Return the kind of sign that shows a limit [m/s]; None without such a kind, and without a limit."""
     return None if limit is None else SPEED_SIGNS.get(round(3.6 * limit))
 
 
-def _tell_limit(limit: float | None) -> str:
-    """Return why the sign of a limit [m/s] is left out."""
+def _explain_limit(limit: float | None) -> str:
+    """Write the reason why the sign of a limit [m/s] is left out."""
     return "a limit without a number" if limit is None else f"a limit of {3.6 * limit:.0f} km/h, which no sign shows"

@@ -31,7 +31,7 @@ from flcav.world.opendrive.road_surface import Road
 
 Kind = Literal["building", "tree", "hedge", "wall", "fence", "railing", "cabinet"]
 
-KINDS: dict[str, Kind] = {  # by the type of an object; an obstacle is a box like a cabinet
+KINDS: dict[str, Kind] = {  # type of an object in the map -> kind in the town; an obstacle is a box like a cabinet
     "building": "building",
     "tree": "tree",
     "vegetation": "hedge",
@@ -40,21 +40,25 @@ KINDS: dict[str, Kind] = {  # by the type of an object; an obstacle is a box lik
     "railing": "railing",
     "obstacle": "cabinet",
 }
-SIDE_M, HEIGHT_M = (0.02, 200.0), (0.2, 150.0)  # extents that are believed
-TREE_M = 2.0  # an object with a radius that is at least so high is a tree
-PIECE_M = 4.0  # length of the straight pieces of what goes on along a road
-LONGEST_M = 20_000.0  # over which an object goes on
-TOUCHED = 0.1  # share of a footprint that may lie on a lane
+SIDE_M, HEIGHT_M = (0.02, 200.0), (0.2, 150.0)  # least and largest side and height that are believed
+TREE_M = 2.0  # least height of an object with a radius that is a tree
+PIECE_M = 4.0  # largest length of the straight pieces of an object that continues along a road
+LONGEST_M = 20_000.0  # largest length over which an object continues along a road
+TOUCHED = 0.1  # largest share of a footprint that may lie on a lane
 
 
 def find_standing_objects(
     root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet
 ) -> TakenOver[ObjectParameters]:
-    """Return the objects of a map of `KINDS` that stand on no lane or sidewalk; town = map + `offset_m` [m]."""
+    """Find the objects of `KINDS` in the map below `root` that stand on no lane or sidewalk of `net`.
+
+    A place in the town is that in the map + `offset_m` (x, y) [m].
+    """
     ways = cover_lanes(net, ("driving", "bicycle", "sidewalk", "walkingarea", "crossing"))
     shapely.prepare(ways)
     found: list[ObjectParameters] = []
-    taken, left = 0, Counter[str]()
+    taken = 0
+    left = Counter[str]()
     for road, thing in list_objects(root, lambda thing: thing.get("type") in KINDS):
         for pieces in _list_copies(road, thing, np.array(offset_m)):
             free = [piece for piece in pieces if not _stands_on(piece, ways)]
@@ -66,7 +70,7 @@ def find_standing_objects(
 
 
 def _stands_on(piece: ObjectParameters, ways: shapely.Geometry) -> bool:
-    """Return whether more than `TOUCHED` of a footprint is on an area; of a tree, its trunk."""
+    """Return whether more than `TOUCHED` of a footprint is on the area `ways`; of a tree only the trunk counts."""
     if piece.kind == "tree":
         return bool(shapely.intersects(ways, shapely.Point(piece.x, piece.y)))
     shape = make_footprint(piece.x, piece.y, math.radians(piece.yaw_deg), piece.length_m, piece.width_m)
@@ -74,7 +78,7 @@ def _stands_on(piece: ObjectParameters, ways: shapely.Geometry) -> bool:
 
 
 def _list_copies(road: Road, thing: ElementTree.Element, offset_m: Array) -> Iterator[list[ObjectParameters]]:
-    """Yield an object and its repetitions, each as its pieces; none where it does not say its place and size."""
+    """Yield an object and its repetitions, as the pieces of each; an empty list without a place or a size."""
     kind = KINDS[thing.get("type", "")]
     if kind == "wall" and "fence" in thing.get("name", "").lower():
         kind = "fence"
@@ -88,7 +92,7 @@ def _list_copies(road: Road, thing: ElementTree.Element, offset_m: Array) -> Ite
 def _go_along(
     road: Road, thing: ElementTree.Element, row: ElementTree.Element, kind: Kind, offset_m: Array
 ) -> Iterator[ObjectParameters]:
-    """Yield the pieces of an object that goes on along a road, its size and place interpolated as a repetition says."""
+    """Yield the pieces of an object that continues along a road; the <repeat> `row` gives its size and place by s."""
     start = min(max(read_number(row, "s"), 0.0), road.length)
     length = min(read_number(row, "length"), road.length - start, LONGEST_M)
     if length <= 0:
@@ -113,7 +117,7 @@ def _go_along(
 
 
 def _stand(road: Road, thing: ElementTree.Element, kind: Kind, offset_m: Array) -> Iterator[ObjectParameters]:
-    """Yield an object that stands at one place."""
+    """Yield an object at a single place; nothing without a place or a size."""
     place = locate_thing(road, thing)
     if place is None:
         return
@@ -134,7 +138,7 @@ def _stand(road: Road, thing: ElementTree.Element, kind: Kind, offset_m: Array) 
 def _describe(
     kind: Kind, centre: Array, yaw: float, sides: tuple[float, float], height: float
 ) -> Iterator[ObjectParameters]:
-    """Yield an object of these extents [m] and heading [rad]; none where they are implausible."""
+    """Yield an object at `centre` (2,) [m] of heading `yaw` [rad] and these extents [m]; nothing if not believed."""
     if SIDE_M[0] <= min(sides) and max(sides) <= SIDE_M[1] and HEIGHT_M[0] <= height <= HEIGHT_M[1]:
         yield ObjectParameters(
             kind=kind,
@@ -147,19 +151,22 @@ def _describe(
         )
 
 
-LENGTH_M, WIDTH_M = (3.0, 20.0), (1.7, 6.0)  # extents that are believed
+LENGTH_M, WIDTH_M = (3.0, 20.0), (1.7, 6.0)  # least and largest extents of a parking space that are believed
 
 
 def find_parking(
     root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet
 ) -> TakenOver[ParkingParameters]:
-    """Return the parking spaces of a map beside the lanes of `net`, in town coordinates: map + `offset_m` [m]."""
+    """Find the parking spaces of the map below `root` that are clear of the lanes of `net` and of one another.
+
+    A place in the town is that in the map + `offset_m` (x, y) [m].
+    """
     found: list[ParkingParameters] = []
     left = Counter[str]()
     driven, walked = cover_lanes(net, ("driving", "bicycle")), cover_lanes(net, ("sidewalk", "walkingarea", "crossing"))
     taken: list[Polygon] = []
-    for road, each in list_objects(root, lambda thing: thing.get("type") == "parkingSpace"):
-        for thing in repeat_object(each):
+    for road, original in list_objects(root, lambda thing: thing.get("type") == "parkingSpace"):
+        for thing in repeat_object(original):
             outline = outline_object(road, thing)
             space = None if outline is None else _enclose(outline + offset_m)
             if space is None:
@@ -179,7 +186,7 @@ def find_parking(
 
 
 def cover_lanes(net: RoadNet, kinds: tuple[LaneKind, ...]) -> BaseGeometry:
-    """Return the area of all lanes of these kinds [m]."""
+    """Unite the areas of all lanes of these kinds, in the town's frame [m]."""
     lanes = [lane for edge in net.edges.values() for lane in edge.lanes if lane.kind in kinds and len(lane.shape) > 1]
     areas = [
         shapely.make_valid(Polygon(lane.shape))
@@ -191,14 +198,14 @@ def cover_lanes(net: RoadNet, kinds: tuple[LaneKind, ...]) -> BaseGeometry:
 
 
 def _enclose(outline: np.ndarray) -> ParkingParameters | None:
-    """Return the smallest rectangle around an outline (K, 2) as a space; None where it is none for a vehicle."""
-    found = enclose_outline(outline)
-    if found is None:
+    """Enclose an outline (K, 2) [m] in the smallest rectangle, as a space; None if that has no extents of a space."""
+    rectangle = enclose_outline(outline)
+    if rectangle is None:
         return None
-    length, width, yaw = found.extents
+    length, width, yaw = rectangle.extents
     if not (LENGTH_M[0] <= length <= LENGTH_M[1] and WIDTH_M[0] <= width <= WIDTH_M[1]):
         return None
-    x, y = found.centre.tolist()
+    x, y = rectangle.centre.tolist()
     turned = round(math.degrees(yaw) % 360.0, 2)
     return ParkingParameters(
         x=round(x, 3), y=round(y, 3), yaw_deg=turned, length_m=round(length, 2), width_m=round(width, 2)

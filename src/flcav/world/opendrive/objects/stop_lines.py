@@ -18,41 +18,45 @@ from flcav.world.opendrive.objects.places import TakenOver, locate_thing, outlin
 from flcav.world.opendrive.road_surface import Road
 
 PAINTED_STOP_LINE = "294"  # type of a signal that is a painted stop line: its number in the German catalogue
-SUBTYPE = "signalLines"  # of an object `roadMark` that is one
-WIDE_M = (1.5, 30.0)  # lengths of a line that are believed
-STOPPED = ("driving", "bicycle")  # lanes with stop lines
-ACROSS_M = 20.0  # from a signal to both sides, where the lanes that it is for are sought
-BEFORE_M, BEYOND_M = 25.0, 6.0  # from a line to the end of its lane in the net, which may lie on either side of it
-GAP_M = 1.0  # from a vehicle that stops to a line, SUMO's usual distance
-BEFORE_CROSSING_M = 0.6  # from the middle of a line to the crossing behind it
-ASKEW = math.cos(math.radians(60.0))  # of the least angle between a line and its lane
-AHEAD = math.cos(math.radians(30.0))  # of the largest angle between a lane and the direction a signal is for
+SUBTYPE = "signalLines"  # subtype of an object `roadMark` that is a stop line
+WIDE_M = (1.5, 30.0)  # least and largest length of a line that is believed
+STOPPED = ("driving", "bicycle")  # kinds of lanes with stop lines
+ACROSS_M = 20.0  # distance to both sides of a signal within which its lanes are searched
+BEFORE_M, BEYOND_M = 25.0, 6.0  # largest distance of a line before and beyond the end of its lane in the net
+GAP_M = 1.0  # distance of a stopping vehicle from a line, SUMO's default
+BEFORE_CROSSING_M = 0.6  # distance of the middle of a line from the crossing behind it
+ASKEW = math.cos(math.radians(60.0))  # cosine of the least angle between a line and its lane
+AHEAD = math.cos(math.radians(30.0))  # cosine of the largest angle between a lane and the traffic of its signal
 
 
 @dataclass(frozen=True)
 class _Line:
-    """A line of the map in town coordinates."""
+    """A stop line of the map in the town's frame."""
 
-    ends: Array  # (2, 2) both ends; of a signal `ACROSS_M` to both sides of it [m]
-    ahead: Array | None  # (2,) unit vector of the traffic that a signal is for; None of an object, whose ends are known
+    ends: Array  # (2, 2) both ends [m]; for a signal, the points `ACROSS_M` to its sides
+    ahead: Array | None  # (2,) unit vector of the traffic that stops at a signal; None for an object
 
 
 @dataclass(frozen=True)
 class _Crossed:
-    """A lane that a line crosses, or would if the lane went straight on."""
+    """A lane that a line crosses, the lane being continued straight on."""
 
-    edge: str
-    lane: str
-    before_end_m: float
-    aside_m: float  # from where the line is described
+    edge: str  # id of the lane's edge
+    lane: str  # id of the lane
+    before_end_m: float  # distance of the line before the end of the lane; negative beyond it
+    aside_m: float  # distance of the lane's border from the middle of the line; 0 inside the lane
 
 
 def find_stop_lines(
     root: ElementTree.Element, offset_m: tuple[float, float], net: RoadNet
 ) -> TakenOver[StopLineParameters]:
-    """Return the stop lines of a map at the ends of the lanes of `net`, town = map + `offset_m` [m]."""
+    """Find the stop lines of the map below `root` near the ends of the lanes of `net`.
+
+    A place in the town is that in the map + `offset_m` (x, y) [m].
+    """
     found: dict[str, float] = {}
-    taken, left = 0, Counter[str]()
+    taken = 0
+    left = Counter[str]()
     ends = [
         (edge.id, lane, _go_on(lane))
         for edge in net.streets
@@ -68,13 +72,13 @@ def find_stop_lines(
                 left["no lane ends there"] += 1
             else:
                 taken += 1
-                found |= {each.lane: each.before_end_m for each in lanes if each.lane not in found}
+                found |= {crossed.lane: crossed.before_end_m for crossed in lanes if crossed.lane not in found}
     rows = (StopLineParameters(lane=lane, before_end_m=round(found[lane], 2)) for lane in found)
     return TakenOver(tuple(rows), left, taken)
 
 
 def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | None]:
-    """Yield the stop lines along one road of the map; None for one without place or length."""
+    """Yield the stop lines along one road of the map; None for one without a place or a believed length."""
     things = [thing for thing in row.iterfind("objects/object") if _is_stop_line(thing)]
     signals = [signal for signal in row.iterfind("signals/signal") if signal.get("type") == PAINTED_STOP_LINE]
     if not things and not signals:
@@ -101,21 +105,21 @@ def _list_lines(row: ElementTree.Element, offset_m: Array) -> Iterator[_Line | N
 
 
 def _is_stop_line(thing: ElementTree.Element) -> bool:
-    """Return whether an object is a stop line, by its subtype, or by its name where it has no type."""
+    """Return whether an object is a stop line, by its subtype or by its name."""
     if thing.get("type") == "roadMark" and thing.get("subtype") == SUBTYPE:
         return True
     return "".join(filter(str.isalpha, thing.get("name", ""))).lower().startswith("stopline")
 
 
 def _go_on(lane: Lane) -> LineString:
-    """Return the middle of a lane, continued straight on for `BEYOND_M`."""
+    """Continue the middle line of a lane straight on for `BEYOND_M`."""
     step = lane.shape[-1] - lane.shape[-2]
     beyond = lane.shape[-1] + BEYOND_M * step / max(float(np.hypot(*step)), 1e-9)
     return LineString([*lane.shape, beyond])
 
 
 def _cross(line: _Line, ends: list[tuple[str, Lane, LineString]]) -> Iterator[_Crossed]:
-    """Yield the lanes that a line crosses near their ends."""
+    """Yield the lanes that a line crosses near their ends; `ends` are edge id, lane and its continued middle line."""
     across = LineString(line.ends)
     way = line.ends[1] - line.ends[0]
     for edge, lane, longer in ends:
@@ -134,23 +138,26 @@ def _cross(line: _Line, ends: list[tuple[str, Lane, LineString]]) -> Iterator[_C
 
 
 def _choose(line: _Line, crossed: list[_Crossed], net: RoadNet) -> list[_Crossed]:
-    """Return the crossed lanes of one edge: that next to a signal, else that which ends next behind the line."""
+    """Choose one of the edges crossed: the one nearest to a signal, else the one that ends next behind the line.
+
+    Returns the crossed lanes of that edge in the order of the edge.
+    """
     if not crossed:
         return []
 
-    def rate(each: _Crossed) -> tuple[float, bool, float]:
-        aside = 0.0 if line.ahead is None else round(each.aside_m, 1)
-        return aside, each.before_end_m < -0.5, abs(each.before_end_m)
+    def rate(lane: _Crossed) -> tuple[float, bool, float]:
+        aside = 0.0 if line.ahead is None else round(lane.aside_m, 1)
+        return aside, lane.before_end_m < -0.5, abs(lane.before_end_m)
 
     edge = net.edges[min(crossed, key=rate).edge]
     order = [lane.id for lane in edge.lanes]
-    return sorted((each for each in crossed if each.edge == edge.id), key=lambda each: order.index(each.lane))
+    return sorted((lane for lane in crossed if lane.edge == edge.id), key=lambda lane: order.index(lane.lane))
 
 
 def add_crossing_lines(net: RoadNet, known: tuple[StopLineParameters, ...]) -> tuple[StopLineParameters, ...]:
     """Return the known stop lines, and further ones where a crossing lies across the lanes before a light.
 
-    netconvert ends lanes before the crossings that it has placed; those of a map may lie in front of that.
+    netconvert ends lanes before the crossings that it has guessed; those of a map may lie before these ends.
     """
     taken = {line.lane.rpartition("_")[0] for line in known}
     crossings = [
@@ -175,7 +182,7 @@ def add_crossing_lines(net: RoadNet, known: tuple[StopLineParameters, ...]) -> t
 
 
 def stop_at_lines(net: Path, lines: tuple[StopLineParameters, ...]) -> None:
-    """Write into a net file that vehicles stop at these lines, as far as they lie before the ends of their lanes."""
+    """Write stop offsets into the net file `net` for the lines that lie before the ends of their lanes."""
     before = {line.lane: line.before_end_m + GAP_M for line in lines if line.before_end_m > 0}
     if not before:
         return
