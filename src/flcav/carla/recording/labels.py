@@ -26,7 +26,7 @@ VEHICLES = tuple(SEMANTICS[name] for name in ("rider", "car", "truck", "bus", "m
 PEOPLE = (SEMANTICS["pedestrian"],)
 
 
-class LidarSweep(NamedTuple):
+class LabelledSweep(NamedTuple):
     """The sweep of a LiDAR, and what the semantic one beside it met."""
 
     lidar: Lidar
@@ -48,7 +48,7 @@ def annotate_bodies(
     state: State,
     own: int | None,
     within: NDArray[np.bool_],
-    sweeps: Mapping[str, LidarSweep],
+    sweeps: Mapping[str, LabelledSweep],
     sights: Mapping[str, CameraSight],
 ) -> tuple[Annotations, dict[str, NDArray[np.uint16]]]:
     """Return the annotations of M bodies, and the instance image (H, W) of each camera.
@@ -93,7 +93,7 @@ def enter_box(origin: Array, directions: Array, half: Array) -> tuple[NDArray[np
     return (near <= far) & (far > 0), np.maximum(near, 0.0)
 
 
-def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) -> NDArray[np.int64]:
+def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LabelledSweep) -> NDArray[np.int64]:
     """Return the number (M,) of a LiDAR's points from each body: those beside a point of it of the semantic LiDAR's.
 
     A parked vehicle is no actor of CARLA's: points of its class in its box count.
@@ -110,7 +110,7 @@ def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) 
     return counts
 
 
-def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[LidarSweep]) -> Array:
+def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[LabelledSweep]) -> Array:
     """Return the share (M,) of rays at each box that ends before it, all LiDARs together; 1 where none arrives."""
     visible, hidden, rays = np.zeros((3, len(boxes)), np.int64)
     for sweep in sweeps:
