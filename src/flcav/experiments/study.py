@@ -159,7 +159,8 @@ def make_experiment(
     """Return the experiment of a study; `tables` gets its results with recomputed means over seeds."""
 
     def run(out: Path, options: Options) -> Outcome[StudyResult[EvaluationT]]:
-        seeds, scale = range(1, options.seeds + 1), "quick" if options.quick else "full"
+        seeds = range(1, options.seeds + 1)
+        scale = "quick" if options.quick else "full"
         with options.show_steps(options.title) as notify:
             results = run_study(study, out, seeds=seeds, scale=scale, **options.how(notify))
         return Outcome(results, {f"{study.task.name}.png": study.draw(results)}, describe_summary(results))

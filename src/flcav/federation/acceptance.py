@@ -129,7 +129,8 @@ def _check_records(content: RecordDict, wanted: Sequence[str]) -> None:
 
 def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, float]:
     """Return the number of samples and the loss or norm in a reply's metrics."""
-    metrics, limits = content[wire.METRICS], rules.limits
+    metrics = content[wire.METRICS]
+    limits = rules.limits
     if not isinstance(metrics, MetricRecord) or set(metrics) != {wire.SAMPLES, key}:
         raise ReplyRefused(f"metrics that are not {wire.SAMPLES} and {key}")
     samples, number = metrics[wire.SAMPLES], metrics[key]
@@ -169,7 +170,9 @@ def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
 
 def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
     """Raise `ReplyRefused` where the L2 norm of the change of all floating arrays exceeds the limit or is infinite."""
-    total, most = 0.0, rules.limits.norm
+    # comparisons are negated so that NaN is refused, too
+    total = 0.0
+    most = rules.limits.norm
     with np.errstate(over="ignore", invalid="ignore"):
         for name, array in weights.items():
             if array.dtype.kind == "f":
@@ -182,7 +185,8 @@ def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
 
 def _squared_norm(values: NDArray[np.number], start: NDArray[np.number] | None) -> float:
     """Return the squared L2 norm of values or of their change, in blocks that fit in the cache."""
-    change, total = np.empty(min(BLOCK, values.size), np.promote_types(values.dtype, np.float32)), 0.0
+    change = np.empty(min(BLOCK, values.size), np.promote_types(values.dtype, np.float32))
+    total = 0.0
     for first in range(0, values.size, BLOCK):
         part = values[first : first + BLOCK]
         moved = np.subtract(part, 0 if start is None else start[first : first + BLOCK], out=change[: part.size])

@@ -122,12 +122,14 @@ class _ClientSide:
 
     def _admit(self, message: Message, context: Context, name: str, work: wire.LocalWork) -> str:
         """Return the kind of the request; raises `RequestRefused` where the client must not answer it."""
-        asked, before = asked_for(message.content), recall_answered(context)
+        asked = asked_for(message.content)
+        before = recall_answered(context)
         repeatable = self.rules.secure is None and not {OWN, RESIDUAL, OPTIMISER} & {*context.state}
         digest = self.requests.digest(message.content, wire.LOST if self.rules.secure is None else wire.ASK)
         answered = before.admit(work.round, asked, digest, self.rules, repeatable)
         if (most := self.requests.affordable) is not None and answered.rounds > most - self.spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
+        # stored before any answer leaves, so that a crash cannot make the client answer twice
         keep_answered(context, answered)
         if HIDDEN in context.state and (asked == wire.UNMASK or answered.round > before.round):
             del context.state[HIDDEN], context.state[f"{HIDDEN}-{wire.SAMPLES}"]
@@ -151,7 +153,9 @@ class _ClientSide:
             return wire.reply_norm(message, 0.0, count_samples(self.trainables[name], work.steps))
         if self.rules.secure is not None:
             return self._answer_masked(message, context, name, work, self.rules.secure)
-        extra, own, sent = {}, {}, _optional(message.content, wire.EXTRA)
+        extra = {}
+        own = {}
+        sent = _optional(message.content, wire.EXTRA)
         if asked == wire.SEND:
             start, update = _recorded(context, KEPT_START), _recall(context, KEPT)
         else:
@@ -190,7 +194,8 @@ class _ClientSide:
             about = (1, 0.0) if wire.is_local(self.rules) else (update.samples, update.loss)
             values = wire.flatten_change(update, start, self.rules, seed, key)
             _keep(context, HIDDEN, LocalUpdate({wire.VECTOR: values}, *about))
-        hidden, peers = _recall(context, HIDDEN), message.content.config_records[wire.ASK][wire.NAMES]
+        hidden = _recall(context, HIDDEN)
+        peers = message.content.config_records[wire.ASK][wire.NAMES]
         values = np.asarray(hidden.weights[wire.VECTOR], np.float64)
         integers = to_integers(values, secure.largest, len(peers) + 1)  # type: ignore[arg-type]
         return wire.reply(message, replace(hidden, weights={wire.VECTOR: mask_update(context, integers)}), {})

@@ -54,7 +54,8 @@ class Answered:
         Under secure aggregation a round may restart with new masks until its sum is unmasked; the masked update stays
         that of the first request to train, identified by its `digest`.
         """
-        requests, masked = agreed_requests(rules), rules.secure is not None
+        requests = agreed_requests(rules)
+        masked = rules.secure is not None
         if asked not in requests:
             raise RequestRefused(f"a request for '{asked}', and agreed are {', '.join(requests)}")
         place = requests.index(asked)

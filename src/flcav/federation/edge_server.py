@@ -53,12 +53,14 @@ class EdgeServer:
         that took no part, otherwise the samples of its last edge round that is not empty. If all are empty it is 0, but
         1 in the first cloud round, for the model of stage II.
         """
+        # personal arrays override the cloud's, which does not average them
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         regional = isinstance(self.rules.personal, RegionalModels)
         centre = weights if regional and self.cloud_rounds_done else None
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
-        first, known = self.cloud_rounds_done == 0, len(self.state.records)
+        first = self.cloud_rounds_done == 0
+        known = len(self.state.records)
         self.cloud_rounds_done += 1  # also where a round fails: it counts for the cloud
         if self.distiller is not None:
             self.state.server = {}  # the first edge round starts from outputs of the cloud's network
@@ -100,6 +102,7 @@ def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_ro
 
 def edge_seeds(schedule: Schedule, cloud_round: int, region: str, edge_rounds: int) -> list[int]:
     """Return the seeds of a region's edge rounds in a cloud round of `schedule`, as `EdgeServer` derives them."""
-    seed, done = derive_seed(schedule.work(cloud_round).seed, region), (cloud_round - 1) * edge_rounds
+    seed = derive_seed(schedule.work(cloud_round).seed, region)
+    done = (cloud_round - 1) * edge_rounds
     region_schedule = Schedule(done + edge_rounds, 0, 1.0, 1.0, seed)
     return [region_schedule.work(done + number).seed for number in range(1, edge_rounds + 1)]

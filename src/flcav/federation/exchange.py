@@ -63,7 +63,8 @@ class Attendance:
 
         Too few may be planned, drawn, or present.
         """
-        chosen, secure = len(self.chosen), rules.secure
+        chosen = len(self.chosen)
+        secure = rules.secure
         absent = {name: self.away[name] for name in self.chosen if name in self.away}
         if short := rules.tell_shortage(chosen - len(absent)):
             self.shortage = ClientFailed(short)
@@ -112,7 +113,8 @@ class Intake:
 
     def __init__(self, weigher: Averages | None = None) -> None:
         """Average with the weights of `weigher`; None: keep every update."""
-        self._weigher, self._mean = weigher, RunningMean()
+        self._weigher = weigher
+        self._mean = RunningMean()
         self._extra: dict[str, NDArray[np.number]] = {}  # sums of the strategy's further arrays
         self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
         self.samples: dict[str, int] = {}  # by client

@@ -2,7 +2,7 @@
 
 `federate` repeats `Server.run_round`. A round calls the clients that take part, sends them the weights and their local
 work, checks every update as it arrives, combines those that count, and keeps a record. Flower carries the messages;
-its own strategies sample clients from the global random state, multiply integer buffers by floats, and skip a whole
+its strategies sample clients from the global random state, multiply integer buffers by floats, and skip a whole
 round where one client fails.
 """
 
@@ -158,7 +158,7 @@ def federate(
             on Ray. The weights do not depend on it.
         centre: weights to which the proximal term of `rules.personal` pulls the clients.
         distiller: the server's network under `FedMD`, whose clients send outputs: after a round it learns from their
-            mean, which is sent down in the next one; in the first it sends its own.
+            mean, which is sent down in the next one; in the first it sends its present outputs.
         buffers: for `FedBuff`, the rounds by a clock; None: clients are equally fast, and messages take no time. The
             federation ends before an update that would exceed a budget, which is not sent.
 
@@ -240,7 +240,8 @@ def _run_round(
     server: "FederationServer", link: Link, terms: FederationTerms, number: int, weights: Weights, sent: Weights
 ) -> tuple[Weights, Weights]:
     """Return the weights after a round and the next downlink: these weights or, in distillation, mean outputs."""
-    state, kept = server.state, kept_records(server.strategy, server.rules)
+    state = server.state
+    kept = kept_records(server.strategy, server.rules)
     try:
         combined = server.run_round(number, sent)
     except (ClientFailed, TooFewClients) as error:
@@ -313,7 +314,9 @@ class FederationServer(Exchange):
 
     def _call(self, number: int, start: Weights) -> OpenRound:
         """Return the round with its chosen clients, and those of them that are absent."""
-        work, selection, clients = self.work(number), self.rules.selection, [*self.names.values()]
+        work = self.work(number)
+        selection = self.rules.selection
+        clients = [*self.names.values()]
         if self.buffering is not None:
             self.state.server = self.buffering.keep_version(number, start, self.state.server)
             return OpenRound(work, self.buffering.attend(number, clients), Expected(self.rules, start))
@@ -342,7 +345,9 @@ class FederationServer(Exchange):
         """Return the weights after a round, and update the strategy's state; raises the shortage if there is one."""
         if round_.here.shortage is not None:
             raise round_.here.shortage
-        start, updates, privacy = round_.start, received.combinable, self.rules.privacy
+        start = round_.start
+        updates = received.combinable
+        privacy = self.rules.privacy
         if received.average is not None:
             updates = [LocalUpdate(received.average(), *WHOLE)]
         elif privacy is not None and not privacy.local:
@@ -375,7 +380,8 @@ class FederationServer(Exchange):
 
     def _keep(self, round_: OpenRound, received: Intake) -> None:
         """Add the record of a round to the state; where the draw of clients is secret, it does not name them."""
-        number, epsilon = round_.work.round, None
+        number = round_.work.round
+        epsilon = None
         if self.buffering is not None:
             self.state.server = self.buffering.keep_version(number + 1, {}, self.state.server)
         if self.rules.privacy is not None and self.buffering is not None:

@@ -70,7 +70,7 @@ class Privacy(Config):
 
     @property
     def local(self) -> bool:
-        """Return whether each client adds noise to its own update."""
+        """Return whether the clients add the noise, to their updates."""
         return self.where == "local"
 
     def hides_draws(self, selection: Selection) -> bool:
@@ -167,12 +167,14 @@ def compose_epsilon(
     import dp_accounting  # 1 s
     from dp_accounting import rdp
 
+    # replacing a client's data changes the sum by up to twice the norm, which equals half the noise multiplier
     replaced = privacy.local or selection.rule == "uniform"  # neighbours by replacement; else by addition or removal
     times = Counter[tuple[int, float]]()  # rounds by number of clients and noise multiplier
     for (clients, rounds), found in zip(trainings, noises, strict=False):
         noise = privacy.multiplier if found is None else found
         taken = rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
         times[clients, noise / 2 if replaced else noise] += taken
+    # Renyi divergences add up under composition, so that equal events are measured once and multiplied
     accountant = rdp.RdpAccountant()
     orders: Any = accountant._orders
     spent: Any = accountant._rdp  # Renyi divergence, by order
@@ -228,6 +230,7 @@ def _find_least_noise(privacy: str, selection: str, clients: int, rounds: int) -
     if exceeds(ends[1]) > 0:
         return MOST_NOISE
     found = ends[0] if exceeds(ends[0]) <= 0 else float(root_scalar(exceeds, bracket=ends, xtol=1e-5).root)
+    # rounded up to three digits; the tolerance of the root may cost one unit more
     place = 10 ** (2 - math.floor(found))
     noise = math.ceil(10**found * place) / place
     return noise if exceeds(math.log10(noise)) <= 0 else min(noise + 1 / place, MOST_NOISE)
@@ -266,6 +269,7 @@ def count_affordable(privacy: Privacy, selection: Selection, names: Sequence[str
 
     if privacy.epsilon is None or rounds == 0:
         return rounds
+    # epsilon increases with the number of rounds
     return max(bisect.bisect_left(range(rounds + 1), True, key=exceeds) - 1, 0)
 
 
@@ -286,11 +290,14 @@ class SecretNormals:
 
     def __init__(self, key: bytes) -> None:
         """Draw with `key`, which must be used for a single change."""
-        self._key, self._arrays = key, 0
+        self._key = key
+        self._arrays = 0
 
     def normal(self, *, scale: float, size: tuple[int, ...]) -> NDArray[np.float64]:
         """Return numbers of mean 0 and standard deviation `scale`."""
-        count, self._arrays = math.prod(size), self._arrays + 1
+        count = math.prod(size)
+        self._arrays += 1
+        # another key per array; 53 random bits per number, never 0, whose logarithm is taken
         pairs = -(-count // 2)
         drawn = hashlib.shake_256(_derive(self._key, f"array {self._arrays}")).digest(16 * pairs)
         uniform = ((np.frombuffer(drawn, "<u8") >> np.uint64(11)) + 1.0) * 2.0**-53  # in (0, 1]

@@ -92,7 +92,8 @@ class Selection(Config):
         returns all, since every client reports its norm, and so does a deadline whose round times are yet to be
         predicted.
         """
-        count, rng = self.clients or 0, stream(seed, "selection")
+        count = self.clients or 0
+        rng = stream(seed, "selection")
         match self.rule:
             case "uniform":
                 chosen = set(rng.permutation(len(names))[:count].tolist())
@@ -129,6 +130,7 @@ class Selection(Config):
         """
         assert self.clients is not None
         reported = np.array([*norms.values()])
+        # with fewer than half of the clients lying, the lower median lies among the honest reports
         middle = float(np.sort(reported)[(len(reported) - 1) // 2]) if len(reported) else 0.0
         probabilities = optimal_probabilities(np.minimum(reported, LONGEST * middle), self.clients)
         drawn = stream(seed, "importance").random(len(norms)) < probabilities

@@ -80,9 +80,12 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
             }
             return {name: array.astype(np.float16) for name, array in sent.items()}, {}
         case "int8":
-            rng, sent, scales = np.random.default_rng(seed), {}, []
+            rng = np.random.default_rng(seed)
+            sent = {}
+            scales = []
             for name, array in change.items():
                 scale = np.float32(np.abs(array).max(initial=0.0) / LEVELS)
+                # floor(x + u) with u uniform in [0, 1) rounds stochastically, without bias
                 with np.errstate(invalid="ignore"):  # a scale that is not finite is refused by the server
                     levels = array / (scale or 1.0) + rng.random(array.shape)
                     sent[name] = np.clip(np.floor(levels), -LEVELS, LEVELS).astype(np.int8)
@@ -94,6 +97,7 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
                 flat = flat + residual
             kept = _kept_coordinates(upload, flat.size)
             size = np.where(np.isnan(flat), np.inf, np.abs(flat))  # NaN is sent, so that the server refuses it
+            # stable, so that equal magnitudes give the same choice on every machine
             indices = np.sort(np.argsort(-size, kind="stable")[:kept])
             sent = {INDICES: indices.astype(np.uint32), VALUES: flat[indices]}
             flat[indices] = 0.0

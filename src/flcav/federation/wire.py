@@ -100,7 +100,8 @@ def type_name(dtype: np.dtype) -> str:
 @lru_cache(maxsize=4096)
 def _header(shape: tuple[int, ...], dtype: np.dtype, fortran_order: bool) -> bytes:
     """Return the header of an array in version 1.0 of NumPy's file format."""
-    head, descr = BytesIO(), np.lib.format.dtype_to_descr(dtype)
+    head = BytesIO()
+    descr = np.lib.format.dtype_to_descr(dtype)
     about = {"shape": shape, "fortran_order": fortran_order, "descr": descr}
     np.lib.format.write_array_header_1_0(head, about)
     return head.getvalue()
@@ -115,7 +116,9 @@ def to_numpy(array: Array) -> np.ndarray:
     """
     if array.stype != SType.NUMPY:
         raise TypeError(f"'{array.stype}' is no format of arrays")
-    shape, dtype, data = tuple(array.shape), NUMBERS.get(array.dtype), array.data
+    shape = tuple(array.shape)
+    dtype = NUMBERS.get(array.dtype)
+    data = array.data
     if dtype is None:
         raise ValueError(f"{shorten(array.dtype)} is no type of numbers")
     start = 10 + int.from_bytes(data[8:10], "little")  # of the numbers
@@ -200,7 +203,8 @@ def encode_update(
     key: of local noise, see `add_noise`. Under local privacy the number of samples, the loss and all arrays that are
     not learned stay with the client.
     """
-    upload, weights = rules.upload, update.weights
+    upload = rules.upload
+    weights = update.weights
     names, learned = upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
         return LocalUpdate({name: weights[name] for name in names}, update.samples, update.loss), {}
@@ -314,13 +318,16 @@ def list_events(awaited: Iterable[str], replies: Iterable[Message], names: Mappi
     A reply whose turn it is is yielded at once and not kept. `names` are the clients' names by node.
     """
     nodes = {name: node for node, name in names.items()}
-    left, early = deque(nodes[name] for name in awaited), dict[int, Message]()
+    left = deque(nodes[name] for name in awaited)
+    early = dict[int, Message]()
+    # the final None stands for the end of replies: whoever is still awaited has timed out
     for message in chain(replies, [None]):
         if message is not None:
             early[message.metadata.src_node_id] = message
         while left and (message is None or left[0] in early):
             node = left.popleft()
-            found, client = early.pop(node, None), names[node]
+            found = early.pop(node, None)
+            client = names[node]
             if found is None:
                 yield TimedOut(client)
             elif found.has_error():

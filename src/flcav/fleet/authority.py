@@ -102,7 +102,8 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
     """
     if (folder / AUTHORITY).exists() or (folder / REGISTRY).exists():
         raise InputError(f"{folder}: has an authority already")
-    key, name = make_key(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "flcav fleet authority")])
+    key = make_key()
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "flcav fleet authority")])
     made = certificate_of(key.public_key(), name, name, AUTHORITY_YEARS * 365 * DAY)
     uses = dict.fromkeys(
         (

@@ -37,6 +37,7 @@ def check_identifier(name: str) -> str:
 
 def write_private(path: Path, data: bytes) -> None:
     """Write a secret to `path`, atomically, and readable only by its owner."""
+    # the file is created with its final mode: no moment at which others could read it
     before = os.umask(0o077)
     try:
         write_bytes(path, data)
@@ -153,7 +154,8 @@ def requested_name(request: x509.CertificateSigningRequest) -> str:
 
 def make_loopback(folder: Path) -> None:
     """Make key and self-signed certificate (127.0.0.1) of a vehicle's forwarder, which its SuperNode trusts."""
-    key, name = make_key(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "forwarder")])
+    key = make_key()
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "forwarder")])
     made = certificate_of(key.public_key(), name, name, timedelta(days=3650), hosts=("127.0.0.1", "localhost"))
     write_private(folder / LOOPBACK_KEY, private_pem(key))
     write_bytes(folder / LOOPBACK, made.sign(key, hashes.SHA384()).public_bytes(serialization.Encoding.PEM))

@@ -42,7 +42,8 @@ class ClientConnection:
     """A client's connection, with its bytes counted so far."""
 
     def __init__(self, transport: Any) -> None:
-        self._socket, self.abort = transport.get_extra_info("socket"), transport.abort
+        self._socket = transport.get_extra_info("socket")
+        self.abort = transport.abort
         self.is_closed = transport.is_closing
         self._counted = (0, 0)
 
@@ -60,6 +61,7 @@ class ClientConnection:
             struct.unpack_from("=Q", info, RECEIVED_AT),
             struct.unpack_from("=QQ", info, SENT_AT),
         )
+        # the kernel counts retransmitted bytes as sent, and an application did not send them
         before, self._counted = self._counted, (received, sent - again)
         return received - before[0], sent - again - before[1]
 

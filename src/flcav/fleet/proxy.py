@@ -51,7 +51,8 @@ class FleetProxy:
         self._registry: VehicleRegistry | None = None
         self._file: tuple[int, int] | None = None  # device and inode of the registry's file
         self._objects = defaultdict[str, asyncio.Semaphore](lambda: asyncio.Semaphore(AT_ONCE))
-        self._traffic, self._changed = read_traffic(folder), True
+        self._traffic = read_traffic(folder)
+        self._changed = True
         self._traffic.lose_all()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
@@ -82,7 +83,9 @@ class FleetProxy:
             connection.abort()
 
     async def _answer(self, vehicle: RegisteredVehicle, scope: Scope, receive: Receive, send: Send) -> None:
-        path, headers, came = scope["path"], relay.check_headers(scope["headers"]), time.time()
+        path = scope["path"]
+        headers = relay.check_headers(scope["headers"])
+        came = time.time()
         if path == REQUEST_PATH and scope["method"] == "POST":
             await self._take_request(vehicle.name, scope, receive, send)
             return
@@ -94,7 +97,8 @@ class FleetProxy:
             raise relay.RequestRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
         if node_key(headers.get(relay.NODE_KEY, b"")) != vehicle.public_key:
             raise relay.RequestRefused(401, "the node's key is not the certificate's")
-        passed, gone = [*relay.choose_headers(headers), relay.name_key(vehicle)], False
+        passed = [*relay.choose_headers(headers), relay.name_key(vehicle)]
+        gone = False
         connection: ClientConnection = scope["state"][CONNECTION]
 
         async def checked(event: Message) -> None:
@@ -102,6 +106,7 @@ class FleetProxy:
             gone |= connection.is_closed()
             await send(event)
 
+        # bodies of objects are held in memory while they are relayed, which bounds a vehicle's share of it
         slot = self._objects[vehicle.name] if call == "push-object" else contextlib.nullcontext()
         async with slot:
             body = await relay.read_body(scope, receive, relay.largest_body(call))
@@ -203,7 +208,7 @@ class FleetProxy:
 def find_caller(
     registry: VehicleRegistry, certificate: bytes | None, now: float | None = None
 ) -> RegisteredVehicle | str:
-    """Return the vehicle whose certificate (DER) is in force, or a sentence why there is none."""
+    """Return the vehicle whose certificate (DER) is in force at `now` [s since 1970], or a sentence why none is."""
     if certificate is None:
         return "a certificate is wanted"
     found = registry.find(hashlib.sha256(certificate).hexdigest())
@@ -217,7 +222,10 @@ def find_caller(
 
 
 def describe_clock(signed_at: bytes, now: float | None = None) -> str:
-    """Return a sentence on why Flower refused a node's signature, usually its clock; `signed_at` is its header."""
+    """Return a sentence on why Flower refused a node's signature, usually its clock.
+
+    signed_at: header with the time of signing. now: [s since 1970].
+    """
     try:
         late = (time.time() if now is None else now) - datetime.fromisoformat(signed_at.decode("ascii")).timestamp()
     except (ValueError, OverflowError):

@@ -276,6 +276,7 @@ class VehicleRegistry:
     def _change(self) -> Iterator[sqlite3.Cursor]:
         with _registry_errors(self.path):
             cursor = self._connection.cursor()
+            # takes the write lock at once: what is read within the change stays true until its end
             cursor.execute("BEGIN IMMEDIATE")
             try:
                 yield cursor

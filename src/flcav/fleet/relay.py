@@ -110,7 +110,8 @@ async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
     declared = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
     if int(declared) > most:
         raise RequestRefused(400, f"the message has more than {most} bytes")
-    body, more = bytearray(), True
+    body = bytearray()
+    more = True
     try:
         async with asyncio.timeout(BODY_S):
             while more:
@@ -170,6 +171,7 @@ def check_body(call: str, body: bytes, vehicle: RegisteredVehicle) -> bytes:
         message_ = CALLS[call].FromString(body)
     except DecodeError:
         raise RequestRefused(400, f"the body is none of {call}") from None
+    # fields unknown here might be known to another version of Flower behind the proxy
     message_.DiscardUnknownFields()
     _check_texts(message_)
     if isinstance(message_, ActivateNodeRequest):
@@ -202,7 +204,8 @@ async def relay(client: httpx.AsyncClient, path: str, headers: Headers, body: by
 
     If the other server cannot be reached, the response is 503, after which Flower's nodes try again.
     """
-    done, begun = Relayed(up=len(body)), False
+    done = Relayed(up=len(body))
+    begun = False
     try:
         request = client.build_request("POST", path, headers=[*headers], content=body)
         for name in ("accept-encoding", "user-agent"):  # added by httpx

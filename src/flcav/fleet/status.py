@@ -136,7 +136,8 @@ def read_fleet_status(folder: Path) -> FleetStatus:
         asked, answered = registry.list_requests(SHOWN), registry.list_answered()
     finally:
         registry.close()
-    traffic, online = read_traffic(folder), set[int]()
+    traffic = read_traffic(folder)
+    online = set[int]()
     try:
         ready = read_ready(folder)
     except InputError:
@@ -144,7 +145,8 @@ def read_fleet_status(folder: Path) -> FleetStatus:
     if ready is not None:
         with contextlib.suppress(*SuperLinkLost):
             online = SuperLink(folder, ready.superlink).list_online()
-    vehicles, reports = [], read_reports(folder)
+    vehicles = []
+    reports = read_reports(folder)
     for vehicle_ in registered:
         crossed = traffic.vehicles.get(vehicle_.name, Crossed())
         counted = crossed.socket_up, crossed.socket_down, crossed.content_up, crossed.content_down
@@ -159,6 +161,7 @@ def read_fleet_status(folder: Path) -> FleetStatus:
     proxy = None if ready is None else ready.proxy
     made = [(vehicle, parse_request(content)) for vehicle, _, content in asked]
     requests = tuple(Asked(vehicle, vehicle_, vehicle_.nonce in answered) for vehicle, vehicle_ in made)
-    refused, free = tuple(map(make_printable, traffic.refused[-SHOWN:])), shutil.disk_usage(folder).free
+    refused = tuple(map(make_printable, traffic.refused[-SHOWN:]))
+    free = shutil.disk_usage(folder).free
     rest = refused, free, federation, time.time()
     return FleetStatus(proxy, read_processes(folder), tuple(vehicles), requests, *rest)

@@ -124,6 +124,7 @@ class SuperLink:
             self._control() as control,
             RuntimeHttpClient.from_server_address(self.address, False, certificate, interceptors) as runtime,
         ):
+            # this process takes the task of the server app, in place of Flower's executor
             number = control.StartRun(StartRunRequest(fab=Fab(content=bundle))).run_id
             self._attach(bundle, signature)
             while True:
@@ -152,7 +153,8 @@ class ServerRun:
         self._client = self.grid._runtime_client
         given = self._client.PullTaskInput(PullTaskInputRequest())
         self._identity = given.task_id, given.run.run_id, given.context.node_id
-        self._context, self.id = given.context, given.run.run_id
+        self._context = given.context
+        self.id = given.run.run_id
         self.grid.set_run(run_from_proto(given.run))
         self._ended = threading.Event()
         threading.Thread(target=self._beat, daemon=True).start()

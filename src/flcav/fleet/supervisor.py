@@ -57,18 +57,17 @@ def supervise(
         ended = True
 
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
-    all_, waiting = {name: _Supervised(do) for name, do in processes.items()}, dict(later)
+    all_ = {name: _Supervised(do) for name, do in processes.items()}
+    waiting = dict(later)
     changed = False
     try:
         while not ended:
             changed |= _reap(all_)
             for name, process in all_.items():
                 if not process.pid and time.monotonic() >= process.started + process.pause_s:
-                    process.pid, process.started, process.starts = (
-                        _fork(folder, name, process.do),
-                        time.monotonic(),
-                        process.starts + 1,
-                    )
+                    process.pid = _fork(folder, name, process.do)
+                    process.started = time.monotonic()
+                    process.starts += 1
                     changed = True
             if changed:
                 status = {name: {"pid": process.pid, "starts": process.starts} for name, process in all_.items()}
@@ -112,7 +111,8 @@ def _reap(all_: Mapping[str, _Supervised]) -> bool:
         if process.pid and os.waitpid(process.pid, os.WNOHANG)[0]:
             steady = time.monotonic() - process.started > STEADY_S
             process.pause_s = 0.0 if steady else min(max(2 * process.pause_s, 1.0), LONGEST_S)
-            process.pid, changed = 0, True
+            process.pid = 0
+            changed = True
     return changed
 
 

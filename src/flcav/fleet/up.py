@@ -115,7 +115,8 @@ def run_fleet(
     """
     with _alone(folder):
         _, proxy, superlink = prepare_fleet(folder, host, port, vehicles)
-        link, state = SuperLink(folder, superlink), _Enrolment(folder)
+        link = SuperLink(folder, superlink)
+        state = _Enrolment(folder)
         processes: dict[str, Callable[[], None]] = {
             "superlink": lambda: run_superlink(folder, superlink),
             "proxy": lambda: run_proxy(folder, host, int(proxy.rpartition(":")[2]), superlink),
@@ -125,7 +126,8 @@ def run_fleet(
             functions = vehicle_processes(folder / VEHICLES / name, prepare, others)
             later |= {f"{name}-{kind}": do for kind, do in functions.items()}
 
-        begun, silent = time.monotonic(), True
+        begun = time.monotonic()
+        silent = True
 
         def is_up() -> bool:
             nonlocal silent

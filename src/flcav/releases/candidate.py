@@ -162,6 +162,7 @@ def hash_card(weights: Path) -> str:
     try:
         check_is_file(weights, None)
         with weights.open("rb") as file:
+            # safetensors: the length of the header, 8 bytes, then the header as JSON
             size = int.from_bytes(file.read(8), "little")
             if size > MOST_HEADER_BYTES:
                 raise ValueError("its header is too long")

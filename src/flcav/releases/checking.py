@@ -230,6 +230,7 @@ def _refresh(folder: Path, name: str, sources: RepositorySources, at: datetime) 
             config=config,
             bootstrap=root.read_bytes(),
         )
+        # the client checks expiry against the vehicle's clock rather than this machine's
         updater._trusted_set.reference_time = at
         updater.refresh()
     _check_clock(updater, name, at)

@@ -114,6 +114,7 @@ def download(folder: Path, checked: CheckedRelease, approved: Approved) -> None:
 
 def install_release(folder: Path, approved: Approved) -> Installed:
     """Make an approved release, whose weights are in a vehicle's folder, its driving network."""
+    # an atomic rename: until it, the old network drives, and from it on the new one
     installed = Installed(approved.task, approved.release, approved.weights)
     write_json(folder / CURRENT, installed.as_json())
     return installed

@@ -73,9 +73,11 @@ class Deployment:
         self, clients: Mapping[str, Trainable], agreed: ClientAgreement, states: ClientStates, account: Account
     ) -> Iterator["DeployedGrid"]:
         vehicles = self.choose_vehicles([*clients])
+        # a fresh name, since vehicles answer a round once per federation
         federation = os.urandom(8).hex()
         for (name, client), vehicle in zip(clients.items(), vehicles, strict=True):
-            secret, state = agreed.secrets.get(name), states.get(name, {})
+            secret = agreed.secrets.get(name)
+            state = states.get(name, {})
             assignment = Assignment(
                 federation, name, client, agreed.strategy, agreed.rules, secret, agreed.spent, dict(state)
             )
@@ -106,6 +108,7 @@ class Deployment:
             if len(able) < len(clients):
                 counted = f"{len(able)} vehicles" + (f" beside {self.first} of other regions" if self.first else "")
                 raise InputError(f"{self.folder}: {counted}, and the federation has {len(clients)} clients")
+            # a client prefers its earlier vehicle, which has its state, until the timeout
             with contextlib.suppress(*SuperLinkLost):
                 online = self.link.list_online()
                 found = {each.name: each for each in able if each.node in online}
@@ -152,7 +155,8 @@ class RegionalDeployment:
         clients: number of clients by region; in a common fleet, regions take consecutive vehicles. Raises `InputError`
         where a fleet is not up.
         """
-        first, self._fleets = 0, dict[str, Deployment]()
+        first = 0
+        self._fleets = dict[str, Deployment]()
         for region, count in clients.items():
             if (folder / region / AUTHORITY).exists():
                 self._fleets[region] = Deployment(folder / region)
@@ -219,7 +223,10 @@ class JoinedGrid(LinkGrid):
         return {name: found[name] for name in self.names.values() if name in found}
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies in the order of the messages; local nodes answer after the deployed ones before them."""
+        """Yield the replies in the order of the messages; local nodes answer after the deployed ones before them.
+
+        timeout: of the deployed nodes [s].
+        """
         asked = [*messages]
         far = [message for message in asked if message.metadata.dst_node_id not in self._near.names]
         answers = iter(self._grid.send_and_receive(far, timeout=timeout))

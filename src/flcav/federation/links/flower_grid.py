@@ -62,7 +62,8 @@ class DeployedGrid(LinkGrid):
         limit_s: time limit of training in a round [s]; None: none.
         """
         self._folder, self._link, self.names, self._vehicles, self._account = folder, link, names, vehicles, account
-        self._limit_s, self.authority = limit_s, load_certificate(folder)
+        self._limit_s = limit_s
+        self.authority = load_certificate(folder)
         self._largest = 0  # largest request to train so far [bytes]
         self._rounds: tuple[RoundProgress, ...] = ()
         self._waits: dict[str, str] = {}  # reason of waiting, by client
@@ -92,7 +93,8 @@ class DeployedGrid(LinkGrid):
     def follow(self, record: RoundRecord) -> None:
         """Write a completed round to the fleet's folder, for `flcav fleet status`."""
         about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon, record.empty
-        self._rounds, self._waits = (*self._rounds, RoundProgress(record.round, *about)), {}
+        self._rounds = (*self._rounds, RoundProgress(record.round, *about))
+        self._waits = {}
         self._tell()
 
     def _tell(self) -> None:
@@ -121,12 +123,17 @@ class DeployedGrid(LinkGrid):
 
         Nodes that claim to have withheld an answer for its size come last. `BudgetExceeded` is raised if the claim is
         plausible: another client's answer was larger than the grant or, if there is none, the largest possible one is.
+        timeout: of all replies together [s].
         """
         asked = {message.metadata.dst_node_id: message for message in messages}
-        exchange, kept, largest = _Exchange(self._count_losses()), list[int](), 0
+        exchange = _Exchange(self._count_losses())
+        kept = list[int]()
+        largest = 0
+        # one answer per node; those that arrive before their turn wait here
         answers: dict[int, Message] = {}
         end = time.monotonic() + (timeout or float("inf"))
-        late_s, self._look = self._limit_answers(asked.values()), 0.0
+        late_s = self._limit_answers(asked.values())
+        self._look = 0.0
         for node, message in asked.items():
             while node not in answers:
                 self._strike(asked, answers)
@@ -168,7 +175,8 @@ class DeployedGrid(LinkGrid):
         for node, message in kept.items():
             granted = exchange.granted[node]
             if granted < (largest or self._most_bytes):
-                name, link = self.names[node], self._account.link
+                name = self.names[node]
+                link = self._account.link
                 raise BudgetExceeded(
                     f"{name}: an answer of more than the {granted} bytes that are left on the {link} uplink"
                 )
@@ -205,7 +213,8 @@ class DeployedGrid(LinkGrid):
             state = "not registered" if vehicle is None else vehicle.describe_state()
             if state == "registered":
                 continue
-            name, why = self.names[node], f"the certificate of {self._vehicles[node].name} is {state}"
+            name = self.names[node]
+            why = f"the certificate of {self._vehicles[node].name} is {state}"
             if node in asked and node not in answers:
                 answers[node] = Message(Error(LOST_BY_NETWORK, why), reply_to=asked[node])
             if name not in self._gone:
@@ -224,12 +233,15 @@ class DeployedGrid(LinkGrid):
 
     def _push(self, exchange: "_Exchange", due: Mapping[int, Message]) -> None:
         """Send requests to nodes, with the granted sizes of their answers."""
-        left, sent = min(max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6)), 2**62), []
+        left = min(max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6)), 2**62)
+        sent = []
         for node, message in due.items():
-            content, trains = {**message.content}, message.metadata.message_type == MessageType.TRAIN
+            content = {**message.content}
+            trains = message.metadata.message_type == MessageType.TRAIN
             if trains:
                 self._largest = max(self._largest, wire_bytes(message.content))
             most = min(left, self._most_bytes) if trains else left if GRANT in content else 2**62
+            # a repeated request keeps its first grant: the vehicle then sends the same answer
             granted = exchange.granted.setdefault(node, most)
             if trains or GRANT in content:
                 content[GRANT] = ConfigRecord({GRANTED: granted})
@@ -299,7 +311,8 @@ class _Exchange:
         return node in self._lost and time.monotonic() > self._lost[node] + REJOIN_S
 
     def sent(self, node: int, identifier: str) -> None:
-        self.nodes[identifier], self._due[node] = node, time.monotonic() + self._patience.get(node, AGAIN_S)
+        self.nodes[identifier] = node
+        self._due[node] = time.monotonic() + self._patience.get(node, AGAIN_S)
         self._patience[node] = 2 * self._patience.get(node, AGAIN_S)
         self._begun.setdefault(node, time.monotonic())
 

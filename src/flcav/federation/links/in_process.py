@@ -59,7 +59,8 @@ def wire_bytes(content: RecordDict) -> int:
     Sizes of arrays are computed from the encoding of Protocol Buffers, since serialising a large network takes longer
     than a local step. A field consists of tag, length and content; empty fields are left out, except records.
     """
-    others, total = RecordDict(), 0
+    others = RecordDict()
+    total = 0
     for key, record in content.items():
         if not isinstance(record, ArrayRecord):
             others[key] = record
@@ -70,6 +71,7 @@ def wire_bytes(content: RecordDict) -> int:
 
 
 def _array_bytes(array: Array) -> int:
+    # in Protocol Buffers an empty bytes field takes no space, not even its tag
     head = ProtoArray(dtype=array.dtype, shape=array.shape, stype=array.stype).ByteSize()
     return head + (_nested(len(array.data)) if array.data else 0)
 
@@ -206,12 +208,14 @@ class EmbeddedGrid(LinkGrid):
         return found
 
     def _number(self, message: Message) -> None:
+        # numbered in order, so that equal runs have equal messages
         self._sent += 1
         message.metadata.__dict__["_message_id"] = f"{RUN_ID}-{self._sent}"
 
     def _deliver(self, message: Message) -> Message:
         """Return a node's reply; an exception in the client app becomes an error reply, except `BudgetExceeded`."""
         node = message.metadata.dst_node_id
+        # the client app gets shallow copies: the arrays themselves are immutable bytes
         shared = message.content  # by all nodes: changes by one client app must not reach the next
         message.content = RecordDict({key: _copied(record) for key, record in shared.items()})
         config: UserConfig = {PARTITION: node - FIRST_NODE, "num-partitions": len(self.names)}
@@ -230,7 +234,8 @@ class EmbeddedGrid(LinkGrid):
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
         """Yield the replies in the order of the messages, as soon as they are available; raises what a node raises.
 
-        At most `at_once` messages are in flight, or answered and not yet consumed.
+        At most `at_once` messages are in flight, or answered and not yet consumed. timeout: not
+        applied in this process, where `limit_time` limits a training.
         """
         if self._at_once == 1:  # in this thread: other threads have other thread counts
             for message in messages:

@@ -92,14 +92,17 @@ def open_link(
     """
     make_app = partial(client_app, **vars(agreed))
     rules = agreed.rules
-    limit_s, names, far = rules.limits.train_s, [*clients], False
+    limit_s = rules.limits.train_s
+    names = [*clients]
+    far = False
     if runtime is None:
         opened = EmbeddedGrid(make_app(limit_time(clients, limit_s)), names, states)
     elif isinstance(runtime, ClientProcesses):
         opened = EmbeddedGrid(make_app(train_remotely(clients, runtime, limit_s)), names, states, runtime.count)
     elif runtime.deployed is True:
         check_deployable(rules)
-        opened, far = runtime.open(clients, agreed, states, account), True
+        opened = runtime.open(clients, agreed, states, account)
+        far = True
     else:
         opened = runtime.open(clients, lambda each: make_app(limit_time(each, limit_s), simulated=True), states)
     with opened as inner:
@@ -157,7 +160,8 @@ def _ask_there(
     *,
     counted: bool = True,
 ) -> Replies:
-    nodes, records = {name: node for node, name in names.items()}, {ASK: ConfigRecord({ASK: question})}
+    nodes = {name: node for node, name in names.items()}
+    records = {ASK: ConfigRecord({ASK: question})}
     content = RecordDict({**records, **({ARRAYS: to_array_record(arrays)} if arrays else {})})
     if counted:
         content[GRANT] = ConfigRecord()  # the grid fills it in when it sends the request

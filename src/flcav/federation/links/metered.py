@@ -71,7 +71,7 @@ class MeteredGrid(LinkGrid):
 
         A message is entered when it is sent or, while another reply is outstanding, together with its reply, so that
         the order of entries does not depend on the number of messages in flight. Nothing is sent before the first reply
-        is requested. The first reply over a budget ends the exchange: raises `BudgetExceeded`.
+        is requested. The first reply over a budget ends the exchange: raises `BudgetExceeded`. timeout: [s].
         """
         asked: dict[int, Message] = {}
         waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages not entered yet, by node
@@ -103,7 +103,9 @@ class MeteredGrid(LinkGrid):
             yield from map(self._fail, away)
 
         for reply in arrived():
-            node, number, size = reply.metadata.src_node_id, 0, 0
+            node = reply.metadata.src_node_id
+            number = 0
+            size = 0
             counts = reply.has_content() and self.names[node] not in self._account.within
             if counts:
                 number, size = _round(asked[node]), wire_bytes(reply.content)
@@ -137,7 +139,8 @@ class MeteredGrid(LinkGrid):
         outage = self._find_outage(message)
         if outage is None or not reply.has_content() or ARRAYS not in reply.content.array_records:
             return reply
-        account, size = self._account, min(outage.sent_bytes or 0, wire_bytes(reply.content))
+        account = self._account
+        size = min(outage.sent_bytes or 0, wire_bytes(reply.content))
         name = self.names[message.metadata.dst_node_id]
         account.ledger.enter(account.describe("up", _round(message), name, size))
         return self._fail(message)

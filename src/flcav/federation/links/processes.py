@@ -59,6 +59,7 @@ class SharedBlock:
 
     def write(self, value: object) -> Parcel:
         """Write a value over the previous one; return what the reader needs besides."""
+        # protocol 5 keeps arrays out of the pickle, so that they are copied once, into shared memory
         buffers: list[pickle.PickleBuffer] = []
         pickled = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         arrays = [buffer.raw() for buffer in buffers]
@@ -73,7 +74,8 @@ class SharedBlock:
 
     def read(self, parcel: Parcel) -> Any:
         """Return the value, with copies of its arrays."""
-        arrays, start = [], 0
+        arrays = []
+        start = 0
         with memoryview(self._memory) as memory:
             for size in parcel.sizes:
                 arrays.append(bytearray(memory[start : start + size]))

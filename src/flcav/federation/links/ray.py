@@ -48,7 +48,8 @@ class RaySimulation:
         `InputError` where Ray is not installed.
         """
         ready, ended = SimpleQueue[SimulatedGrid | BaseException](), threading.Event()
-        server, names = ServerApp(), [*clients]
+        server = ServerApp()
+        names = [*clients]
 
         @server.main()
         def main(grid: Grid, context: Context) -> None:
@@ -88,7 +89,7 @@ class SimulatedGrid(LinkGrid):
         self._grid, self.names = grid, names
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
-        """Return the replies of the simulation's nodes."""
+        """Return the replies of the simulation's nodes, at most those within `timeout` [s]."""
         return self._grid.send_and_receive(messages, timeout=timeout)
 
 
@@ -110,6 +111,7 @@ def _introduce(grid: Grid, names: list[str], states: Mapping[str, Mapping[str, A
         if time.monotonic() > end:
             raise OSError(f"Flower's simulation: {len(nodes)} of {len(names)} nodes are there after {STARTING_S:.0f} s")
         time.sleep(0.05)
+    # Flower assigns partitions to nodes in an order of its choice, so every node is asked for its index
     partition: dict[int, int] = {}
     for reply in grid.send_and_receive(_query(nodes, {})):
         partition[int(reply.content.metric_records[METRICS][PARTITION])] = reply.metadata.src_node_id  # type: ignore[arg-type]

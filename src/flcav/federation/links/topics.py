@@ -217,12 +217,13 @@ class Topic:
 
         from flcav.federation.links.ros_types import UInt8MultiArray_
 
-        self.name, self._kind = name, UInt8MultiArray_
+        self.name = name
+        self._kind = UInt8MultiArray_
         quality = Qos(
             Policy.Reliability.Reliable(max_blocking_time=int(DELIVERY_S * 1e9)),
             Policy.Durability.Volatile,
             Policy.History.KeepLast(10),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.DataRepresentation(use_cdrv0_representation=True),  # XCDR1, which ROS 2 uses
             Policy.Userdata(f"typehash={HASH};".encode()),
         )
         self._reader = DataReader(to, DdsTopic(to, f"rt{name}", UInt8MultiArray_), qos=quality)

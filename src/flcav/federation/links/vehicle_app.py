@@ -130,13 +130,16 @@ class VehicleApp(ClientApp):
             assigned.spent,
             identity,
         )
-        content, grant = message.content, None
+        content = message.content
+        grant = None
         if GRANT in content:
             grant = int(content.config_records[GRANT][GRANTED])  # type: ignore[arg-type]
             message.content = RecordDict({key: each for key, each in content.items() if key != GRANT})
+        # the digest excludes the grant, which differs when a request is repeated
         digest = RequestDigests(None).digest(message.content)
         last, state, answer = self._read(assigned)
-        answered, digests_before = answer, _digests(state)
+        answered = answer
+        digests_before = _digests(state)
         asks_again = message.metadata.message_type == MessageType.TRAIN and last == digest
         if not asks_again:
             here = Context(context.run_id, context.node_id, {PARTITION: 0}, state, {})
@@ -144,6 +147,7 @@ class VehicleApp(ClientApp):
             if reply.has_error():
                 return reply
             answer = reply.content
+            # state and answer are one atomic write, before the answer leaves
             if message.metadata.message_type == MessageType.TRAIN:
                 self._write(assigned, digest, here.state, answer)
             elif OWN_DIGESTS in answer:

@@ -146,7 +146,10 @@ def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: A
     Clients get the version that they start from, out of those `kept`, and the local `work` of the round that follows
     it. An update that would exceed a budget, and those after it, are not sent, which the round's record reports.
     """
-    here, rules, number, strategy = round_.here, round_.rules, round_.work.round, buffering.strategy
+    here = round_.here
+    rules = round_.rules
+    number = round_.work.round
+    strategy = buffering.strategy
     buffer = buffering.buffers.rounds[number - 1]
     begun = {
         version: {name: kept[_key(version, name)] for name in round_.start} for version in buffer.versions.values()
@@ -156,6 +159,7 @@ def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: A
     requests = {}
     for name in here.chosen:
         version = buffer.versions[name]
+        # trained as in the round after its version, but answered in this round, once per client
         local = replace(work(version + 1), round=number)
         requests[name] = RecordDict({ARRAYS: arrays[version], CONFIG: local.record()})
     updates = Intake(strategy if rules.privacy is None else None)

@@ -18,7 +18,8 @@ def collect(exchange: Exchange, round_: OpenRound) -> Intake:
     train. No update is requested where fewer clients take part than the rules need.
     """
     here, rules, work = round_.here, round_.rules, round_.work
-    unbiased, local = rules.selection.unbiased, RecordDict({CONFIG: work.record()})
+    unbiased = rules.selection.unbiased
+    local = RecordDict({CONFIG: work.record()})
     first = RecordDict({**local}) if unbiased else round_.training()
     first[ASK] = ConfigRecord({ASK: COUNT if unbiased else NORM})
     requests = dict.fromkeys(here.asked if unbiased else here.chosen, first)

@@ -31,7 +31,9 @@ def collect(exchange: Exchange, round_: OpenRound, authority: x509.Certificate |
     assert secure is not None
     if not here.count(round_.rules):
         return Intake()
-    local, training, clients = round_.work.record(), round_.training(), here.chosen
+    local = round_.work.record()
+    training = round_.training()
+    clients = here.chosen
 
     def exchange_step(
         asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]

@@ -64,7 +64,8 @@ def answer_secretly(
             record[wire.CERTIFICATES], record[wire.SIGNATURES] = identity.sign(name, round_, client.keys)
     elif asked[wire.ASK] == wire.SHARES:
         client = _recall(context)
-        peers, threshold = _peers(asked), _number(asked[THRESHOLD])
+        peers = _peers(asked)
+        threshold = _number(asked[THRESHOLD])
         if identity is not None:
             check_certified(identity.authority, round_, _signed(asked, peers))
         if threshold < (needed := how.needed(len(peers), certified=identity is not None)):
@@ -172,6 +173,7 @@ class SecureSum:
         )
         self._check(len(shares), "helped to unmask the sum")
         about = add_vectors(masked.values()), self._keys, survivors, dropped
+        # wrong shares are only searched for where the sum does not come out: that takes much longer
         try:
             return unmask_sum(*about, shares), {}
         except OverflowError:

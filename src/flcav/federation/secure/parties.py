@@ -91,7 +91,8 @@ class SecureClient:
             raise ValueError("another public key in the place of this client's own")
         if not len(peers) / 2 < threshold <= len(peers):
             raise ValueError(f"a threshold of {threshold} of {len(peers)} clients: more than half of them is wanted")
-        self.peers, self.threshold = dict(peers), threshold
+        self.peers = dict(peers)
+        self.threshold = threshold
         parts = (split_secret(secret, threshold, len(peers)) for secret in (self.seed, self.private))
         both = {name: seed + key for name, seed, key in zip(peers, *parts, strict=True)}
         self.own_shares = both.pop(self.name)
@@ -166,7 +167,7 @@ def unmask_sum(
     def joined(name: str) -> bytes:
         return join_shares({places[holder]: revealed[name] for holder, revealed in shares.items()})
 
-    for name in survivors:
+    for name in survivors:  # their pairwise masks cancel, and their self-masks are left
         total = add_mask(total, joined(name), plus=False)
     for name in dropped:  # its pairwise masks with survivors have no counterpart in the sum
         private = joined(name)

@@ -82,6 +82,7 @@ def to_integers(values: NDArray[np.float64], largest: float, clients: int) -> Ve
     """
     if not np.isfinite(values).all():
         raise ValueError("an update with values that are not finite cannot be masked")
+    # signed 32-bit range over the number of clients: the sum of all vectors cannot wrap around
     limit = LARGEST_SUM // clients
     return np.rint(np.clip(values / largest, -1.0, 1.0) * limit).astype(np.int64).astype(np.uint32)
 
@@ -128,6 +129,7 @@ def find_wrong_shares(shares: Mapping[int, bytes], threshold: int) -> set[int]:
     Subsets of `threshold` shares are tried, all where there are few, until one gives a secret of 32 bytes. With e wrong
     shares and a threshold of half, about one subset in 2^e does. Raises ValueError where none of those tried does.
     """
+    # the order of trials is no secret, so a fixed seed keeps the result reproducible
     every = math.comb(len(shares), threshold)
     rng = stream(0, "shares")
     tried = (
@@ -144,6 +146,7 @@ def find_wrong_shares(shares: Mapping[int, bytes], threshold: int) -> set[int]:
 
 def _interpolate(shares: Mapping[int, bytes], x: int) -> int:
     """Return the value at x of the polynomial through the shares."""
+    # Lagrange basis polynomials at x; the share at index i has the abscissa i + 1
     total = 0
     for place, share in shares.items():
         above, below = 1, 1

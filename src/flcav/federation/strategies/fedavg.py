@@ -62,6 +62,7 @@ class RunningMean:
             if not np.issubdtype(array.dtype, np.floating):
                 low, high = self._ends.get(name, (array, array))
                 self._ends[name] = np.minimum(low, array), np.maximum(high, array)
+        # block by block, so that no second array of the network's size is needed
         for name, total in self._sums.items():
             values, sums = weights[name].reshape(-1), total.reshape(-1)
             for start in range(0, values.size, BLOCK):

@@ -37,7 +37,9 @@ def mix_neighbours(updates: Sequence[Update], mixing: Mixing) -> Sequence[Update
     mixed = []
     for row, update in zip(flat, updates, strict=True):
         near = np.argsort(((flat - row) ** 2).sum(axis=1), kind="stable")[: len(updates) - mixing]
-        mean, start, weights = flat[np.sort(near)].mean(axis=0), 0, dict(update.weights)
+        mean = flat[np.sort(near)].mean(axis=0)
+        start = 0
+        weights = dict(update.weights)
         for name in names:
             array = update.weights[name]
             weights[name] = mean[start : start + array.size].reshape(array.shape).astype(array.dtype)
@@ -142,6 +144,7 @@ class Krum:
         names = learned_names(start)
         mixed = mix_neighbours(updates, self.mixing)
         flat = flatten_updates(mixed, names)
+        # the smallest distance of a row is that to itself, 0, and is left out
         near = len(updates) - self.byzantine - 2
         scores = [np.sort(((flat - row) ** 2).sum(axis=1))[1 : near + 1].sum() for row in flat]
         chosen = [mixed[i] for i in np.sort(np.argsort(scores, kind="stable")[: self.kept])]

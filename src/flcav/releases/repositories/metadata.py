@@ -214,6 +214,7 @@ def sign_online(
     first: bool = False,
 ) -> None:
     """Sign snapshot and timestamp; the timestamp is written last, so that a crash leaves the old state intact."""
+    # clients start from the timestamp, so that no reader sees files that are not written yet
     snapshot.signed.meta["targets.json"].version = targets_version
     snapshot.signed.version += 0 if first else 1
     snapshot.signed.expires = expiry_of("snapshot", at)

@@ -119,7 +119,8 @@ def publish(out: Path, now: datetime | None = None) -> int:
     from tuf.api.metadata import Metadata
 
     at = now or datetime.now(UTC)
-    metadata, staged = out / "repository" / "metadata", _staged_path(out)
+    metadata = out / "repository" / "metadata"
+    staged = _staged_path(out)
     _check_clock(out, at)
     version = load_targets(out).signed.version
     online = read_private_key(key := out / "keys" / f"{ONLINE}.pem")
@@ -285,8 +286,10 @@ def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = N
     Metadata signed with a stolen old key are invalid from then on, whatever their version numbers. Raises `InputError`
     for fewer keys than the root's threshold, unknown keys, and one given twice.
     """
-    at, metadata = now or datetime.now(UTC), out / "repository" / "metadata"
-    owned, party = [read_private_key(path) for path in keys], read_party(out)
+    at = now or datetime.now(UTC)
+    metadata = out / "repository" / "metadata"
+    owned = [read_private_key(path) for path in keys]
+    party = read_party(out)
     check_distinct([key.public for key in owned], f"the keys of the {party}")
     signed = load_root(out)
     root: Root = signed.signed
@@ -305,6 +308,7 @@ def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = N
         < root.roles["root"].threshold
     ):
         raise InputError(f"{out}: fewer signatures of the {party} than its root wants")
+    # a thief may have signed a snapshot of old targets: the latest file counts
     version = latest_version(metadata, "targets")
     write_metadata(signed, metadata / f"{root.version}.root.json")
     timestamp: Metadata[Timestamp] = load_metadata(metadata / "timestamp.json")

@@ -55,7 +55,9 @@ class RepositoryStatus(Record):
 
 def read_repository_status(out: Path, task: str) -> RepositoryStatus:
     """Return the status of a party's repository for a task; raises `InputError` where `out` is none."""
-    party, targets, root = read_party(out), load_targets(out).signed, load_root(out).signed
+    party = read_party(out)
+    targets = load_targets(out).signed
+    root = load_root(out).signed
     directive = read_directives(targets.targets).get(task)
     return RepositoryStatus(
         party=party,

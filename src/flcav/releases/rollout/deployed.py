@@ -79,7 +79,8 @@ def roll_out(
         InputError: for a fleet that is not up or has no vehicles, too few keys, and a release that was stopped.
     """
     read_ready(fleet)
-    names, directive = list_registered(fleet), read_directive(customer, TASK)
+    names = list_registered(fleet)
+    directive = read_directive(customer, TASK)
     candidate = read_released(provider, TASK, directive.release)
     if len(keys) < (threshold := read_repository_status(customer, TASK).threshold):
         raise InputError(f"{len(keys)} of {threshold} keys of the customer: a roll-out that stops by itself needs all")
@@ -179,7 +180,8 @@ class _Rollout:
         assigned = self.assigned(self.sign(share))
         while True:
             reports = {name: kept for name, kept in read_reports(self.fleet).items() if name in assigned}
-            reached, decision = {name for name, kept in reports.items() if self.drives(kept)}, self.judge(reports)
+            reached = {name for name, kept in reports.items() if self.drives(kept)}
+            decision = self.judge(reports)
             stop = decision is not None and decision.judgement == "stop" and decision.vehicles >= LEAST
             if stop or len(reached) == len(assigned) or time.monotonic() > until:
                 break
@@ -208,6 +210,7 @@ class _Rollout:
         """Return the bytes downloaded for releases so far, by vehicle, on the proxy's sockets."""
         crossed = read_traffic(self.fleet).vehicles  # written with a delay, unlike reports
         known = {name: traffic.release_down for name, traffic in crossed.items()}
+        # the larger one is the later one
         return {
             name: max(known.get(name, 0), reports[name].down_bytes if name in reports else 0) for name in self.names
         }

@@ -163,7 +163,9 @@ class _Rehearsal:
 
     def roll_out(self, candidate: Path, shadows: _Shadows, progress: Report) -> list[Turn]:
         """Return the turns until the whole fleet has the release, it is stopped, or `MOST_TURNS` is reached."""
-        release, share, fleet = read_candidate(candidate).release, STAGES[0], self.fleet
+        release = read_candidate(candidate).release
+        share = STAGES[0]
+        fleet = self.fleet
         self.parties.release(candidate, share)
         turns: list[Turn] = []
         fetched: set[str] = set()

@@ -186,7 +186,8 @@ def update_over_radio(
         tuple[int, str, int, int], dict[str, str]
     ] = {}  # vehicles that download together, by agent of the recording
     for vehicle in vehicles:
-        drive, day = fleet.drive_of(vehicle, turn), fleet.names.index(vehicle) // len(fleet.drives)
+        drive = fleet.drive_of(vehicle, turn)
+        day = fleet.names.index(vehicle) // len(fleet.drives)
         release, size = _ask(fleet, vehicle, sources)
         groups.setdefault((day, drive.scene, release, size), {})[drive.agent] = vehicle
     found = []

@@ -104,9 +104,11 @@ def judge_shadows(reports: Sequence[ShadowReport], limit: float = LIMIT) -> Shad
     if len({each.vehicle for each in reports}) < len(reports):
         raise InputError("a vehicle reports its shadow run twice")
     values = np.array([each.disagreement for each in reports])
-    mean, number = float(values.mean()), len(values)
+    mean = float(values.mean())
+    number = len(values)
     if number < 2:
         return ShadowDecision("stop" if mean > limit else "wait", number, mean, 0.0, 1.0)
+    # the disagreement is in [0, 1], and so are its bounds
     half = float(stdtrit(number - 1, 1 - LEVEL)) * float(values.std(ddof=1)) / float(np.sqrt(number))
     low, high = max(mean - half, 0.0), min(mean + half, 1.0)
     judgement: Judgement = "stop" if low > limit else "go on" if high < limit else "wait"
@@ -144,7 +146,8 @@ def change_share(
     A share of 0 also stops the roll-out for vehicles assigned by name.
     """
     now = read_directive(out, task)
-    revoked, named = tuple(sorted({*now.revoked, *revoke})), now.vehicles if share else ()
+    revoked = tuple(sorted({*now.revoked, *revoke}))
+    named = now.vehicles if share else ()
     updates = {"share_ppm": round(share * MILLION), "revoked": revoked, "vehicles": named}
     changed = parse_config(Directive, now.model_dump() | updates, "the directive")
     return changed, stage_directive(out, task, changed, keys)

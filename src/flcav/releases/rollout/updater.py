@@ -68,7 +68,10 @@ def equip_vehicle(folder: Path, roots: tuple[bytes, bytes] | None, drive: Record
 
 def run_updater(folder: Path) -> None:
     """Update the vehicle in `folder` whenever the customer's timestamp changes, until the parent process ends."""
-    parent, pause, seen, due = os.getppid(), POLL_S, b"", float("inf")
+    parent = os.getppid()
+    pause = POLL_S
+    seen = b""
+    due = float("inf")
     client: httpx.Client | None = None
     while os.getppid() == parent:
         fine = True
@@ -77,11 +80,13 @@ def run_updater(folder: Path) -> None:
             stamp = _ask(client)
             if stamp is None:  # reopened for the next request, as the certificate may have been replaced
                 client.close()
-                client, fine = None, False
+                client = None
+                fine = False
             elif stamp and (stamp != seen or time.monotonic() > due):
                 fine = _run_apart(lambda: update_in_fleet(folder))
                 if fine:
-                    seen, due = stamp, time.monotonic() + CHECK_S
+                    seen = stamp
+                    due = time.monotonic() + CHECK_S
         pause = POLL_S if fine else min(2 * pause, LONGEST_S)
         time.sleep(pause)
 
@@ -98,9 +103,11 @@ def update_in_fleet(folder: Path) -> None:
     Raises `InputError` if the vehicle refuses it, `httpx.HTTPError` if the proxy cannot be reached or refuses the
     vehicle.
     """
-    home, vehicle = folder / FOLDER, requested_name(read_request(folder / REQUEST))
+    home = folder / FOLDER
+    vehicle = requested_name(read_request(folder / REQUEST))
     for left in (home / "networks").glob(".*.part"):  # left by an update that was killed
         left.unlink()
+    # every stage is reported before the next, so that the fleet sees a vehicle that stops within one
     with open_client(folder) as client:
         base = str(client.base_url)
         sources = RepositorySources(f"{base}image", f"{base}director", CertifiedFetcher(client))

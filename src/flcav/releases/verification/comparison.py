@@ -166,6 +166,7 @@ def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Compar
     times: (n, F) bootstrap samples, see `draw_scenes`. guards: number of guards judged together, by which the level is
     divided (Bonferroni).
     """
+    # both networks are measured on the same resampled scenes, so that their common variation cancels
     once = np.ones((1, len(pair.scene)), np.int64)
     old, new = pair.driving(once), pair.candidate(once)
     before, after = pair.driving(times), pair.candidate(times)
@@ -175,7 +176,8 @@ def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Compar
     spare = None
     weak = pair.limit.is_share and not old[0] >= LEAST_MEASURE
     if len(after) and pair.scenes >= LEAST_OF_GUARD and not weak:
-        error, mean = float(pair.limit.spare(before, after).std()), float(pair.limit.spare(old, new)[0])
+        error = float(pair.limit.spare(before, after).std())
+        mean = float(pair.limit.spare(old, new)[0])
         spare = mean + error * float(stdtrit(pair.scenes - 1, 1 - LEVEL / guards))
         least = mean - error * float(stdtrit(pair.scenes - 1, 1 - LEVEL))
         judgement = "lost" if spare < 0 else "kept" if least >= 0 else "open"

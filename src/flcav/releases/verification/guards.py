@@ -242,6 +242,7 @@ def _of_right(table: ClassTable, values: Values) -> MeasureTerms:
     return MeasureTerms(table.detections, np.where(table.right, values, 0.0), table.right.astype(float))
 
 
+# limits are loose, since guards only protect against large losses: see `comparison`
 MEASURES = (
     ClassMeasure("found", "", Limit(0.6), _found, everywhere=True),
     ClassMeasure("false", "", Limit(2, 0.15, falling=True), _false, everywhere=True),

@@ -160,7 +160,8 @@ def verify(
     candidate = read_candidate(folder)
     if candidate.task != OBJECTS.name:
         raise InputError(f"{folder}: a network of '{candidate.task}', and those of '{OBJECTS.name}' are verified")
-    network, allowed = load_network(OBJECTS, driving), read_domain(odd)
+    network = load_network(OBJECTS, driving)
+    allowed = read_domain(odd)
     frames = choose_test_frames(data, network, most)
     if not frames:
         raise InputError(f"no frame to verify with in {', '.join(map(str, data))}")
@@ -264,6 +265,7 @@ def read_verification(folder: Path) -> CandidateVerification:
 
 def _supports_acceptance(found: CandidateVerification) -> bool:
     """Return whether the numbers of a verification allow its acceptance."""
+    # the file only claims acceptance, so its numbers are judged again
     whole = found.whole
     if whole is None or found.reasons or found.undecided or found.kept_share != KEPT:
         return False
