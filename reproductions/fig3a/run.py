@@ -23,7 +23,7 @@ from flcav.optimization.graph import Layers, build_graph
 from flcav.report import style
 from flcav.report.charts import curves as curve_charts
 from flcav.runs.provenance import Provenance, provenance
-from flcav.runs.tables import load_history
+from flcav.runs.tables import load_known_history
 from flcav.storage.markdown import format_bullets, format_table
 from flcav.storage.records import Record
 
@@ -126,7 +126,7 @@ def _line(fit: Fit[Additive], found: Bands | None, where: Array) -> tuple[tuple[
 
 def _own_curves() -> OwnCurves:
     """Return a line for each number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
-    history = level_seeds(load_history("objects")).history
+    history = level_seeds(load_known_history("objects")).history
     samples, edge_rounds, cloud_rounds = history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     points = np.column_stack((history.resources, history.accuracy)).tolist()

@@ -35,7 +35,7 @@ from flcav.runs.provenance import provenance
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Budgets, RunRecipe
 from flcav.runs.results.run import Run
 from flcav.runs.running import run_several
-from flcav.runs.tables import load_history
+from flcav.runs.tables import load_known_history
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.seeds import mean_over_seeds
 from flcav.storage.markdown import format_bullets, format_signed, format_table
@@ -149,7 +149,7 @@ def _difference(estimate: Estimate | None) -> Estimate:
 
 def _history_ranges() -> dict[str, tuple[float, float]]:
     """Return the least and most of each count in the history that both plans are predicted from."""
-    columns = load_history(TASK).resources.T
+    columns = load_known_history(TASK).resources.T
     return {name: (float(column.min()), float(column.max())) for name, column in zip(COUNTS, columns, strict=True)}
 
 

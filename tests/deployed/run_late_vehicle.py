@@ -11,6 +11,6 @@ date.now = lambda: datetime.now(UTC) + timedelta(seconds=float(ahead.read_text()
 
 if __name__ == "__main__":
     from flcav.federation.links.vehicle_app import preload_assignment
-    from flcav.fleet.up import run_vehicle
+    from flcav.fleet.up import run_vehicle_processes
 
-    run_vehicle(folder, preload_assignment)
+    run_vehicle_processes(folder, preload_assignment)

@@ -231,7 +231,7 @@ def up(
 def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on the vehicle.")) -> None:
     """On a vehicle: run its forwarder, its node and its app until interrupted."""
     from flcav.federation.links.vehicle_app import preload_assignment
-    from flcav.fleet.up import run_vehicle as run
+    from flcav.fleet.up import run_vehicle_processes as run
 
     run(folder, preload_assignment, _updater())
 

@@ -14,7 +14,7 @@ from flcav.storage.records import read_csv
 CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 
 
-def read_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) -> pa.Table:
+def read_input_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) -> pa.Table:
     """Return the CSV or Parquet table at `path`; raises `InputError` if it is no table, empty, or lacks a column.
 
     names: columns that a CSV has as they are written, "007" not as 7; whole numbers without such zeros are numbers.

@@ -1,6 +1,6 @@
-"""An experiment: a folder with a `run.py` whose `EXPERIMENT` says how it is run and how its results are tabulated.
+"""An experiment: a folder with a `run.py` whose `EXPERIMENT` has the functions that run it and tabulate its results.
 
-Beside `run.py` are the experiment's page, `README.md`, and the numbers that it shows, `result.json`.
+The folder also has the experiment's page, `README.md`, and the numbers on it, `result.json`.
 """
 
 import importlib
@@ -36,7 +36,7 @@ OPTIONS = (*STUDY, "kitti", "data", "around", "weights")  # all
 
 
 class HowToRun(TypedDict):
-    """How steps are run, see `flcav.runs.engine.run_steps`."""
+    """Keyword arguments of `flcav.runs.engine.run_steps`."""
 
     jobs: int
     notify: Notify
@@ -46,11 +46,11 @@ class HowToRun(TypedDict):
 
 @dataclass(frozen=True)
 class Options:
-    """Options of `flcav reproduce`; `show_steps` and `show_progress` display what goes on in their contexts."""
+    """Options of `flcav reproduce`; `show_steps` and `show_progress` display progress in their contexts."""
 
     title: str  # name of the target
     seeds: int
-    quick: bool  # in minutes, to see that it runs
+    quick: bool  # whether to shrink it to minutes, as a trial
     jobs: int
     engine: str
     stale: str
@@ -62,23 +62,23 @@ class Options:
     weights: Path | None = None
 
     def how(self, notify: Notify) -> HowToRun:
-        """Return how steps are run."""
+        """Return the keyword arguments of `run_steps`."""
         return {"jobs": self.jobs, "notify": notify, "stale": self.stale, "engine": self.engine}
 
     def load(self, name: str, resize: Resize) -> RunRecipe:
-        """Return the package's recipe `runs/NAME`; a quick one by `resize`."""
+        """Return the package's recipe `runs/NAME`, shrunk by `resize` if quick."""
         recipe = load_run_recipe(recipe_path(f"runs/{name}"))
         return resize(recipe) if self.quick else recipe
 
     def run_seeds(self, recipe: RunRecipe, out: Path, beside: Path | None = None) -> tuple[Run, ...]:
-        """Run or finish a recipe with each seed in the folder `out`; imported towns are looked for in `beside`."""
+        """Run or finish a recipe with all seeds in the folder `out`; imported towns are searched in `beside`."""
         with self.show_steps(self.title) as notify:
             runs, _ = run_seeds(recipe, out, seeds=self.seeds, beside=beside, **self.how(notify))
         return runs
 
 
 class Outcome(NamedTuple, Generic[Results]):
-    """What an experiment found: its results, PNG files by name, and sentences for the terminal."""
+    """The outcome of an experiment: results, PNG files by name, and sentences for the terminal."""
 
     results: Results
     pictures: Mapping[str, bytes]
@@ -87,27 +87,27 @@ class Outcome(NamedTuple, Generic[Results]):
 
 @dataclass(frozen=True)
 class Experiment(Generic[Results]):
-    """How an experiment is run, and the Markdown tables of its page, by name."""
+    """An experiment: the function that runs it, and that which makes the Markdown tables of its page."""
 
     results: type[Results]  # a dataclass, the content of result.json
-    run: Callable[[Path, Options], Outcome[Results]]  # or goes on, in a folder
+    run: Callable[[Path, Options], Outcome[Results]]  # runs or finishes it in a folder
     tables: Callable[[Results], Mapping[str, str]]
     seeds: int = 3  # without `--seeds`
-    takes: tuple[str, ...] = STUDY  # of `OPTIONS`
+    takes: tuple[str, ...] = STUDY  # supported options, of `OPTIONS`
 
     def encode(self, results: Results) -> Json:
         """Return results as a JSON value."""
         return to_json(results, self.results)
 
     def tabulate(self, values: Json, origin: str) -> Mapping[str, str]:
-        """Return the tables of the results that `encode` wrote; raises `InputError`, naming `origin`, for others."""
+        """Return the tables of encoded results, by name; raises `InputError`, naming `origin`, for invalid ones."""
         return self.tables(from_json(self.results, values, origin))
 
 
 def load_experiment(name: str) -> Experiment:
-    """Return the experiment of a target's name, or of a user's own folder.
+    """Return the experiment with the name of a target, or in a user's folder.
 
-    Raises `InputError` for an unknown name, and a folder without `run.py`, with one that cannot be imported, or whose
+    Raises `InputError` for an unknown name, and for a folder whose `run.py` is missing or cannot be imported, or whose
     name is that of another module.
     """
     known = list_experiments()
@@ -133,7 +133,7 @@ def _place(folder: Path) -> str | None:
 
 
 def _import_own(folder: Path) -> ModuleType:
-    """Return a user's `run.py` as a module, which processes that run its steps import, too."""
+    """Import a user's `run.py` as a module that worker processes can import, too."""
     if str(folder.parent) not in sys.path:
         sys.path.insert(0, str(folder.parent))
     try:
@@ -146,7 +146,7 @@ def _import_own(folder: Path) -> ModuleType:
 
 
 def list_works(runs: Sequence[Run], out: Path) -> list[Path]:
-    """Return the folder of the steps of each run that `Options.run_seeds` made in `out`."""
+    """Return the folders of steps of the runs that `Options.run_seeds` made in `out`."""
     return [out / f"seed{run.recipe.seed}" / WORK for run in runs]
 
 
@@ -156,25 +156,25 @@ def use_demo_size(recipe: RunRecipe) -> RunRecipe:
 
 
 def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
-    """Return a recipe at toy size that shows that it runs, with plans that its few frames, anywhere, suffice for."""
+    """Return a recipe at toy size, for a trial, with plans that few frames from anywhere suffice for."""
     few = {"samples": 16, "edge_rounds": 1}
     tasks = {
         name: task.model_copy(update={"plan": task.plan.model_copy(update=few)}) if task.plan else task
         for name, task in recipe.tasks.items()
     }
-    anywhere = recipe.placement.model_copy(update={"group_range_m": 1000.0})  # from a sensor
+    anywhere = recipe.placement.model_copy(update={"group_range_m": 1000.0})  # [m] from a sensor
     changes = {"size": "toy", "splits": None, "training": None, "tasks": tasks, "placement": anywhere}
     return recipe.model_copy(update=changes)
 
 
 def import_map(name: str, folder: Path) -> None:
-    """Import recipes/maps/NAME.xodr as the town `folder`/NAME, unless it is there."""
+    """Import recipes/maps/NAME.xodr as the town `folder`/NAME, unless that exists."""
     if not (folder / name).exists():
         import_town(recipe_path("runs/placement").parents[1] / "maps" / f"{name}.xodr", folder / name)
 
 
 def name_differences(differences: Differences) -> dict[str, MeanOverSeeds]:
-    """Return all differences by name, whose verdicts are corrected together."""
+    """Return all differences by name, as one family of hypotheses."""
     return {
         f"{setting}, {measure}: {rival}": mean
         for setting, of_setting in differences.items()
@@ -184,7 +184,7 @@ def name_differences(differences: Differences) -> dict[str, MeanOverSeeds]:
 
 
 def describe_differences(differences: Differences, reference: str) -> list[str]:
-    """Return the differences to the `reference` in words."""
+    """Return the differences from the `reference` in words, with jointly corrected verdicts."""
     claims = name_differences(differences)
     judged = judge_means(claims)
     return [

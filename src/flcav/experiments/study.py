@@ -1,8 +1,8 @@
-"""Study of one task: record the splits, train a network per seed, and test each once on frames of other scenes.
+"""Study of one task: record the splits, train a network per seed, and test it once on frames of other scenes.
 
 The best epoch is chosen on the validation frames; the test frames are used for nothing else. All seeds train on the
-same recordings, and each has test recordings of its own, so that intervals over seeds cover training and test scenes,
-but not the choice of the training scenes.
+same recordings but have different test recordings, so that intervals over seeds cover training and test scenes, but not
+the choice of the training scenes.
 """
 
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -31,17 +31,17 @@ from flcav.statistics.verdicts import Claim
 
 EvaluationT = TypeVar("EvaluationT", bound=Evaluated)
 VALIDATION = "validation"
-DATA = "data"  # folder of a recording in that of its step
+DATA = "data"  # folder of a recording in its step's folder
 
 
 @dataclass(frozen=True)
 class SeedResult(Generic[EvaluationT]):
-    """Results of one seed: the card of its network, and its evaluations."""
+    """The results of one seed: the card of its network, and its evaluations."""
 
     seed: int
     card: Card
     tests: Mapping[str, EvaluationT]  # by name of the test
-    test_seeds: Mapping[str, int]  # of its test recordings, by name of the test
+    test_seeds: Mapping[str, int]  # seeds of its test recordings, by name of the test
 
 
 @dataclass(frozen=True)
@@ -50,12 +50,12 @@ class StudyRecordings:
 
     train: tuple[RecipeFields, ...]
     validation: RecipeFields
-    tests: Mapping[str, RecipeFields]  # by name; their own seeds are `SeedResult.test_seeds`
+    tests: Mapping[str, RecipeFields]  # by name; with the seeds `SeedResult.test_seeds`
 
 
 @dataclass(frozen=True)
 class StudyResult(Generic[EvaluationT]):
-    """Results of a study: of each seed, and means over seeds."""
+    """The results of a study: per seed, and means over seeds."""
 
     task: str
     network: str
@@ -78,10 +78,10 @@ def _never(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Study(Generic[EvaluationT]):
-    """A study: its task and recipe, and how its results are summarised and drawn.
+    """A study: task, recipe, and functions that summarise and draw its results.
 
-    Functions are module-level, since steps run in other processes. Fields with `compare=False` are not part of the
-    steps' code: a change of what they reach makes no step stale.
+    Functions must be module-level, since steps run in other processes. Fields with `compare=False` are not part of the
+    steps' code: changes of the code that they call make no step stale.
     """
 
     task: Task
@@ -92,20 +92,20 @@ class Study(Generic[EvaluationT]):
 
     @property
     def evaluation(self) -> type[EvaluationT]:
-        """Return the class that the task's `evaluate` returns, by its annotation; raises `InputError` without one."""
+        """Return the annotated return class of the task's `evaluate`; raises `InputError` without one."""
         found = get_type_hints(self.task.evaluate).get("return")
         if not (isinstance(found, type) and issubclass(found, Evaluated) and is_dataclass(found)):
             raise InputError(f"task '{self.task.name}': its evaluate() has no annotation of the dataclass it returns")
         return cast("type[EvaluationT]", found)
 
     def learn(self, work: Work, *, seed: int, network: str, epochs: int, patience: int) -> Json:
-        """Train the network of one seed, resuming an interrupted training; return its card as JSON."""
+        """Train the network of one seed, or resume its training; return its card as JSON."""
         data = [open_split(work.inputs[step]) for step in _training_steps(self)]
         request = TrainingRequest(data, open_split(work.inputs[VALIDATION]), network, epochs, patience, seed)
         return train_network(self.task, request, work.folder, work.report).model_dump(mode="json")
 
     def test(self, work: Work, *, seed: int) -> Json:
-        """Return the evaluation of one seed's network on each test, as JSON by test."""
+        """Return the evaluations of one seed's network as JSON, by test."""
         network = load_network(self.task, work.inputs[_seed_step(seed)] / WEIGHTS)
         return {
             name: self._tested(name, network, open_split(work.inputs[_test_step(seed, name)]), work)
@@ -132,8 +132,8 @@ def run_study(
 ) -> StudyResult[EvaluationT]:
     """Run or finish a study in the folder `out` by `run_steps`; return its results.
 
-    Raises `InputError` for an unknown scale, where `out` holds another study, and where the task does not say which
-    record its evaluation returns.
+    Raises `InputError` for an unknown scale, where `out` has another study, and where the task's `evaluate` lacks the
+    annotation of its return class.
     """
     recipe = study.recipe.at_scale(scale)
     study = replace(study, recipe=recipe)
@@ -148,7 +148,7 @@ def run_study(
         recipe.patience,
         StudyRecordings(recipe.train, recipe.validation, recipe.tests),
         runs,
-        summarise(study, runs),
+        summarise_seeds(study, runs),
         provenance(),
     )
 
@@ -156,10 +156,11 @@ def run_study(
 def make_experiment(
     study: Study[EvaluationT], tables: Callable[[StudyResult[EvaluationT]], Mapping[str, str]]
 ) -> Experiment[StudyResult[EvaluationT]]:
-    """Return the experiment of a study; `tables` are of its results, with means over seeds computed anew."""
+    """Return the experiment of a study; `tables` gets its results with recomputed means over seeds."""
 
     def run(out: Path, options: Options) -> Outcome[StudyResult[EvaluationT]]:
-        seeds, scale = range(1, options.seeds + 1), "quick" if options.quick else "full"
+        seeds = range(1, options.seeds + 1)
+        scale = "quick" if options.quick else "full"
         with options.show_steps(options.title) as notify:
             results = run_study(study, out, seeds=seeds, scale=scale, **options.how(notify))
         return Outcome(results, {f"{study.task.name}.png": study.draw(results)}, describe_summary(results))
@@ -167,22 +168,22 @@ def make_experiment(
     return Experiment(
         results=StudyResult[study.evaluation],  # pyright: ignore[reportInvalidTypeArguments]
         run=run,
-        tables=lambda results: tables(replace(results, summary=summarise(study, results.seeds))),
+        tables=lambda results: tables(replace(results, summary=summarise_seeds(study, results.seeds))),
     )
 
 
 def load_own_study(name: str) -> Study:
-    """Return a user's study `module:NAME`, or the study of a user's task; raises `InputError` where there is none."""
-    own = load_named("study", name, {}, object)
-    if isinstance(own, Study):
-        return own
-    if not isinstance(own, Studied):
+    """Return a user's study `module:NAME`, or the study of a user's task; raises `InputError` if there is none."""
+    loaded = load_named("study", name, {}, object)
+    if isinstance(loaded, Study):
+        return loaded
+    if not isinstance(loaded, Studied):
         raise InputError(f"study '{name}': is neither a study nor a task with a study()")
-    return Study(load_named("task", name, {}, Task), own.study(), draw=draw_numbers)
+    return Study(load_named("task", name, {}, Task), loaded.study(), draw=draw_numbers)
 
 
 def draw_numbers(results: StudyResult) -> bytes:
-    """Return a PNG with a panel per test: the mean over seeds of each number as a bar, each seed as a dot."""
+    """Return a PNG with a panel per test: means over seeds as bars, single seeds as dots."""
     panels = {
         test: [
             Bar(name, mean.mean, tuple(found.numbers()[name] for found in results.tested(test)))
@@ -194,7 +195,7 @@ def draw_numbers(results: StudyResult) -> bytes:
 
 
 def describe_summary(results: StudyResult) -> list[str]:
-    """Return the mean over seeds of each number of each test in words."""
+    """Return the means over seeds of all numbers in words."""
     return [
         f"{test}, {name}: {value.describe()}"
         + (f", standard deviation over seeds {value.sd:.3f}" if value.seeds > 1 else "")
@@ -203,15 +204,15 @@ def describe_summary(results: StudyResult) -> list[str]:
     ]
 
 
-def summarise(
+def summarise_seeds(
     study: Study[EvaluationT], seeds: Sequence[SeedResult[EvaluationT]]
 ) -> dict[str, dict[str, MeanOverSeeds]]:
-    """Return means over seeds by test, of the numbers that all seeds have."""
+    """Return means over seeds by test and name, of the numbers that all seeds have."""
     return {test: _means(study, [seed.tests[test] for seed in seeds]) for test in seeds[0].tests}
 
 
 def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int, str]]:
-    """Return seed, samples, optimiser steps, and the scores after each epoch, for each seed of a study's results."""
+    """Return a row per seed of a study: seed, samples, optimiser steps, and the scores after the epochs."""
     rows = []
     for run in results.seeds:
         scores = ", ".join(f"{score:.2f}" for score in run.card.learning.scores)
@@ -220,7 +221,7 @@ def training_rows(results: StudyResult[EvaluationT]) -> list[tuple[int, int, int
 
 
 def describe_limits(aims: Collection[Claim], effect: float) -> list[str]:
-    """Return a sentence on what the findings can tell: the seeds that detect a deviation of `effect` from an aim."""
+    """Return a sentence on the findings' power: the seeds needed to detect a deviation of `effect` from an aim."""
     widest = max(aim.mean.sd for aim in aims)
     if not widest:  # one seed
         return []
@@ -231,7 +232,7 @@ def describe_limits(aims: Collection[Claim], effect: float) -> list[str]:
 
 
 def list_counts(counts: Sequence[int]) -> str:
-    """Return a count as text, once where it is the same in all seeds, else one per seed."""
+    """Return counts per seed as text, or a single count if all are equal."""
     return ", ".join(map(str, counts if len(set(counts)) > 1 else counts[:1]))
 
 
@@ -283,12 +284,12 @@ def _means(study: Study[EvaluationT], tested: Sequence[EvaluationT]) -> dict[str
 
 
 def record_split(work: Work, recipe: RecipeFields) -> dict[str, int]:
-    """Record one split by its recipe; return its number of frames, by the name "frames"."""
+    """Record one split by its recipe; return {"frames": number of frames}."""
     source = EmbeddedSource(parse_config(Recipe, recipe, work.folder.name))
     record(source, work.folder / DATA, progress=work.report)
     return {"frames": len(open_split(work.folder))}
 
 
 def open_split(step: Path) -> Dataset:
-    """Return the dataset that `record_split` recorded in the folder of its step."""
+    """Return the dataset of `record_split` in its step's folder."""
     return Dataset.open(step / DATA)

@@ -1,8 +1,8 @@
-"""Acceptance of replies: each is checked against the server's request before anything is computed from it.
+"""Validation of replies against the server's request, before anything is computed from them.
 
-Every update of a round is read here, keys and shares of masks in `secure.messages`. A reply has the records that were
-asked for and no others, arrays of the names, shapes and types that the server's own weights give, and numbers within
-the limits of the rules; or it is refused.
+Updates are read here, keys and shares of masks in `secure.messages`. A valid reply has exactly the requested records,
+arrays with the names, shapes and dtypes of the server's weights, and numbers within the limits of the rules; all others
+are refused.
 """
 
 import math
@@ -23,7 +23,7 @@ from flcav.federation.strategies.strategy import Exchanges, Strategy
 from flcav.federation.trainable import Arrays, Forms, LocalUpdate, Weights, forms_of, learned_names
 from flcav.federation.upload import find_change
 
-SAME = 1e-6  # relative: more than two machines differ in the norm of one change
+SAME = 1e-6  # relative; above the difference of two machines in the norm of one change
 
 
 class ReplyRefused(ValueError):
@@ -31,22 +31,22 @@ class ReplyRefused(ValueError):
 
 
 class NoSamples(ReplyRefused):
-    """A reply of a client without samples, which is no fault."""
+    """A valid reply of a client without samples."""
 
 
 @dataclass(frozen=True)
 class Expected:
-    """The form that updates of a round must have: rules, weights at its start, and arrays beside them."""
+    """The expected form of a round's updates: rules, initial weights, and further arrays."""
 
     rules: Rules
-    start: Weights  # that the round began with
-    extra: Forms = field(default_factory=dict)  # of the arrays beside an update
+    start: Weights  # at the start of the round
+    extra: Forms = field(default_factory=dict)  # of the strategy's further arrays
 
 
 def extra_forms(strategy: Strategy, rules: Rules, start: Weights, sent: Weights) -> Forms:
-    """Return shape and type of the arrays that clients send beside their updates: what `strategy` reports of `start`.
+    """Return shape and dtype of the strategy's further arrays in an update, as it reports them for `start`.
 
-    sent: what the server sends beside the weights.
+    sent: further arrays that the server sends.
     """
     if not isinstance(strategy, Exchanges):
         return {}
@@ -56,25 +56,25 @@ def extra_forms(strategy: Strategy, rules: Rules, start: Weights, sent: Weights)
 
 
 def read_update(content: RecordDict, expected: Expected, told: float | None = None) -> LocalUpdate:
-    """Return the update in a reply, with the client's weights for its arrays; raises `ReplyRefused`.
+    """Return the decoded update in a reply; raises `ReplyRefused`.
 
-    told: norm of its change of learned arrays, which the client has reported before, and by which it was drawn.
+    told: norm of the change of learned arrays that the client has reported, and that its selection was based on.
     """
     rules, start, extra = expected.rules, expected.start, expected.extra
-    if wire.METRICS in content:  # of a client without samples the rest may be missing
+    if wire.METRICS in content:  # a client without samples may omit the rest
         _read_numbers(content, wire.LOSS, rules)
     _check_records(content, [wire.ARRAYS, wire.METRICS, wire.EXTRA] if extra else [wire.ARRAYS, wire.METRICS])
     samples, loss = _read_numbers(content, wire.LOSS, rules)
     sent = _read_arrays(content, wire.ARRAYS, wire.sent_forms(start, rules))
     update = LocalUpdate({}, samples, loss, extra=_read_arrays(content, wire.EXTRA, extra) if extra else {})
     try:
-        with np.errstate(over="ignore", invalid="ignore"):  # of values that the norm is about to refuse
+        with np.errstate(over="ignore", invalid="ignore"):  # such values are refused by the norm below
             update = replace(update, weights=wire.decode_update(sent, start, rules))
     except ValueError as error:
         raise ReplyRefused(str(error)) from None
     _check_change({name: update.weights[name] for name in rules.upload.exchanged(start)}, start, rules)
     _check_change(update.extra, {}, rules)
-    if told is not None and not wire.is_changed(rules):  # what is compressed may be longer
+    if told is not None and not wire.is_changed(rules):  # compression may increase the norm
         exchanged = rules.upload.exchanged(start)
         names = [name for name in learned_names(start) if name in exchanged]
         if (norm := change_norm(find_change(update.weights, start, names))) > told * (1 + SAME):
@@ -83,7 +83,7 @@ def read_update(content: RecordDict, expected: Expected, told: float | None = No
 
 
 def is_usable(content: RecordDict, expected: Expected) -> bool:
-    """Return whether the server accepts an update."""
+    """Return whether the server accepts the update in a reply."""
     try:
         read_update(content, expected)
     except ReplyRefused:
@@ -92,9 +92,9 @@ def is_usable(content: RecordDict, expected: Expected) -> bool:
 
 
 def read_masked(content: RecordDict, expected: Expected, peers: Sequence[str]) -> LocalUpdate | Sequence[str]:
-    """Return a masked update, or the names of those of `peers` whose shares for the client do not open.
+    """Return a masked update or, as a complaint, the names of the `peers` whose sealed shares do not open.
 
-    Masked values cannot be distinguished from others. Raises `ReplyRefused`.
+    Masked values are uniformly random, so that none can be refused. Raises `ReplyRefused`.
     """
     if wire.ASK in content:
         accused = read_entry(content, wire.NAMES)
@@ -108,14 +108,14 @@ def read_masked(content: RecordDict, expected: Expected, peers: Sequence[str]) -
 
 
 def read_norm(content: RecordDict, rules: Rules) -> tuple[float, int]:
-    """Return the norm of an update and the number of samples that a client tells; raises `ReplyRefused`."""
+    """Return the norm and the number of samples that a client reports; raises `ReplyRefused`."""
     _check_records(content, [wire.METRICS])
     samples, norm = _read_numbers(content, wire.NORM, rules)
     return norm, samples
 
 
 def read_entry(content: RecordDict, key: str) -> Any:
-    """Return an entry of an answer's one record, None where it has none; raises `ReplyRefused` for other records."""
+    """Return an entry of a reply's single record, None where it has none; raises `ReplyRefused` for other records."""
     _check_records(content, [wire.ASK])
     record = content[wire.ASK]
     return record.get(key) if isinstance(record, ConfigRecord) else None
@@ -128,8 +128,9 @@ def _check_records(content: RecordDict, wanted: Sequence[str]) -> None:
 
 
 def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, float]:
-    """Return the number of samples, and the loss or the norm, of a reply's metrics."""
-    metrics, limits = content[wire.METRICS], rules.limits
+    """Return the number of samples and the loss or norm in a reply's metrics."""
+    metrics = content[wire.METRICS]
+    limits = rules.limits
     if not isinstance(metrics, MetricRecord) or set(metrics) != {wire.SAMPLES, key}:
         raise ReplyRefused(f"metrics that are not {wire.SAMPLES} and {key}")
     samples, number = metrics[wire.SAMPLES], metrics[key]
@@ -138,16 +139,16 @@ def _read_numbers(content: RecordDict, key: str, rules: Rules) -> tuple[int, flo
     least, most = (0.0, limits.norm) if key == wire.NORM else (-limits.loss, limits.loss)
     if wire.is_local(rules) and samples != 1:
         raise ReplyRefused(f"{samples} samples, where all clients count the same")
-    if samples == 0:  # the loss is then of nothing
+    if samples == 0:  # and the loss has no meaning
         raise NoSamples("0 samples to train on: at least 1 is wanted")
-    if not (1 <= samples <= limits.samples and least <= number <= most):  # also of what is no number
-        told = f"1 to {limits.samples} samples are taken, and a {key} from {least:g} to {most:g}"
-        raise ReplyRefused(f"{samples} samples and a {key} of {number}: {told}")
+    if not (1 <= samples <= limits.samples and least <= number <= most):  # also true of NaN
+        taken = f"1 to {limits.samples} samples are taken, and a {key} from {least:g} to {most:g}"
+        raise ReplyRefused(f"{samples} samples and a {key} of {number}: {taken}")
     return samples, float(number)
 
 
 def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
-    """Return the arrays of a record, which are declared to be and are of these shapes and types."""
+    """Return the arrays of a record, whose declared and actual shapes and dtypes are those of `wanted`."""
     record = content[key]
     if not isinstance(record, ArrayRecord):
         raise ReplyRefused(f"'{key}' holds no arrays")
@@ -168,8 +169,10 @@ def _read_arrays(content: RecordDict, key: str, wanted: Forms) -> Arrays:
 
 
 def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
-    """Raise `ReplyRefused` where the L2 norm of the change of all floating arrays is above the limit, or not finite."""
-    total, most = 0.0, rules.limits.norm
+    """Raise `ReplyRefused` where the L2 norm of the change of all floating arrays exceeds the limit or is infinite."""
+    # comparisons are negated so that NaN is refused, too
+    total = 0.0
+    most = rules.limits.norm
     with np.errstate(over="ignore", invalid="ignore"):
         for name, array in weights.items():
             if array.dtype.kind == "f":
@@ -181,8 +184,9 @@ def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
 
 
 def _squared_norm(values: NDArray[np.number], start: NDArray[np.number] | None) -> float:
-    """Return the squared L2 norm of values or of their change, by blocks that stay in the cache."""
-    change, total = np.empty(min(BLOCK, values.size), np.promote_types(values.dtype, np.float32)), 0.0
+    """Return the squared L2 norm of values or of their change, in blocks that fit in the cache."""
+    change = np.empty(min(BLOCK, values.size), np.promote_types(values.dtype, np.float32))
+    total = 0.0
     for first in range(0, values.size, BLOCK):
         part = values[first : first + BLOCK]
         moved = np.subtract(part, 0 if start is None else start[first : first + BLOCK], out=change[: part.size])

@@ -1,4 +1,4 @@
-"""Consistency of a federation's settings: which strategies, rules and clients go together."""
+"""Consistency checks of a federation's settings: which strategies, rules and clients go together."""
 
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
@@ -13,7 +13,7 @@ from flcav.federation.trainable import Counts, Trainable
 
 
 def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules: Rules) -> None:
-    """Raise `InputError` where these clients cannot federate by this strategy and these rules."""
+    """Raise `InputError` where clients, strategy and rules do not go together."""
     if not clients:
         raise InputError("a federation of 0 clients: nobody trains")
     if rules.selection.predicts:
@@ -30,14 +30,14 @@ def check_federation(clients: Mapping[str, Trainable], strategy: Strategy, rules
     if rules.selection.unbiased:
         for name, client in clients.items():
             if not isinstance(client, Counts):
-                told = f"and {name} ({type(client).__name__}) has no 'count_samples'"
-                raise InputError(f"selection: unbiased weights need clients that count their samples, {told}")
+                lacking = f"and {name} ({type(client).__name__}) has no 'count_samples'"
+                raise InputError(f"selection: unbiased weights need clients that count their samples, {lacking}")
     if isinstance(rules.personal, RegionalModels):
         check_arguments(clients, ["proximal", "centre"], "personal:")
 
 
 def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], why: str) -> None:
-    """Raise `InputError` where a client's `train` does not take the arguments `wanted`; `why` begins the sentence."""
+    """Raise `InputError` where a client's `train` lacks an argument of `wanted`; the message starts with `why`."""
     for name, trainable in trainables.items():
         known = inspect.signature(trainable.train).parameters
         if any(each.kind is inspect.Parameter.VAR_KEYWORD for each in known.values()):
@@ -51,18 +51,19 @@ def check_arguments(trainables: Mapping[str, Trainable], wanted: Iterable[str], 
 
 def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     """Raise `InputError` where a strategy and rules do not go together, or not with so many clients."""
-    told, selection = type(strategy).__name__, rules.selection
+    named = type(strategy).__name__
+    selection = rules.selection
     selection.check_clients(names)
     planned = selection.rule == "planned"
-    any_number = planned or selection.rule in ("poisson", "importance")  # all at most; too few make no update
+    any_number = planned or selection.rule in ("poisson", "importance")  # at most all; with too few there is no update
     chosen = len(names) if any_number else len(selection.choose(names, 1, 0))
     if short := rules.tell_shortage(chosen):
         raise InputError(short)
-    single = isinstance(strategy, Robust | Exchanges)  # looks at each update
+    single = isinstance(strategy, Robust | Exchanges)  # needs the updates one by one
     if selection.weighs:
         if single:
             kind = "unbiased" if selection.unbiased else "importance"
-            raise InputError(f"{told} looks at each update, and {kind} selection gives each a weight of its own")
+            raise InputError(f"{named} looks at each update, and {kind} selection gives each a weight of its own")
         if rules.privacy is not None and selection.rule == "importance":
             raise InputError("privacy: importance selection reads norms of the updates, which no noise covers")
     if selection.unbiased and (alike := _count_alike(strategy, rules)):
@@ -79,25 +80,25 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     if isinstance(strategy, FedBuff):
         _check_buffers(strategy, rules, len(names))
     if isinstance(rules.personal, RegionalModels) and isinstance(strategy, Corrects):
-        raise InputError(f"{told} corrects local steps, and so does the pull of regional models, 'personal'")
+        raise InputError(f"{named} corrects local steps, and so does the pull of regional models, 'personal'")
     if rules.privacy is not None and planned:
         raise InputError("privacy: rounds of a plan have other numbers of clients, and noise is for one number")
     if isinstance(strategy, Robust):
         if selection.rule not in ("poisson", "planned"):
             strategy.check_clients(chosen)
         elif needs_known_number(strategy):
-            raise InputError(f"{told} needs a known number of clients, and {selection.rule} selection has any")
+            raise InputError(f"{named} needs a known number of clients, and {selection.rule} selection has any")
     if rules.secure is not None:
-        _check_secure(told, rules, rules.secure, chosen, single)
+        _check_secure(named, rules, rules.secure, chosen, single)
     if rules.privacy is not None:
         if isinstance(strategy, Exchanges):
-            raise InputError(f"{told} sends further arrays beside the weights, which the noise does not cover")
+            raise InputError(f"{named} sends further arrays beside the weights, which the noise does not cover")
         if rules.privacy.where == "central" and single:
-            raise InputError(f"{told} looks at each update, and central noise covers their sum alone")
+            raise InputError(f"{named} looks at each update, and central noise covers their sum alone")
 
 
 def _count_alike(strategy: Strategy, rules: Rules) -> str | None:
-    """Return what has all clients count the same, whatever their samples; None where nothing does."""
+    """Return the setting that weights all clients equally, whatever their samples; None where there is none."""
     alike = {"FedMD": isinstance(strategy, FedMD), "privacy": rules.privacy, "secure aggregation": rules.secure}
     return next((name for name, there in alike.items() if there), None)
 
@@ -127,10 +128,10 @@ def _check_buffers(strategy: FedBuff, rules: Rules, clients: int) -> None:
         raise InputError("FedBuff: how often a client takes part is known with the clock alone; give 'privacy.noise'")
 
 
-def _check_secure(told: str, rules: Rules, secure: SecureAggregation, chosen: int, single: bool) -> None:
+def _check_secure(strategy: str, rules: Rules, secure: SecureAggregation, chosen: int, single: bool) -> None:
     needed = secure.needed(chosen)
     if single:
-        raise InputError(f"{told} looks at each update, and secure aggregation shows their sum alone")
+        raise InputError(f"{strategy} looks at each update, and secure aggregation shows their sum alone")
     if rules.selection.rule in ("poisson", "importance"):
         raise InputError(f"secure aggregation needs a known number of clients, and {rules.selection.rule} draws any")
     if rules.upload.compression != "none":

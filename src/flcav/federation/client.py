@@ -1,4 +1,4 @@
-"""The Flower client app of both federated stages: vehicles with their edge server, edge servers with the cloud."""
+"""The Flower client app of both federated stages: vehicles of an edge server, and edge servers of the cloud."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -41,27 +41,29 @@ from flcav.federation.upload import find_change
 from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
-PARTITION = "partition-id"  # key of Flower's simulation in a node's config: place of the client among all
-OWN, RESIDUAL = "own", "residual"  # records of a node's state: what strategy and compression keep between rounds
-OWN_DIGESTS = "own-digests"  # record in the place of `OWN` that stays with the client: of the last two, the last first
-OPTIMISER = "optimiser"  # record of it: the state of the client's optimiser
+PARTITION = "partition-id"  # key of Flower's simulation in a node's config: index of its client
+OWN, RESIDUAL = "own", "residual"  # records of a node's state: kept by strategy and compression between rounds
+OWN_DIGESTS = "own-digests"  # record in place of an `OWN` that stays with the client: of the last two, latest first
+OPTIMISER = "optimiser"  # record of a node's state: that of the client's optimiser
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
 
 
 @dataclass(frozen=True)
 class ClientAgreement:
-    """What server and clients of a federation agree on before it begins."""
+    """The terms that server and clients of a federation agree on before it begins."""
 
     strategy: Strategy
     rules: Rules
-    secrets: Mapping[str, Secret]  # by client, that it draws local noise by
-    spent: int  # rounds of earlier federations that count against each client's privacy budget
+    secrets: Mapping[str, Secret]  # of local noise, by client
+    spent: int  # rounds of earlier federations that count against a client's privacy budget
 
 
 def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
-    """Return the records of a node's state that a checkpoint has: those of strategy and compression, the optimiser's
-    where it is kept, and under clients' own noise or masks what they have answered.
+    """Return the keys of a node's state that belong in a checkpoint.
+
+    They are those of strategy and compression, the optimiser's where it is kept, and under local noise or masks the
+    last answered request.
     """
     keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
     guards = wire.is_local(rules) or rules.secure is not None
@@ -79,33 +81,34 @@ def client_app(
     identity: Identity | None = None,
     simulated: bool = False,
 ) -> ClientApp:
-    """Return a Flower client app that trains the one of `trainables` (by client name) that its node stands for.
+    """Return the Flower client app of `trainables` (by client name).
 
-    A node stands for the client at the place `PARTITION` of its config. Its seed is derived from the round's seed and
-    the client's name. `secrets` are those of the clients, by name, that local noise is drawn by unless it is seeded;
-    they are in no message. What it answers and what not, see `conduct`; `spent` are the rounds of earlier federations
-    that count against its privacy budget. Under masks a client with an `identity` takes part with certified ones alone.
-    To a query it answers with its place and with what it keeps between rounds; networks of FedMD's clients stay with
-    them, and a query gets their digests. Where clients are `simulated`, and have one checkpoint, it gets all, and a
-    client without any state takes over what the message brings. Questions (`ASK`) are for clients that `Answers`.
+    A node trains the client with the index `PARTITION` in its config, with a seed derived from the round's seed and the
+    client's name. `secrets` of local noise, by client, are used unless noise is seeded, and are never sent. `conduct`
+    defines which requests a client answers; `spent` is the number of rounds of earlier federations that count against
+    its privacy budget. Under secure aggregation a client with an `identity` only takes part with certified peers.
 
-    What error feedback leaves out, and a strategy's own arrays, are taken over where the server gets the update and can
-    use it; otherwise they stay as they were. The networks of FedMD's clients are their own, and have learned whatever
-    arrives, and so optimisers that are kept.
+    A query returns the client's index and what it keeps between rounds; networks of FedMD's clients stay with them, and
+    only their digests are returned. Clients that are `simulated` share one checkpoint: a query then returns everything,
+    and a client without state takes over the state in the message. Questions (`ASK`) are for clients that are
+    `Answers`.
+
+    Residuals of error feedback and a strategy's client state are updated only where the server receives the update and
+    can use it. The networks of FedMD's clients, and optimisers that are kept, have learned whether it does or not.
     """
-    own = _ClientSide(
+    side = _ClientSide(
         trainables, strategy, rules, secrets, spent, identity, simulated, [*trainables], RequestDigests(rules.privacy)
     )
     app = ClientApp()
-    app.train()(own.train)
-    app.query(wire.ASK)(own.answer)
-    app.query()(own.query)
+    app.train()(side.train)
+    app.query(wire.ASK)(side.answer)
+    app.query()(side.query)
     return app
 
 
 @dataclass(frozen=True)
 class _ClientSide:
-    """The clients' side of a federation: what the client app does with each kind of message."""
+    """The clients' side of a federation: the handlers of the client app."""
 
     trainables: Mapping[str, Trainable]
     strategy: Strategy
@@ -114,24 +117,26 @@ class _ClientSide:
     spent: int
     identity: Identity | None
     simulated: bool
-    names: Sequence[str]  # of the trainables, by place
+    names: Sequence[str]  # of the trainables, by index
     requests: RequestDigests
 
     def _admit(self, message: Message, context: Context, name: str, work: wire.LocalWork) -> str:
-        """Return what is asked for; raises `RequestRefused` where the client is not to answer."""
-        asked, before = asked_for(message.content), recall_answered(context)
+        """Return the kind of the request; raises `RequestRefused` where the client must not answer it."""
+        asked = asked_for(message.content)
+        before = recall_answered(context)
         repeatable = self.rules.secure is None and not {OWN, RESIDUAL, OPTIMISER} & {*context.state}
         digest = self.requests.digest(message.content, wire.LOST if self.rules.secure is None else wire.ASK)
         answered = before.admit(work.round, asked, digest, self.rules, repeatable)
         if (most := self.requests.affordable) is not None and answered.rounds > most - self.spent:
             raise RequestRefused(f"a round more than the {most} that the privacy budget of {name} affords")
+        # stored before any answer leaves, so that a crash cannot make the client answer twice
         keep_answered(context, answered)
         if HIDDEN in context.state and (asked == wire.UNMASK or answered.round > before.round):
             del context.state[HIDDEN], context.state[f"{HIDDEN}-{wire.SAMPLES}"]
         return asked
 
     def train(self, message: Message, context: Context) -> Message:
-        """Return the answer to a request of a round."""
+        """Return the reply to a request of a round."""
         try:
             return self._answer_training(message, context)
         except wire.NoCount as error:
@@ -148,7 +153,9 @@ class _ClientSide:
             return wire.reply_norm(message, 0.0, count_samples(self.trainables[name], work.steps))
         if self.rules.secure is not None:
             return self._answer_masked(message, context, name, work, self.rules.secure)
-        extra, own, sent = {}, {}, _optional(message.content, wire.EXTRA)
+        extra = {}
+        own = {}
+        sent = _optional(message.content, wire.EXTRA)
         if asked == wire.SEND:
             start, update = _recorded(context, KEPT_START), _recall(context, KEPT)
         else:
@@ -160,7 +167,7 @@ class _ClientSide:
             names = [each for each in learned_names(start) if each in self.rules.upload.exchanged(start)]
             return wire.reply_norm(message, change_norm(find_change(update.weights, start, names)), update.samples)
         encoded, left = wire.encode_update(update, start, self.rules, _recorded(context, RESIDUAL), seed, key)
-        if self.rules.hides_draws:  # neither the ledger's bytes nor the server's figures are to tell who was drawn
+        if self.rules.hides_draws:  # neither the ledger's bytes nor the server's figures may reveal who was drawn
             encoded = replace(encoded, samples=min(encoded.samples, 1), loss=0.0)
         answer = wire.reply(message, encoded, extra)
         if (left or own) and wire.LOST not in message.content:
@@ -175,7 +182,8 @@ class _ClientSide:
     ) -> Message:
         """Return the masked update, or a complaint where others' shares do not open.
 
-        The update is trained once, and kept until its sum is unmasked: what new masks hide stays the same.
+        The update is trained once, and kept until its sum is unmasked. If a restarted round masked another update, the
+        server could subtract the two.
         """
         if (complaint := complain(message, context)) is not None:
             return complaint
@@ -186,17 +194,18 @@ class _ClientSide:
             about = (1, 0.0) if wire.is_local(self.rules) else (update.samples, update.loss)
             values = wire.flatten_change(update, start, self.rules, seed, key)
             _keep(context, HIDDEN, LocalUpdate({wire.VECTOR: values}, *about))
-        hidden, peers = _recall(context, HIDDEN), message.content.config_records[wire.ASK][wire.NAMES]
+        hidden = _recall(context, HIDDEN)
+        peers = message.content.config_records[wire.ASK][wire.NAMES]
         values = np.asarray(hidden.weights[wire.VECTOR], np.float64)
         integers = to_integers(values, secure.largest, len(peers) + 1)  # type: ignore[arg-type]
         return wire.reply(message, replace(hidden, weights={wire.VECTOR: mask_update(context, integers)}), {})
 
     def _name(self, context: Context) -> str:
-        """Return the client that a node stands for."""
+        """Return the name of a node's client."""
         return self.names[int(context.node_config[PARTITION])]
 
     def _seeds(self, name: str, work: wire.LocalWork) -> tuple[int, bytes | None]:
-        """Return the seed of a client's training, and the key of its noise where that is by a secret."""
+        """Return the seed of a client's training, and the key of its noise where that has a secret."""
         secret = self.secrets.get(name)
         key = None if secret is None else derive_key(secret, "noise", work.round, work.seed)
         return derive_seed(work.seed, name), key
@@ -208,7 +217,7 @@ class _ClientSide:
         return Message(RecordDict({wire.ARRAYS: wire.to_array_record(found)}), reply_to=message)
 
     def query(self, message: Message, context: Context) -> Message:
-        """Return a client's place, and what it keeps between rounds."""
+        """Return a client's index, and what it keeps between rounds."""
         kept = (OWN, RESIDUAL, OPTIMISER, ANSWERED)
         if message.content and (not self.simulated or context.state or not {*message.content} <= {*kept}):
             raise RequestRefused("a client's state is its own once it has any")
@@ -228,7 +237,7 @@ class _ClientSide:
     def _train(
         self, trainable: Trainable, message: Message, context: Context, start: Weights, work: wire.LocalWork, seed: int
     ) -> tuple[Update, Weights, Weights]:
-        """Return the result of local training, a self.strategy's arrays beside it, and those to keep if they arrive."""
+        """Return the result of local training, the strategy's further arrays, and its client state if these arrive."""
         sent, own = _optional(message.content, wire.EXTRA), _recorded(context, OWN)
         correction = self.strategy.correct(sent, own) if isinstance(self.strategy, Corrects) else Correction()
         if isinstance(self.rules.personal, RegionalModels) and wire.CENTRE in message.content:
@@ -246,7 +255,7 @@ class _ClientSide:
         except BudgetExceeded as error:
             if isinstance(trainable, Accounts):
                 raise
-            raise RuntimeError(f"no budget is its own: {error}") from None  # which would end the federation
+            raise RuntimeError(f"no budget is its own: {error}") from None  # else the federation ended
         if self.rules.keep_optimiser:
             if not (state := getattr(update, "optimiser", {})):
                 raise TypeError("keep_optimiser: its update has no 'optimiser' to keep")
@@ -255,8 +264,9 @@ class _ClientSide:
             _record(context, OWN, getattr(update, "own", {}))
         if not isinstance(self.strategy, Exchanges):
             return update, {}, {}
-        exchanged, asked = self.rules.upload.exchanged(start), getattr(update, "gradient", {})  # by the correction
-        gradient = {name: array for name, array in asked.items() if name in exchanged}
+        exchanged = self.rules.upload.exchanged(start)
+        gradients: Weights = getattr(update, "gradient", {})  # uncorrected, by the training with a shift
+        gradient = {name: array for name, array in gradients.items() if name in exchanged}
         found = LocalUpdate(update.weights, update.samples, update.loss, gradient)
         return update, *self.strategy.report(found, sent, own)
 
@@ -270,7 +280,7 @@ def _optional(content: RecordDict, key: str) -> Arrays:
 
 
 def _record(context: Context, key: str, arrays: Weights) -> None:
-    """Keep arrays for the next round; of a training that diverged nothing is kept."""
+    """Keep arrays for the next round, unless training diverged."""
     if arrays and all(np.isfinite(array).all() for array in arrays.values()):
         context.state[key] = wire.to_array_record(arrays)
 

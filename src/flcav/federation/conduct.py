@@ -1,8 +1,8 @@
-"""Conduct of a client: it answers each round once, in order, in the way that was agreed, and within its budget.
+"""A client's guard against a dishonest server: it answers every round once, in the agreed order, within its budget.
 
-A server that asks otherwise could average noise away, see an update without its masks, or the same change from two
-sides. A client keeps what it answered last among its state, before the answer leaves; nothing that the server sends
-changes it.
+A server that could repeat or reorder requests might average noise away, see an update without its masks, or subtract
+two messages about the same change. A client therefore stores the last request in its state before the answer leaves;
+no message of the server changes that record.
 """
 
 import hashlib
@@ -20,17 +20,17 @@ from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
 
 ANSWERED = "answered"  # record of a node's state
-UPDATE = "update"  # asked for where nothing else is
-NOTHING = bytes(32)  # in the place of a digest, before the first request
-MOST_ROUNDS = 10**6  # that a budget is looked up for
+UPDATE = "update"  # the default request
+NOTHING = bytes(32)  # digest before the first request
+MOST_ROUNDS = 10**6  # upper end of the search for the rounds that a budget affords
 
 
 class RequestRefused(ValueError):
-    """A request that a client does not answer."""
+    """A request that a client must not answer."""
 
 
 def agreed_requests(rules: Rules) -> tuple[str, ...]:
-    """Return what clients are asked for in a round, in this order."""
+    """Return the kinds of requests in a round, in order."""
     if rules.secure is not None:
         return wire.KEYS, wire.SHARES, wire.MASKED, wire.UNMASK
     if rules.selection.rule == "importance":
@@ -43,18 +43,19 @@ class Answered:
     """The last request that a client answered."""
 
     round: int = 0
-    place: int = 0  # of the request among those that are agreed on
-    rounds: int = 0  # in which it has answered so far
-    digest: bytes = NOTHING  # of the request; under secure aggregation of the training that the round's update is of
+    place: int = 0  # index of the request among the agreed ones
+    rounds: int = 0  # number of rounds answered so far
+    digest: bytes = NOTHING  # of the request; under secure aggregation, of the request to train in this round
 
     def admit(self, round_: int, asked: str, digest: bytes, rules: Rules, repeatable: bool) -> "Answered":
-        """Return what is answered last after a request for `asked` in a round; raises `RequestRefused`.
+        """Return the new last answered request if `asked` is admissible in a round; raises `RequestRefused`.
 
-        The same request may come again, as after a stop of the server, where the same answer can be given:
-        `repeatable`. Under secure aggregation a round may restart, with new masks, until its sum is unmasked; what they
-        hide stays the update of the first training that was asked for, by its `digest`.
+        A request may be repeated, as after a restart of the server, if the same answer can be given (`repeatable`).
+        Under secure aggregation a round may restart with new masks until its sum is unmasked; the masked update stays
+        that of the first request to train, identified by its `digest`.
         """
-        requests, masked = agreed_requests(rules), rules.secure is not None
+        requests = agreed_requests(rules)
+        masked = rules.secure is not None
         if asked not in requests:
             raise RequestRefused(f"a request for '{asked}', and agreed are {', '.join(requests)}")
         place = requests.index(asked)
@@ -69,12 +70,12 @@ class Answered:
                 return Answered(round_, place, self.rounds, trained)
             if place == self.place and digest == self.digest and repeatable:
                 return self
-        told = f"{requests[self.place]} of round {self.round}" if self.rounds else "nothing"
-        raise RequestRefused(f"a request for {asked} of round {round_}, after {told} was answered")
+        last = f"{requests[self.place]} of round {self.round}" if self.rounds else "nothing"
+        raise RequestRefused(f"a request for {asked} of round {round_}, after {last} was answered")
 
 
 def recall_answered(context: Context) -> Answered:
-    """Return what a node has answered last."""
+    """Return the last request that a node answered."""
     if ANSWERED not in context.state:
         return Answered()
     kept = wire.read_arrays(context.state, ANSWERED)[ANSWERED]
@@ -83,7 +84,7 @@ def recall_answered(context: Context) -> Answered:
 
 
 def keep_answered(context: Context, answered: Answered) -> None:
-    """Keep what a node answers."""
+    """Store the last request that a node answers."""
     numbers = np.array([answered.round, answered.place, answered.rounds], np.int64)
     context.state[ANSWERED] = wire.to_array_record(
         {ANSWERED: np.concatenate([numbers, np.frombuffer(answered.digest, np.int64)])}
@@ -91,30 +92,30 @@ def keep_answered(context: Context, answered: Answered) -> None:
 
 
 class RequestDigests:
-    """Requests as the clients of a process see them: in how many rounds they answer, and digests of what is asked.
+    """Digests of requests, and the number of rounds that a budget affords, for the clients of a process.
 
-    The clients share the arrays of theirs, which are hashed once.
+    Their requests share arrays, which are hashed once.
     """
 
     def __init__(self, privacy: Privacy | None) -> None:
-        """Answer within the budget of `privacy`."""
+        """Take the budget of `privacy`."""
         self._privacy = privacy
         self._last: Mapping[str, tuple[list[bytes], bytes]] = {}  # by record: its data and their digest
         self._lock = threading.Lock()
 
     def __reduce__(self) -> tuple[type["RequestDigests"], tuple[Privacy | None]]:
-        """Return how another process makes its own: what is kept here is only for speed."""
+        """Return the constructor for another process: the cached digests only save time."""
         return RequestDigests, (self._privacy,)
 
     @cached_property
     def affordable(self) -> int | None:
-        """Number of rounds in which a client's budget affords an answer, see `affordable_answers`."""
+        """Number of rounds that a client's budget affords, see `affordable_answers`."""
         return affordable_answers(self._privacy)
 
     def digest(self, content: RecordDict, without: str = wire.LOST) -> bytes:
-        """Return the digest of all that is asked, which is 32 bytes (BLAKE2b); not of the note that nothing arrives.
+        """Return the digest (32 bytes, BLAKE2b) of a request, without its note that the answer will be lost.
 
-        without: another record that does not count.
+        without: another record to leave out.
         """
         hashed = hashlib.blake2b(digest_size=32)
         with self._lock:
@@ -142,12 +143,12 @@ class RequestDigests:
 
 
 def affordable_answers(privacy: Privacy | None) -> int | None:
-    """Return in how many rounds a client's own budget affords an answer with its noise; None: in any number."""
+    """Return the number of rounds that a client's budget affords with local noise; None: no limit."""
     if privacy is None or not privacy.local or privacy.epsilon is None:
         return None
     return affordable_rounds(privacy, Selection(), ["one"], MOST_ROUNDS, 0)
 
 
 def asked_for(content: RecordDict) -> str:
-    """Return what a request asks for."""
+    """Return the kind of a request."""
     return str(content.config_records[wire.ASK][wire.ASK]) if wire.ASK in content else UPDATE

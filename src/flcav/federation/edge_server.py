@@ -1,6 +1,6 @@
-"""Edge server of stage III: a client of the cloud, whose local training is k edge rounds with its region's vehicles.
+"""The edge server in stage III: a client of the cloud whose local training is k edge rounds with its vehicles.
 
-Wang et al., IEEE Network 37(3), 2023.
+Hierarchical federated averaging of Wang et al., IEEE Network 37(3), 2023.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,33 +35,35 @@ class EdgeServer:
     state: FederationState = field(default_factory=FederationState)  # of the region's rounds
     earlier: int = 0  # rounds of stage II, which a privacy budget counts
     runtime: Runtime | None = None  # where the vehicles train; None: in this process
-    distiller: Distiller | None = None  # where vehicles send outputs
+    distiller: Distiller | None = None  # server's network where vehicles send outputs
     buffers: Buffers | None = None  # of `FedBuff`, the region's rounds by a clock
-    begun: Weights = field(default_factory=dict)  # that its last cloud round began with
-    trained: Weights = field(default_factory=dict)  # that the edge rounds of that came to
+    begun: Weights = field(default_factory=dict)  # weights at the start of the last cloud round
+    trained: Weights = field(default_factory=dict)  # weights after its edge rounds
 
     def train(
         self, weights: Weights, *, steps: int, learning_rate: float, seed: int, layers: Sequence[str] = ()
     ) -> LocalUpdate:
         """Return the update of the region after k edge rounds from the cloud's `weights`; raises as `federate` does.
 
-        The first cloud round starts from the server's own stage II model instead: the cloud has not averaged yet, and
-        its model is older. Arrays that are personal to the region go on from where they were, whatever the cloud's are;
-        of regional models these are all, and vehicles are pulled to the cloud's from the second cloud round on. Edge
-        rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which vehicles keep
-        to. Under central noise the region counts by its number of vehicles, even those that took no part; otherwise by
-        the samples of its last edge round that is not empty. Where all are, it has no samples itself, but in the first
-        cloud round one, for its model of stage II.
+        The first cloud round starts from the region's stage II model instead: the cloud has not averaged yet, and its
+        model is older. Personal arrays of the region continue from their last values, whatever the cloud's are; for
+        regional models these are all arrays, and vehicles are pulled to the cloud's model from the second cloud round
+        on. Edge rounds are numbered consecutively over the cloud rounds. `layers` are those of the rules, which the
+        vehicles follow. The update's weight is the region's number of vehicles under central noise, including those
+        that took no part, otherwise the samples of its last edge round that is not empty. If all are empty it is 0, but
+        1 in the first cloud round, for the model of stage II.
         """
+        # personal arrays override the cloud's, which does not average them
         start = {**weights, **self.state.personal} if self.cloud_rounds_done else self.own
         regional = isinstance(self.rules.personal, RegionalModels)
         centre = weights if regional and self.cloud_rounds_done else None
         done = self.cloud_rounds_done * self.edge_rounds
         schedule = Schedule(done + self.edge_rounds, steps, learning_rate, learning_rate, seed)
-        first, known = self.cloud_rounds_done == 0, len(self.state.records)
-        self.cloud_rounds_done += 1  # also of a round that fails here, and counts for the cloud
+        first = self.cloud_rounds_done == 0
+        known = len(self.state.records)
+        self.cloud_rounds_done += 1  # also where a round fails: it counts for the cloud
         if self.distiller is not None:
-            self.state.server = {}  # the first edge round begins with the outputs of the cloud's network
+            self.state.server = {}  # the first edge round starts from outputs of the cloud's network
         found = federate(
             self.vehicles,
             start,
@@ -80,18 +82,18 @@ class EdgeServer:
         self.begun, self.trained = start, found.weights
         names = [*found.weights] if regional else name_like(found.weights, self.rules.personal_arrays)
         self.state.personal = {name: np.asarray(found.weights[name]) for name in names}
-        if self.rules.privacy is not None and not self.rules.privacy.local:  # no noise covers numbers of samples
+        if self.rules.privacy is not None and not self.rules.privacy.local:  # numbers of samples have no noise
             return replace(found, samples=len(self.vehicles))
         if self.state.records and self.state.records[-1].empty:
             trained = [each.samples for each in self.state.records[known:] if each.samples]
             return replace(found, samples=trained[-1] if trained else int(first))
-        return replace(found, samples=max(found.samples, 1))  # the cloud averages also where the network lost everybody
+        return replace(found, samples=max(found.samples, 1))  # the cloud averages even if the network lost all
 
 
 def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_rounds: int, earlier: int) -> int:
-    """Return how many of `rounds` cloud rounds, of `edge_rounds` edge rounds each, a region's privacy budget affords.
+    """Return the number of cloud rounds that a region's privacy budget affords, of `rounds`.
 
-    names: the region's clients, who took part in `earlier` rounds.
+    A cloud round has `edge_rounds` edge rounds. names: the region's clients, which took part in `earlier` rounds.
     """
     if rules.privacy is None or rounds == 0:
         return rounds
@@ -100,6 +102,7 @@ def afford_cloud_rounds(rules: Rules, names: Sequence[str], rounds: int, edge_ro
 
 def edge_seeds(schedule: Schedule, cloud_round: int, region: str, edge_rounds: int) -> list[int]:
     """Return the seeds of a region's edge rounds in a cloud round of `schedule`, as `EdgeServer` derives them."""
-    seed, done = derive_seed(schedule.work(cloud_round).seed, region), (cloud_round - 1) * edge_rounds
-    own = Schedule(done + edge_rounds, 0, 1.0, 1.0, seed)
-    return [own.work(done + number).seed for number in range(1, edge_rounds + 1)]
+    seed = derive_seed(schedule.work(cloud_round).seed, region)
+    done = (cloud_round - 1) * edge_rounds
+    region_schedule = Schedule(done + edge_rounds, 0, 1.0, 1.0, seed)
+    return [region_schedule.work(done + number).seed for number in range(1, edge_rounds + 1)]

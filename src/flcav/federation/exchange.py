@@ -1,4 +1,4 @@
-"""The server's exchange of messages with the clients of a round: who takes part, requests, answers, usable updates."""
+"""The server's exchange of messages in a round: attendance of clients, requests, replies, and accepted updates."""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,27 +23,27 @@ AnswerT = TypeVar("AnswerT")
 
 
 class ClientFailed(OSError):
-    """Fewer clients sent a usable update in a round than are wanted: a fault of their machines."""
+    """Too few clients sent a usable update in a round, since their machines failed."""
 
-    reached: Weights | None = None  # after the last round that came to an end; of `federate`
+    reached: Weights | None = None  # weights after the last completed round; set by `federate`
 
 
 @dataclass
 class Attendance:
-    """Attendance of a round: the clients that are asked, and those of them without an update, with the reason."""
+    """The attendance of a round: its clients, and those of them without an update, with the reason."""
 
-    asked: list[str] = field(default_factory=list)  # for anything
-    chosen: list[str] = field(default_factory=list)  # to send an update, also those that are away
-    away: Mapping[str, str] = field(default_factory=dict)  # clients that are not there at first, with the reason
-    failed: dict[str, str] = field(default_factory=dict)  # by client what was wrong
-    lost: set[str] = field(default_factory=set)  # those of them whom the network lost
-    idle: set[str] = field(default_factory=set)  # those of them without samples, or with no weight for the strategy
-    shortage: ClientFailed | TooFewClients | None = None  # why there is no update
-    few: bool = False  # whether fewer take part than the rules need
-    spent: bool = False  # whether a budget kept some from sending, in the last round of buffers
+    asked: list[str] = field(default_factory=list)  # clients that get any request
+    chosen: list[str] = field(default_factory=list)  # clients that should send an update, also those that are absent
+    away: Mapping[str, str] = field(default_factory=dict)  # clients absent at the start, with the reason
+    failed: dict[str, str] = field(default_factory=dict)  # reason by client
+    lost: set[str] = field(default_factory=set)  # failed clients that the network lost
+    idle: set[str] = field(default_factory=set)  # failed clients without samples, or without weight in the strategy
+    shortage: ClientFailed | TooFewClients | None = None  # why the round has no update
+    few: bool = False  # whether fewer clients take part than the rules need
+    spent: bool = False  # whether a budget kept clients from sending, in the last buffered round
 
     def note(self, event: wire.Lost | wire.TimedOut) -> None:
-        """Note a client that is lost, or has not answered: the latter with the reason of an earlier failure, if any."""
+        """Note a lost client, or one without an answer, which keeps the reason of an earlier failure."""
         if isinstance(event, wire.TimedOut):
             self.failed.setdefault(event.client, "no answer")
         else:
@@ -51,7 +51,7 @@ class Attendance:
             self.lost |= {event.client} if event.by_network else set()
 
     def excuse(self, error: Exception) -> None:
-        """Note why the round has no update; raises `TooFewClients` where clients failed and nothing else is why."""
+        """Note why the round has no update; raises `TooFewClients` where only failures of clients explain it."""
         if isinstance(error, TooFewClients) and not (self.lost or self.few or self.idle):
             raise error
         without = {name: str(error) for name in self.chosen if name not in self.failed}
@@ -59,10 +59,12 @@ class Attendance:
         self.idle |= without.keys() if isinstance(error, NoShares) else set()
 
     def count(self, rules: Rules) -> bool:
-        """Return whether enough take part for the rules; note it where, by a plan, by chance or since some are away,
-        they are too few.
+        """Return whether enough clients take part for the rules; note it where there are too few.
+
+        Too few may be planned, drawn, or present.
         """
-        chosen, secure = len(self.chosen), rules.secure
+        chosen = len(self.chosen)
+        secure = rules.secure
         absent = {name: self.away[name] for name in self.chosen if name in self.away}
         if short := rules.tell_shortage(chosen - len(absent)):
             self.shortage = ClientFailed(short)
@@ -72,13 +74,13 @@ class Attendance:
         return not short
 
     def check(self, rules: Rules, strategy: Strategy, number: int) -> None:
-        """Raise `ClientFailed` where in round `number` fewer sent what can be used than are wanted.
+        """Raise `ClientFailed` where too few clients sent usable answers in round `number`.
 
-        By default half of those are wanted who were asked, and whom the network did not lose: of all who were to report
-        a norm or a number of samples, and of those who were then to send an update. `all` is of both, too, a number of
-        those who were to send; who was away or has no samples does not count. Where fewer are left than `strategy`
-        needs, the round has no update, and so where fewer take part than the rules need, unless a client failed, or
-        where fewer are left than a number of the rules since some have no samples.
+        By default half of the asked clients are needed, without those that the network lost: half of all that had to
+        report a norm or a number of samples, and half of those that then had to send an update. `all` refers to both
+        steps, a number only to the second; clients that are absent or have no samples do not count. The round has no
+        update, and nothing is raised, where fewer clients are left than `strategy` needs, where fewer take part than
+        the rules need and none failed, or where a number of the rules is missed because of clients without samples.
         """
         if self.spent:
             return
@@ -94,29 +96,30 @@ class Attendance:
             wanted = len(asked) if least == "all" else -(-len(asked) // 2) if least is None else least
             usable = sum(name not in self.failed for name in asked)
             if usable < wanted:
-                told = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
+                few = f"{usable} of {len(asked)} clients sent an update that can be used, {wanted} are wanted"
                 if isinstance(least, int) and usable + len(self.idle.intersection(clients)) >= wanted:
-                    self.shortage = ClientFailed(told)
+                    self.shortage = ClientFailed(few)
                     continue
-                raise ClientFailed(f"round {number}: {told} ({reasons})")
+                raise ClientFailed(f"round {number}: {few} ({reasons})")
         if isinstance(strategy, Robust):
             try:
                 strategy.check_clients(sum(name not in self.failed for name in self.chosen))
             except InputError as error:
-                self.shortage = ClientFailed(str(error))  # a minority that sends rubbish does not end a federation
+                self.shortage = ClientFailed(str(error))  # a minority of invalid updates must not end a federation
 
 
 class Intake:
-    """The usable updates of a round: all of them or, where a strategy needs no more, their mean as they come in."""
+    """The accepted updates of a round: all of them or, where that is enough for the strategy, their running mean."""
 
     def __init__(self, weigher: Averages | None = None) -> None:
-        """Add up by the weights of `weigher`; None: keep every update."""
-        self._weigher, self._mean = weigher, RunningMean()
-        self._extra: dict[str, NDArray[np.number]] = {}  # sums of the arrays beside the weights
+        """Average with the weights of `weigher`; None: keep every update."""
+        self._weigher = weigher
+        self._mean = RunningMean()
+        self._extra: dict[str, NDArray[np.number]] = {}  # sums of the strategy's further arrays
         self.updates: dict[str, LocalUpdate] = {}  # by client, where they are kept
         self.samples: dict[str, int] = {}  # by client
         self.losses: dict[str, float] = {}  # by client
-        self.average: Callable[[], Weights] | None = None  # weights after the round, where a mode averages by itself
+        self.average: Callable[[], Weights] | None = None  # weights after the round, where the mode averages
 
     def add(self, client: str, update: LocalUpdate) -> None:
         """Add a client's update."""
@@ -130,29 +133,29 @@ class Intake:
 
     @property
     def combinable(self) -> list[LocalUpdate]:
-        """Return what a strategy is given: all updates, or one that stands for them; none where none came."""
+        """Return the updates for a strategy: all, or their mean as a single one; none where none came."""
         if self._weigher is None or not self.samples:
             return [*self.updates.values()]
         return [LocalUpdate(self._mean.mean(), sum(self.samples.values()), 0.0, extra=self._extra)]
 
     def mean_loss(self) -> float | None:
-        """Return the mean loss weighted by samples; None where no update came."""
+        """Return the mean loss, weighted by samples; None where no update came."""
         return float(np.average([*self.losses.values()], weights=[*self.samples.values()])) if self.samples else None
 
 
 @dataclass
 class OpenRound:
-    """A round under way: its local work, who takes part, what is sent, and what updates must look like."""
+    """A round in progress: its local work, attendance, downlink, and the expected form of its updates."""
 
     work: wire.LocalWork
     here: Attendance
     expected: Expected  # of the updates, with the rules and the weights that the round began with
-    sent: Weights = field(default_factory=dict)  # a strategy's arrays that go with the weights
-    centre: Weights | None = None  # that clients are pulled to
+    sent: Weights = field(default_factory=dict)  # the strategy's further arrays
+    centre: Weights | None = None  # centre of the proximal term
 
     @property
     def start(self) -> Weights:
-        """Return the weights that the round began with."""
+        """Return the weights at the start of the round."""
         return self.expected.start
 
     @property
@@ -161,7 +164,7 @@ class OpenRound:
         return self.expected.rules
 
     def training(self) -> RecordDict:
-        """Return a request to train: weights, what goes with them, and the local work."""
+        """Return a request to train: weights, further arrays, and the local work."""
         records = {wire.ARRAYS: wire.to_array_record(self.start)} | (
             {wire.EXTRA: wire.to_array_record(self.sent)} if self.sent else {}
         )
@@ -174,7 +177,7 @@ class OpenRound:
 
 @dataclass(frozen=True)
 class Exchange:
-    """The server's end of the exchange: a Flower grid, whose nodes are the clients."""
+    """The server's end of the exchange: a Flower grid whose nodes are the clients."""
 
     grid: Grid
     names: Mapping[int, str]  # of the clients, by node
@@ -186,10 +189,10 @@ class Exchange:
         read: Callable[[str, RecordDict], AnswerT],
         awaited: Sequence[str] | None = None,
     ) -> Iterator[tuple[str, AnswerT]]:
-        """Send each client its request, and yield by client, in their order, what `read` makes of its reply.
+        """Send the clients their requests, and yield client and `read` reply in the order of the clients.
 
-        Clients that are lost, do not answer or whose reply is refused are noted `here`, with the reason. `awaited`: who
-        is to answer, where that is more than are sent a request.
+        Clients that are lost, do not answer or send an invalid reply are noted in `here`, with the reason. `awaited`:
+        the clients that have to answer, where these are more than the requests.
         """
         nodes = {name: node for node, name in self.names.items()}
         messages = (Message(content, nodes[name], MessageType.TRAIN) for name, content in requests.items())

@@ -1,8 +1,8 @@
-"""Federated learning: the round loop, and a round from weights to weights. Edge and cloud are two uses of it.
+"""Federated learning: the loop over rounds, and a single round from weights to weights, for edge and cloud alike.
 
 `federate` repeats `Server.run_round`. A round calls the clients that take part, sends them the weights and their local
 work, checks every update as it arrives, combines those that count, and keeps a record. Flower carries the messages;
-its own strategies sample clients from the global random state, multiply integer buffers by floats, and skip a whole
+its strategies sample clients from the global random state, multiply integer buffers by floats, and skip a whole
 round where one client fails.
 """
 
@@ -54,8 +54,8 @@ from flcav.federation.wire import LocalWork
 from flcav.statistics.streams import derive_seed
 
 EVERYBODY = Rules()
-WHOLE = (1, 1.0)  # samples and loss of the one update that a strategy is given where the server averages them itself
-BeforeRound = Callable[[int, Weights], None]  # called with the round's number and the weights that it begins with
+WHOLE = (1, 1.0)  # samples and loss of the single update passed to a strategy where the server has averaged already
+BeforeRound = Callable[[int, Weights], None]  # called with the round's number and its initial weights
 AskAfter = Callable[[int, Weights, Ask], None]  # called with number, aggregated weights and a way to ask clients
 OnRound = Callable[[int, Weights, float | None], None]  # called with number, aggregated weights and mean training loss
 logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each message; a stage reports its rounds
@@ -65,11 +65,11 @@ logging.getLogger("flwr").setLevel(logging.ERROR)  # Flower logs each message; a
 class Schedule:
     """Number of rounds, local steps per round, and a learning rate that decays geometrically over the rounds."""
 
-    rounds: int  # in all, those already done included
+    rounds: int  # total number, including those already done
     steps: int  # local optimiser steps per round
     learning_rate: float  # in the first round
     final_learning_rate: float  # in the last round, where there are several
-    seed: int  # of the federation; each round derives its own
+    seed: int  # of the federation; every round derives another one from it
 
     def work(self, round_: int) -> LocalWork:
         """Return the local work of round `round_`, counted from 1."""
@@ -126,52 +126,52 @@ def federate(
 ) -> LocalUpdate:
     """Run rounds `done + 1 .. schedule.rounds` of a federation, by default of federated averaging.
 
-    In each round every client trains, unless `rules` say otherwise, and `strategy` combines their updates (McMahan et
+    In a round every client trains, unless `rules` say otherwise, and `strategy` combines their updates (McMahan et
     al., AISTATS 2017, algorithm 1). To resume, pass the same clients, strategy, rules and schedule (its `rounds` are
-    those of the whole federation, on which a decaying learning rate depends), the weights and the number of the last
-    round that `on_round` was given, and the state after it; a `Stateful` strategy begins anew without it. Noise that is
-    not seeded is drawn by secrets, which are kept in `state`: without it a federation cannot be repeated, nor resumed
-    to the same weights. Under a privacy budget the last rounds are those that it affords; without noise it is that for
-    all of them. Where epsilon rests on secret draws of clients, records and ledger do not name them. A round in which
-    no client has samples leaves the weights as they are and is marked `empty`; `rules.empty_rounds` of them in a row
-    are the last.
+    those of the whole federation, on which a decaying learning rate depends), the weights and the number that
+    `on_round` received after the last round, and the state after it; without that state a `Stateful` strategy starts
+    afresh. Noise that is not seeded is drawn with secrets kept in `state`: without it a federation can neither be
+    repeated nor resumed to the same weights. A privacy budget limits the number of rounds; where the rules give no
+    noise, it is the least with which the budget affords all of them. Where epsilon relies on secret draws of clients,
+    records and ledger do not name them. A round in which no client has samples leaves the weights unchanged and is
+    marked `empty`; the federation ends after `rules.empty_rounds` of them in a row.
 
     Args:
-        clients: by name; a client is asked for when it is to train, and of updates no more are in memory than the
-            strategy needs.
-        weights: of the model that the first round begins with, arrays by name.
+        clients: by name; one is looked up when it is to train, and no more updates are in memory than the strategy
+            needs.
+        weights: of the initial model, arrays by name.
         schedule: number of rounds, local steps, learning rates and seed.
-        account: the ledger that every message is entered in, and the clients that the network loses; None: no budget.
+        account: the ledger in which every message is entered, and the clients that the network loses; None: no budget.
         options: by name, each with a default, see below.
 
     Options:
         strategy: how updates are combined, and how clients correct their training.
-        rules: who takes part, what is sent, what is kept private, and how many are needed.
+        rules: client selection, form of the updates, privacy, and the least number of updates.
         state: what server and clients keep between rounds, changed in place, with a record of every round.
-        done: number of rounds that are over.
-        earlier: number of rounds of federations before this one with the same clients and rules, which count against
-            a privacy budget, and after which the turns of round-robin go on.
+        done: number of rounds already completed.
+        earlier: number of rounds of previous federations with the same clients and rules; they count against a privacy
+            budget, and round-robin selection continues after them.
         before_round: called before each round.
-        ask_after: called after each round and before `on_round`, to ask clients that `Answers`.
-        on_round: called after each round; `state` is then that of the round.
+        ask_after: called after each round and before `on_round`, to ask questions of clients that are `Answers`.
+        on_round: called after each round, when `state` is that after the round.
         runtime: where clients train: None: in this process; `ClientProcesses` of the same clients; Flower's simulation
-            on Ray. The weights are the same.
-        centre: weights that clients are pulled to by the `personal` of the rules.
+            on Ray. The weights do not depend on it.
+        centre: weights to which the proximal term of `rules.personal` pulls the clients.
         distiller: the server's network under `FedMD`, whose clients send outputs: after a round it learns from their
-            mean, which is sent down in the next one; in the first it sends its own.
-        buffers: of `FedBuff`, the rounds by a clock; None: clients are equally fast, and messages take no time. It ends
-            where an update would exceed a budget, which is not sent.
+            mean, which is sent down in the next one; in the first it sends its present outputs.
+        buffers: for `FedBuff`, the rounds by a clock; None: clients are equally fast, and messages take no time. The
+            federation ends before an update that would exceed a budget, which is not sent.
 
     Returns:
-        The weights after the last round, and of that round the number of samples of all clients and their mean training
-        loss, weighted by samples; without a round to run `weights`, 0 samples and a loss of 0.
+        The weights after the last round, and that round's number of samples of all clients and their mean training
+        loss, weighted by samples; if there is no round to run, `weights`, 0 samples and a loss of 0.
 
-    Raises `BudgetExceeded` where a message would exceed a budget, `ClientFailed` where clients raised or sent what is
-    no update, and fewer are left than `rules` ask for (by default half of those asked), `TooFewClients` where fewer are
-    left than secure aggregation needs, though `account` lost none and none is without samples; both have the weights
-    after the last round that came to an end, `reached`. Raises `InputError` where there are no clients, `weights` are
-    no finite arrays, `rules` or `strategy` ask for what they cannot do, or `strategy` changes names, shapes or types of
-    the arrays.
+    Raises `BudgetExceeded` where a message would exceed a budget. Raises `ClientFailed` where clients raised or sent
+    invalid updates, and fewer are left than `rules` ask for (by default half of those asked); `TooFewClients` where
+    fewer are left than secure aggregation needs, though the network lost none and none is without samples. Both carry
+    the weights after the last completed round, `reached`. Raises `InputError` where there are no clients, `weights` are
+    not finite arrays, `rules` and `strategy` do not go together, or `strategy` changes names, shapes or types of the
+    arrays.
 
     >>> import numpy as np
     >>> from flcav import federate
@@ -223,7 +223,7 @@ def federate(
 def _limit_rounds(
     terms: FederationTerms, names: Sequence[str], rounds: int, account: Account
 ) -> tuple[Rules, int, Buffering | None]:
-    """Return the rules with the noise for the planned rounds, how many of these a budget affords, and their buffers."""
+    """Return the rules with the noise for the planned rounds, the number that a budget affords, and their buffers."""
     rules = terms.rules
     if isinstance(terms.strategy, FedBuff):
         buffers = terms.buffers or fill_in_turns(names, terms.strategy.buffer, rounds)
@@ -239,8 +239,9 @@ def _limit_rounds(
 def _run_round(
     server: "FederationServer", link: Link, terms: FederationTerms, number: int, weights: Weights, sent: Weights
 ) -> tuple[Weights, Weights]:
-    """Return the weights after a round, and what the next one sends down: these, or a distillation's mean outputs."""
-    state, kept = server.state, kept_records(server.strategy, server.rules)
+    """Return the weights after a round and the next downlink: these weights or, in distillation, mean outputs."""
+    state = server.state
+    kept = kept_records(server.strategy, server.rules)
     try:
         combined = server.run_round(number, sent)
     except (ClientFailed, TooFewClients) as error:
@@ -273,32 +274,32 @@ def _imitate(distiller: Distiller, strategy: Strategy, network: Weights, outputs
 
 @dataclass(frozen=True)
 class FederationServer(Exchange):
-    """Server of a federation: it runs rounds with the clients at the far end of a Flower grid."""
+    """The server of a federation, which runs rounds with its clients over a Flower grid."""
 
     strategy: Strategy
     rules: Rules
     work: Callable[[int], LocalWork]  # local training of a round, by its number
     state: FederationState  # changed in place
-    earlier: int = 0  # rounds of federations before
-    centre: Weights | None = None  # that clients are pulled to
-    away: Callable[[int], Mapping[str, str]] = lambda _: {}  # clients away when a round begins, with the reason
+    earlier: int = 0  # rounds of previous federations
+    centre: Weights | None = None  # centre of the proximal term
+    away: Callable[[int], Mapping[str, str]] = lambda _: {}  # clients absent when a round begins, with the reason
     buffering: Buffering | None = None  # of a strategy whose rounds are buffers
     authority: x509.Certificate | None = None  # of the clients' fleet
 
     def run_round(self, number: int, start: Weights) -> Weights:
         """Return the weights after round `number`, which begins with `start`; a record is added to the state.
 
-        The weights stay as they were, and the record names those who were chosen as failed, with the reason, where
+        The weights are unchanged, and the record lists the chosen clients as failed, with the reason, where
 
         - fewer clients are left than the strategy needs,
         - the network lost clients, and fewer are left than secure aggregation needs,
         - fewer take part than secure aggregation or `least_clients` asks for, and none failed,
         - clients revealed shares by which the sum cannot be unmasked,
-        - no client with samples, and with a weight for the strategy, is left, or none was drawn.
+        - no client with samples and a positive weight is left, or none was drawn.
 
-        Raises `ClientFailed` where fewer clients than are wanted sent a usable update, or where fewer take part than
-        are wanted and clients failed to report, `TooFewClients` where so few are left for secure aggregation,
-        `InputError` where the strategy refuses the updates or returns arrays of other names, shapes or types.
+        Raises `ClientFailed` where too few clients sent a usable update, or where too few take part and clients failed
+        to report; `TooFewClients` where too few are left for secure aggregation; `InputError` where the strategy
+        refuses the updates or returns arrays of other names, shapes or types.
         """
         round_ = self._call(number, start)  # who takes part
         updates = self._collect(round_)  # what is sent, and checked as it arrives
@@ -312,12 +313,15 @@ class FederationServer(Exchange):
         return weights
 
     def _call(self, number: int, start: Weights) -> OpenRound:
-        """Return the round with the clients that are chosen for it, and those of them that are away."""
-        work, selection, clients = self.work(number), self.rules.selection, [*self.names.values()]
+        """Return the round with its chosen clients, and those of them that are absent."""
+        work = self.work(number)
+        selection = self.rules.selection
+        clients = [*self.names.values()]
         if self.buffering is not None:
             self.state.server = self.buffering.keep_version(number, start, self.state.server)
             return OpenRound(work, self.buffering.attend(number, clients), Expected(self.rules, start))
         sent = self.strategy.send(self.state.server) if isinstance(self.strategy, Exchanges) else {}
+        # amplification by sampling holds only against observers who cannot repeat the draw: a secret seeds it
         seed = int.from_bytes(self._key("selection", work), "little") if self.rules.hides_draws else work.seed
         chosen = selection.choose(clients, number, seed, self.earlier)
         here = Attendance(clients if selection.unbiased else chosen, chosen, self.away(number))
@@ -328,7 +332,7 @@ class FederationServer(Exchange):
         return derive_key(self.state.keep_secret(SERVER), purpose, work.round, work.seed)
 
     def _collect(self, round_: OpenRound) -> Intake:
-        """Return the updates that count, by the mode of the round."""
+        """Return the accepted updates, by the mode of the round."""
         if self.buffering is not None:
             return buffered.collect(self, round_, self.buffering, self.state.server, self.work)
         if self.rules.secure is not None:
@@ -338,10 +342,12 @@ class FederationServer(Exchange):
         return plain.collect(self, round_, self.strategy)
 
     def _combine(self, round_: OpenRound, received: Intake) -> Weights:
-        """Return the weights after a round, and change the strategy's state; raises why there is no update."""
+        """Return the weights after a round, and update the strategy's state; raises the shortage if there is one."""
         if round_.here.shortage is not None:
             raise round_.here.shortage
-        start, updates, privacy = round_.start, received.combinable, self.rules.privacy
+        start = round_.start
+        updates = received.combinable
+        privacy = self.rules.privacy
         if received.average is not None:
             updates = [LocalUpdate(received.average(), *WHOLE)]
         elif privacy is not None and not privacy.local:
@@ -361,20 +367,21 @@ class FederationServer(Exchange):
         return weights
 
     def _average_privately(self, round_: OpenRound, updates: Sequence[LocalUpdate]) -> Weights:
-        """Return the weights after clipped changes and central noise, of all arrays that are learned and sent."""
+        """Return the weights after the noisy mean of clipped changes, of all arrays that are learned and sent."""
         privacy, selection, work = self.rules.privacy, self.rules.selection, round_.work
         assert privacy is not None
         sent = self.rules.upload.exchanged(round_.start)
         names = [name for name in learned_names(round_.start) if name in sent]
         expected = float(len(round_.here.chosen))
-        if selection.rule == "poisson":  # by chance more or fewer come
+        if selection.rule == "poisson":  # the number that comes is random: divide by its mean
             expected = expected_clients(selection, [*self.names.values()])
         key = None if privacy.seeded else self._key("noise", work)
         return average_privately(round_.start, updates, names, privacy, expected, work.seed, key)
 
     def _keep(self, round_: OpenRound, received: Intake) -> None:
-        """Add the record of a round to the state; where who was drawn is to stay secret, it has nothing of clients."""
-        number, epsilon = round_.work.round, None
+        """Add the record of a round to the state; where the draw of clients is secret, it does not name them."""
+        number = round_.work.round
+        epsilon = None
         if self.buffering is not None:
             self.state.server = self.buffering.keep_version(number + 1, {}, self.state.server)
         if self.rules.privacy is not None and self.buffering is not None:

@@ -1,11 +1,11 @@
-"""Differential privacy of clients: clipped updates, Gaussian noise, its sources, and an account of epsilon.
+"""Client-level differential privacy: clipping of updates, Gaussian noise, its sources, and accounting of epsilon.
 
 Central: a trusted server adds noise to the sum of the clipped changes of a round (McMahan et al., "Learning
 Differentially Private Recurrent Language Models", ICLR 2018, algorithm 1 with the fixed-denominator estimator). Local:
 every client adds noise to its clipped change, and the server is not trusted. Noise hides a change only from those who
-cannot repeat it: it is drawn by a party's secret, 32 bytes of the operating system, or, where it is `seeded`, by the
-seed of the round, which all know. By a secret it is drawn with SHAKE256, so that noise that is seen bare, where a
-weight did not change, reveals nothing of the rest.
+cannot reproduce it: it is drawn with a party's secret, 32 bytes from the operating system, or, where it is `seeded`,
+with the seed of the round, which all parties know. A secret is expanded with SHAKE256, so that noise that is seen bare,
+where a weight did not change, reveals nothing about the rest.
 """
 
 import bisect
@@ -29,10 +29,10 @@ from flcav.federation.trainable import Arrays, LocalUpdate, Weights
 from flcav.federation.upload import apply_change, find_change
 from flcav.statistics.streams import stream
 
-ROUNDING = 1e-12  # relative: more than the sum of squares of a clipped change is off in float64
+ROUNDING = 1e-12  # relative; above the rounding error of a clipped change's norm in float64
 MOST_NOISE = 1e6
-SMALLEST = 1e-12  # epsilon, and the inverse of the largest, that noise is sought for
-SEEDED = "seeded, no guarantee against who knows the seed"  # of epsilon whose noise can be drawn again
+SMALLEST = 1e-12  # least epsilon in the search for the noise; its inverse is the largest
+SEEDED = "seeded, no guarantee against who knows the seed"  # epsilon's remark where the noise can be reproduced
 
 
 class Privacy(Config):
@@ -58,34 +58,34 @@ class Privacy(Config):
 
     @property
     def multiplier(self) -> float:
-        """Return `noise`; raises ValueError where it is not known yet."""
+        """Return the noise multiplier, `noise`; raises ValueError where it is not known yet."""
         if self.noise is None:
             raise ValueError("noise that no rounds have been planned for")
         return self.noise
 
     @property
     def deviation(self) -> float:
-        """Return the standard deviation of the noise; raises ValueError where it is not known yet."""
+        """Return the noise's standard deviation, in units of a weight; raises ValueError where it is not known yet."""
         return self.multiplier * self.clip
 
     @property
     def local(self) -> bool:
-        """Return whether each client adds noise to its own update."""
+        """Return whether the clients add the noise, to their updates."""
         return self.where == "local"
 
     def hides_draws(self, selection: Selection) -> bool:
-        """Return whether epsilon is amplified by draws of clients that are to stay secret."""
+        """Return whether epsilon relies on amplification by sampling, whose draws must stay secret."""
         return not self.seeded and self.amplified(selection)
 
     def amplified(self, selection: Selection) -> bool:
-        """Return whether secret sampling of the clients of a round amplifies privacy."""
+        """Return whether sampling of a round's clients amplifies privacy, if it is secret."""
         return not self.local and selection.rule in ("poisson", "uniform")
 
 
 def clip_change(change: Weights, norm: float) -> dict[str, NDArray[np.float64]]:
     """Return a change in float64, scaled down so that its L2 norm over all arrays is at most `norm`.
 
-    In fewer bits a scaled array could be longer again: each number would be rounded, tiny ones by as much as they are.
+    In a narrower type rounding could lengthen the scaled array again, which would break the bound on sensitivity.
     """
     length = change_norm(change)
     factor = 1.0 if length <= norm else norm / length * (1 - ROUNDING)
@@ -98,10 +98,9 @@ def change_norm(change: Weights) -> float:
 
 
 def add_noise(change: Weights, privacy: Privacy, seed: int, key: bytes | None) -> Arrays:
-    """Return a change with independent Gaussian noise of the deviation `noise` x `clip` on every coordinate.
+    """Return a change plus independent Gaussian noise with the standard deviation `noise` x `clip` per coordinate.
 
-    seed: of the round, which seeded noise is drawn by. key: of the round, which all other noise is drawn by. Raises
-    ValueError where it is missing.
+    seed: of the round, for seeded noise. key: of the round, for all other noise. Raises ValueError where it is missing.
     """
     if key is None and not privacy.seeded:
         raise ValueError("noise without a secret to draw it by")
@@ -121,11 +120,11 @@ def average_privately(
     seed: int,
     key: bytes | None = None,
 ) -> Weights:
-    """Return start + (sum of clipped changes + noise) / expected, of the arrays `names`; all others as in `start`.
+    """Return start + (sum of clipped changes + noise) / expected for the arrays `names`; others are those of `start`.
 
-    `expected` is the number of clients that are expected in a round, whether they came or not: the noise is
-    N(0, (noise clip)^2) per coordinate of the sum, and every client counts the same. `seed` and `key` are as in
-    `add_noise`.
+    `expected` is the expected number of clients in a round. It is fixed, since a division by the number that came would
+    change the sensitivity (McMahan et al., ICLR 2018). The noise is N(0, (noise clip)^2) per coordinate of the sum, and
+    clients are weighted equally. `seed` and `key` are those of `add_noise`.
     """
     total: Arrays = {name: np.zeros(start[name].shape) for name in names}
     for update in updates:
@@ -136,7 +135,7 @@ def average_privately(
 
 
 def expected_clients(selection: Selection, names: Sequence[str]) -> float:
-    """Return the number of clients that a selection lets take part in a round, in the mean."""
+    """Return the expected number of clients in a round by a selection."""
     if selection.rule == "poisson":
         assert selection.probability is not None
         return selection.probability * len(names)
@@ -156,23 +155,26 @@ def compose_epsilon(
 ) -> float:
     """Return epsilon at `privacy.delta` of several trainings with one client's data, by Renyi differential privacy.
 
-    trainings: of each the number of clients, in the same order, and of rounds; the turns of round-robin go on in all
-    rounds of a training, and restart with the next. noises: of each training (None: that of `privacy`).
+    trainings: numbers of clients and of rounds per training; round-robin continues over all rounds of a training, and
+    restarts with the next. noises: noise multiplier per training (None: that of `privacy`).
 
-    Central, Poisson sampling: amplified, neighbours differ by a client that is added or removed. Central, a fixed
-    number drawn without replacement: amplified, neighbours differ in the data of one client, which changes a sum by up
-    to twice the norm. All other selections, and local noise, are not amplified: the account is of a client that takes
-    part as often as any. Local noise is between any two data sets of a client, again twice the norm apart.
+    Central noise, Poisson sampling: amplified; neighbouring data sets differ by one client, added or removed. Central
+    noise, a fixed number drawn without replacement: amplified; neighbours differ in the data of one client, which
+    changes the sum by up to twice the clipping norm. All other selections, and local noise, are not amplified: epsilon
+    is that of the client that takes part most often. Local noise protects between any two data sets of a client, whose
+    changes are again up to twice the norm apart.
     """
     import dp_accounting  # 1 s
     from dp_accounting import rdp
 
-    replaced = privacy.local or selection.rule == "uniform"  # else a client is added or removed
-    times = Counter[tuple[int, float]]()  # by number of clients, and noise
+    # replacing a client's data changes the sum by up to twice the norm, which equals half the noise multiplier
+    replaced = privacy.local or selection.rule == "uniform"  # neighbours by replacement; else by addition or removal
+    times = Counter[tuple[int, float]]()  # rounds by number of clients and noise multiplier
     for (clients, rounds), found in zip(trainings, noises, strict=False):
         noise = privacy.multiplier if found is None else found
         taken = rounds if privacy.amplified(selection) else most_participations(selection, clients, rounds)
         times[clients, noise / 2 if replaced else noise] += taken
+    # Renyi divergences add up under composition, so that equal events are measured once and multiplied
     accountant = rdp.RdpAccountant()
     orders: Any = accountant._orders
     spent: Any = accountant._rdp  # Renyi divergence, by order
@@ -203,7 +205,7 @@ def _measure_divergence(event: Any) -> NDArray[np.float64]:
 
 
 def find_noise(privacy: Privacy, selection: Selection, clients: int, rounds: int) -> Privacy:
-    """Return privacy with noise: its own or, without, the least with three digits that affords all these rounds."""
+    """Return privacy with its noise or, where it has none, the least with three digits that affords all rounds."""
     if privacy.noise is not None or privacy.epsilon is None:
         return privacy
 
@@ -213,7 +215,7 @@ def find_noise(privacy: Privacy, selection: Selection, clients: int, rounds: int
 
 @functools.lru_cache(maxsize=256)
 def _find_least_noise(privacy: str, selection: str, clients: int, rounds: int) -> float:
-    """Return the noise of `find_noise`; settings are JSON, by which they are looked up."""
+    """Return the noise of `find_noise`; the settings are JSON, so that they can be keys of the cache."""
     from scipy.optimize import root_scalar  # the processes of a fleet start without it
 
     asked, drawn = Privacy.model_validate_json(privacy), Selection.model_validate_json(selection)
@@ -228,13 +230,14 @@ def _find_least_noise(privacy: str, selection: str, clients: int, rounds: int) -
     if exceeds(ends[1]) > 0:
         return MOST_NOISE
     found = ends[0] if exceeds(ends[0]) <= 0 else float(root_scalar(exceeds, bracket=ends, xtol=1e-5).root)
+    # rounded up to three digits; the tolerance of the root may cost one unit more
     place = 10 ** (2 - math.floor(found))
     noise = math.ceil(10**found * place) / place
     return noise if exceeds(math.log10(noise)) <= 0 else min(noise + 1 / place, MOST_NOISE)
 
 
 def most_participations(selection: Selection, clients: int, rounds: int) -> int:
-    """Return the most rounds, of the first `rounds` of a training, that a client can take part in."""
+    """Return the largest number of rounds that one client can take part in, of the first `rounds` of a training."""
     if selection.rule != "round-robin":
         return rounds
     assert selection.clients is not None
@@ -242,18 +245,18 @@ def most_participations(selection: Selection, clients: int, rounds: int) -> int:
 
 
 def least_participations(selection: Selection, clients: int, rounds: int) -> int:
-    """Return how many of the first `rounds` rounds every client took part in that could."""
+    """Return the number of rounds that every available client took part in, of the first `rounds`."""
     return rounds * (selection.clients or 0) // clients if selection.rule == "round-robin" else rounds
 
 
 def affordable_rounds(privacy: Privacy, selection: Selection, names: Sequence[str], rounds: int, earlier: int) -> int:
-    """Return the number of `count_affordable`; raises `InputError` where it is 0 of some rounds."""
+    """Return the number of `count_affordable`; raises `InputError` where not a single round is affordable."""
     afforded = count_affordable(privacy, selection, names, rounds, earlier)
     if afforded < min(rounds, 1):
-        told = f"{account_epsilon(privacy, selection, names, earlier + 1):.4g} at delta = {privacy.delta:g}"
+        epsilon = f"{account_epsilon(privacy, selection, names, earlier + 1):.4g} at delta = {privacy.delta:g}"
         raise InputError(
-            f"privacy: {'a first' if not earlier else 'another'} round comes to epsilon = {told}, above the budget of "
-            f"{privacy.epsilon:g}; more noise, or fewer clients in a round, cost less"
+            f"privacy: {'a first' if not earlier else 'another'} round comes to epsilon = {epsilon}, above the budget "
+            f"of {privacy.epsilon:g}; more noise, or fewer clients in a round, cost less"
         )
     return afforded
 
@@ -266,6 +269,7 @@ def count_affordable(privacy: Privacy, selection: Selection, names: Sequence[str
 
     if privacy.epsilon is None or rounds == 0:
         return rounds
+    # epsilon increases with the number of rounds
     return max(bisect.bisect_left(range(rounds + 1), True, key=exceeds) - 1, 0)
 
 
@@ -274,7 +278,7 @@ SECRET_BYTES = 32
 
 
 class Normals(Protocol):
-    """Source of normal numbers, as NumPy's generators are."""
+    """A source of Gaussian random numbers, such as NumPy's generators."""
 
     def normal(self, *, scale: float, size: tuple[int, ...]) -> NDArray[np.float64]:
         """Return numbers of mean 0 and standard deviation `scale`."""
@@ -282,15 +286,18 @@ class Normals(Protocol):
 
 
 class SecretNormals:
-    """Normal numbers by Box and Muller from the output of SHAKE256 for a key; equal keys give equal numbers."""
+    """Gaussian numbers by the Box-Muller transform of SHAKE256's output for a key; equal keys give equal numbers."""
 
     def __init__(self, key: bytes) -> None:
-        """Draw by `key`, which is to be used for one change alone."""
-        self._key, self._arrays = key, 0
+        """Draw with `key`, which must be used for a single change."""
+        self._key = key
+        self._arrays = 0
 
     def normal(self, *, scale: float, size: tuple[int, ...]) -> NDArray[np.float64]:
         """Return numbers of mean 0 and standard deviation `scale`."""
-        count, self._arrays = math.prod(size), self._arrays + 1
+        count = math.prod(size)
+        self._arrays += 1
+        # another key per array; 53 random bits per number, never 0, whose logarithm is taken
         pairs = -(-count // 2)
         drawn = hashlib.shake_256(_derive(self._key, f"array {self._arrays}")).digest(16 * pairs)
         uniform = ((np.frombuffer(drawn, "<u8") >> np.uint64(11)) + 1.0) * 2.0**-53  # in (0, 1]
@@ -305,14 +312,15 @@ def draw_secret() -> Secret:
 
 
 def derive_key(secret: Secret, purpose: str, round_: int, seed: int) -> bytes:
-    """Return the 32-byte key of a secret for a purpose in one round; `seed` is the round's, which others know."""
+    """Return the 32-byte key derived from a secret for a purpose in one round; `seed` is the round's, and public."""
     return _derive(secret.tobytes(), f"{purpose} {round_} {seed}")
 
 
 def secret_noise(key: bytes, change: Weights) -> SecretNormals:
-    """Return the noise of a change in the round of `key`: the same for the same change, and for another one another.
+    """Return the noise of a change in the round of `key`: the same for equal changes, independent for different ones.
 
-    So a round that is repeated after a stop sends the same again, and the difference of two messages reveals no change.
+    A round that is repeated after a stop thus sends the same message again, and no difference of two messages cancels
+    the noise.
     """
     hashed = hashlib.blake2b(key=key, digest_size=SECRET_BYTES)
     for name, array in change.items():

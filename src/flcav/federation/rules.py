@@ -1,4 +1,4 @@
-"""Rules of a federation: who takes part in a round, what is sent, what is kept private, and how many are needed."""
+"""Rules of a federation: client selection, form of the updates, privacy, and the least number of updates."""
 
 from collections.abc import Sequence
 from typing import Annotated, Literal
@@ -20,16 +20,17 @@ class SecureAggregation(Config):
     largest: float = Field(default=8.0, gt=0, le=1e6)  # largest change of a weight in a round; more is cut off
 
     def needed(self, clients: int, certified: bool = False) -> int:
-        """Return the threshold among so many clients of a round; two at least, as the sum of one is its update.
+        """Return the threshold of secret sharing in a round of `clients` clients.
 
-        Clients that are `certified` do not trust the server to tell all of them the same. From two thirds on they
-        reveal too little for a single update, whatever it tells each: see `SecureClient.reveal`.
+        It is at least two, since the sum of one update is that update. Clients that are `certified` do not trust the
+        server to show all of them the same list. With a threshold of two thirds they reveal too few shares to unmask a
+        single update, whatever it shows them: see `SecureClient.reveal`.
         """
         least = max(clients // 2 + 1, -(-2 * clients // 3) if certified else 2, 2)
         return least if self.threshold is None else self.threshold
 
 
-MOST_SAMPLES, LARGEST = 10**12, 1e12  # of any limit
+MOST_SAMPLES, LARGEST = 10**12, 1e12  # upper bounds of all limits
 
 
 class ReplyLimits(Config):
@@ -79,17 +80,18 @@ class Rules(Config):
     keep_optimiser: bool = False  # clients keep the state of their optimisers between rounds; default: it begins anew
 
     def of_servers(self) -> "Rules":
-        """Return the rules among edge servers, which federate with the cloud, where vehicles have these.
+        """Return the rules among edge servers in the cloud's rounds, where these are the rules among vehicles.
 
-        All take part, none may fail, and they send in the same form; noise is the vehicles', and what comes after it is
-        as private. Samples are those of all vehicles of a region, and each of these has its own time to train.
+        All edge servers take part, none may fail, and updates have the same form. Only vehicles add noise, since
+        post-processing keeps differential privacy. The samples of an edge server are those of all its vehicles, and the
+        limit on training time applies to vehicles only.
         """
         limits = self.limits.model_copy(update={"samples": MOST_SAMPLES, "train_s": None})
         upload = self.upload.model_copy(update={"kept": self.personal_arrays})
         return Rules(upload=upload, limits=limits, least_clients="all", empty_rounds=self.empty_rounds)
 
     def tell_shortage(self, clients: int) -> str:
-        """Return in words that fewer clients take part in a round than the number `least_clients`, or "" for enough."""
+        """Return a sentence where fewer clients take part in a round than the number `least_clients`, else ""."""
         least = self.least_clients
         if not isinstance(least, int) or clients >= least:
             return ""
@@ -97,19 +99,19 @@ class Rules(Config):
 
     @property
     def hides_draws(self) -> bool:
-        """Return whether epsilon is amplified by draws of clients that are to stay secret."""
+        """Return whether epsilon relies on amplification by sampling, whose draws must stay secret."""
         return self.privacy is not None and self.privacy.hides_draws(self.selection)
 
     def secret_parties(self, clients: Sequence[str]) -> Sequence[str]:
-        """Return the parties that draw noise by a secret: these clients, or `SERVER`; none where it is seeded."""
+        """Return the parties whose secrets noise is drawn with: the clients or `SERVER`; none where it is seeded."""
         if self.privacy is None or self.privacy.seeded:
             return ()
         return clients if self.privacy.local else (SERVER,)
 
     def settle_threshold(self, clients: Sequence[str], certified: bool) -> "Rules":
-        """Return the rules with the number of clients that secure aggregation needs, where every round has as many.
+        """Return the rules with secure aggregation's threshold filled in, where all rounds have as many clients.
 
-        So clients know it, and answer no server that shows them fewer.
+        Clients thus know the threshold, and refuse a server that shows them fewer peers.
         """
         if self.secure is None or self.selection.rule == "planned":
             return self
@@ -118,11 +120,11 @@ class Rules(Config):
 
     @property
     def personal_arrays(self) -> Patterns:
-        """Return the patterns of the arrays that are not averaged between regions."""
+        """Return the patterns of the personal arrays, which are not averaged between regions."""
         return () if isinstance(self.personal, RegionalModels) else self.personal
 
     def check_personal(self, weights: Weights) -> None:
-        """Raise `InputError` where a pattern of `personal` matches no array, or nothing that is learned is left."""
+        """Raise `InputError` where a pattern of `personal` matches no array, or no learned array is left to average."""
         for pattern in self.personal_arrays:
             if not name_like(weights, (pattern,)):
                 raise InputError(

@@ -1,6 +1,6 @@
 """Client selection: which clients take part in a round, and with what probability.
 
-Each round draws from a stream of its own, so that a resumed federation draws as an uninterrupted one.
+Every round has a separate random stream, so that a resumed federation draws as an uninterrupted one.
 """
 
 from collections.abc import Mapping, Sequence
@@ -15,8 +15,8 @@ from flcav.statistics.streams import stream
 
 Rule = Literal["all", "uniform", "poisson", "round-robin", "importance", "deadline", "planned"]
 
-LONGEST = 3.0  # norm of an update that counts in importance selection, as a multiple of the clients' median
-NEEDED: Mapping[Rule, str | None] = {  # the field that a rule needs, which others do not take
+LONGEST = 3.0  # cap on norms in importance selection, as a multiple of the clients' median
+NEEDED: Mapping[Rule, str | None] = {  # the required field of a rule, which other rules refuse
     "all": None,
     "uniform": "clients",
     "poisson": "probability",
@@ -67,31 +67,33 @@ class Selection(Config):
 
     @property
     def weighs(self) -> bool:
-        """Return whether updates are weighted by the inverse of their clients' probability."""
+        """Return whether updates are weighted by the inverse of their clients' selection probability."""
         return self.unbiased or self.rule == "importance"
 
     @property
     def predicts(self) -> bool:
-        """Return whether it is a deadline for round times that a network is to predict."""
+        """Return whether a network has to predict the round times that are compared with a deadline."""
         return self.rule == "deadline" and not self.seconds
 
     def check_clients(self, names: Sequence[str]) -> None:
-        """Raise `InputError` where these clients cannot be selected so."""
+        """Raise `InputError` where the rule cannot select among these clients."""
         if self.clients is not None and self.clients > len(names):
             raise InputError(f"selection: {self.clients} clients are wanted in a round, and there are {len(names)}")
         if self.seconds and (unknown := [name for name in names if name not in self.seconds]):
-            told = f"{len(unknown)} of {len(names)} clients, such as {unknown[0]}"
-            raise InputError(f"selection: 'seconds' has no time of a round for {told}")
+            missing = f"{len(unknown)} of {len(names)} clients, such as {unknown[0]}"
+            raise InputError(f"selection: 'seconds' has no time of a round for {missing}")
         if self.rule == "deadline" and not self.choose(names, 1, 0):
             raise InputError(f"selection: no client is predicted to end a round within {self.deadline_s:g} s")
 
     def choose(self, names: Sequence[str], round_: int, seed: int, earlier: int = 0) -> list[str]:
-        """Return the clients of round `round_` (from 1) in their order, for clients that `check_clients` takes.
+        """Return the clients of round `round_` (from 1) in their order, among `names` that `check_clients` accepts.
 
-        The turns of round-robin go on after `earlier` rounds of federations before, with the same clients. Of
-        importance selection these are all, as each reports its norm, and of a deadline that a network is to predict.
+        Round-robin continues after `earlier` rounds of previous federations with the same clients. Importance selection
+        returns all, since every client reports its norm, and so does a deadline whose round times are yet to be
+        predicted.
         """
-        count, rng = self.clients or 0, stream(seed, "selection")
+        count = self.clients or 0
+        rng = stream(seed, "selection")
         match self.rule:
             case "uniform":
                 chosen = set(rng.permutation(len(names))[:count].tolist())
@@ -112,7 +114,7 @@ class Selection(Config):
         return [name for i, name in enumerate(names) if i in chosen]
 
     def inclusion_probability(self, clients: int) -> float:
-        """Return the probability that a client takes part in a round, one of `clients`, by uniform or poisson."""
+        """Return a client's probability of taking part in a round, one of `clients`, by the rule uniform or poisson."""
         if self.rule == "uniform":
             assert self.clients is not None
             return self.clients / clients
@@ -120,27 +122,28 @@ class Selection(Config):
         return self.probability
 
     def draw(self, norms: Mapping[str, float], seed: int) -> dict[str, float]:
-        """Return the clients that importance selection draws, with the probability of each.
+        """Return the clients drawn by importance selection, with their probabilities.
 
-        `norms` are the norms of the clients' updates times their shares of all samples. Each counts as `LONGEST` times
-        their lower median at most, so that fewer than half of the clients, whatever norms they report, leave the others
-        a part in the draw; the mean stays unbiased, since its weights are by the same probabilities.
+        norms: L2 norms of the clients' updates times their shares of all samples, by client. They are capped at
+        `LONGEST` times their lower median, so that a minority of clients cannot crowd the others out of the draw by
+        reporting large norms. The mean stays unbiased, since its weights are the inverses of the same probabilities.
         """
         assert self.clients is not None
-        told = np.array([*norms.values()])
-        middle = float(np.sort(told)[(len(told) - 1) // 2]) if len(told) else 0.0
-        probabilities = optimal_probabilities(np.minimum(told, LONGEST * middle), self.clients)
+        reported = np.array([*norms.values()])
+        # with fewer than half of the clients lying, the lower median lies among the honest reports
+        middle = float(np.sort(reported)[(len(reported) - 1) // 2]) if len(reported) else 0.0
+        probabilities = optimal_probabilities(np.minimum(reported, LONGEST * middle), self.clients)
         drawn = stream(seed, "importance").random(len(norms)) < probabilities
         return {name: float(p) for name, p, taken in zip(norms, probabilities, drawn, strict=True) if taken}
 
 
 def optimal_probabilities(norms: NDArray[np.float64], expected: int) -> NDArray[np.float64]:
-    """Return each client's probability (clients,) of taking part, for the least variance of the unbiased mean.
+    """Return the clients' probabilities (clients,) of taking part that minimise the variance of the unbiased mean.
 
-    norms: (clients,) weighted norms of updates. They sum to at most `expected`: p_i = (m + l - n) u_i / (u_1 + ... +
-    u_l) for the l smallest norms, and 1 for the others, with the largest l for which none is above 1 (Chen, Horváth and
-    Richtárik, "Optimal Client Sampling for Federated Learning", TMLR 2022, equation 7). Where no norm is above 0, all
-    have the same probability.
+    norms: (clients,) weighted norms u of updates. They sum to at most m = `expected`: p_i = (m + l - n) u_i /
+    (u_1 + ... + u_l) for the l smallest of n norms, and 1 for the others, with the largest l for which none is above
+    1 (Chen, Horváth and Richtárik, "Optimal Client Sampling for Federated Learning", TMLR 2022, equation 7). Where no
+    norm is above 0, all probabilities are equal.
     """
     count = len(norms)
     if expected >= count:

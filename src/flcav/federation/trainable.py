@@ -1,6 +1,6 @@
 """The interface of a federation's client: weights in, update out.
 
-A federation knows weights and numbers alone; whatever satisfies `Trainable` can be federated, of any task.
+A federation only sees weights and numbers, so that any `Trainable` can be federated, whatever its task.
 """
 
 from collections.abc import Mapping
@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from flcav.config import InputError
 
 Arrays = dict[str, NDArray[np.number]]  # by name
-Weights = Mapping[str, NDArray[np.number]]  # name -> array, parameters and buffers, in a fixed order
-Forms = Mapping[str, tuple[tuple[int, ...], np.dtype]]  # shape and type of arrays by name
-STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's own layer
+Weights = Mapping[str, NDArray[np.number]]  # arrays by name, parameters and buffers, in a fixed order
+Forms = Mapping[str, tuple[tuple[int, ...], np.dtype]]  # shape and dtype of arrays, by name
+STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and those of the package's layer
     "running_mean",
     "running_var",
     "running_variance",
@@ -24,12 +24,12 @@ STATISTICS = (  # of batch normalisation, last part of a name: PyTorch's, and th
 
 
 def forms_of(weights: Weights) -> Forms:
-    """Return shape and type of each array."""
+    """Return shape and dtype of every array."""
     return {name: (array.shape, array.dtype) for name, array in weights.items()}
 
 
 def learned_names(weights: Weights) -> list[str]:
-    """Return the names of the arrays that gradients change: floating ones, without batch normalisation's statistics."""
+    """Return the names of the learned parameters: floating arrays without the statistics of batch normalisation."""
     return [
         name
         for name, array in weights.items()
@@ -38,13 +38,13 @@ def learned_names(weights: Weights) -> list[str]:
 
 
 def statistics_names(weights: Weights) -> list[str]:
-    """Return the names of the floating arrays that no gradient changes: batch normalisation's means and variances."""
+    """Return the names of the running means and variances of batch normalisation, which no gradient changes."""
     learned = {*learned_names(weights)}
     return [name for name, array in weights.items() if np.issubdtype(array.dtype, np.floating) and name not in learned]
 
 
 def check_weights(weights: Weights, told: str) -> None:
-    """Raise `InputError` where weights are not finite arrays of numbers; `told` begins the sentence."""
+    """Raise `InputError` where weights are not finite arrays of numbers; the message starts with `told`."""
     for name, array in weights.items():
         if not isinstance(array, np.ndarray | np.generic) or array.dtype.kind not in "fiub":
             kind = f" of {dtype}" if (dtype := getattr(array, "dtype", None)) else ""
@@ -84,37 +84,37 @@ class LocalUpdate:
     samples: int  # distinct samples trained on
     loss: float  # mean over the local steps
     gradient: Weights = field(default_factory=dict)  # mean over the local steps, uncorrected; where `shift` was given
-    extra: Weights = field(default_factory=dict)  # what else a strategy's clients send: see `Exchanges`
-    own: Weights = field(default_factory=dict)  # what a client keeps for the next round, where `own` was given
+    extra: Weights = field(default_factory=dict)  # further arrays of the strategy's clients, see `Exchanges`
+    own: Weights = field(default_factory=dict)  # client state for the next round, where `own` was given
     optimiser: Weights = field(default_factory=dict)  # state of the optimiser after the steps, where it was given
 
 
 @dataclass(frozen=True)
 class Correction:
-    """A change of a client's gradients at every local step: g + proximal (w - centre) + shift.
+    """A correction of a client's gradients at every local step: g + proximal (w - centre) + shift.
 
-    The mean of g over the steps is to be returned as the update's `gradient` where there is a `shift`.
+    Where there is a `shift`, the update must have the mean of g over the steps as its `gradient`.
     """
 
     proximal: float = 0.0  # mu
-    shift: Weights | None = None  # by name of parameter; one that is not in it is not shifted
-    centre: Weights | None = None  # by name of parameter; None: the weights that the round began with
+    shift: Weights | None = None  # by name of parameter; missing ones are not shifted
+    centre: Weights | None = None  # by name of parameter; None: the weights at the start of the round
 
     def arguments(self) -> dict[str, Any]:
-        """Return the further arguments of `Trainable.train`: none where nothing is corrected."""
+        """Return the correction as arguments of `Trainable.train`: none where nothing is corrected."""
         found: dict[str, Any] = {"proximal": self.proximal} if self.proximal else {}
         arrays = {"shift": self.shift, "centre": self.centre}
         return found | {name: each for name, each in arrays.items() if each is not None}
 
 
 class Trainable(Protocol):
-    """A client: its own data and a network to train on them. The network that the vehicle drives with is another.
+    """A client of a federation: private data and a network to train on them, not that which the vehicle drives with.
 
-    Strategies that correct the clients' gradients need a `train` that takes the arguments of `Correction`, too, and
-    federations that exchange named layers alone need one that takes `layers`, patterns of the parameters to train.
-    Clients of FedMD get their mean outputs for weights, `own`, what they kept, and `imitation_steps`. Where rules have
-    clients keep their optimisers, `train` takes `optimiser`, the state after their last round, empty at first, and the
-    update has it as `optimiser` after this one.
+    `train` takes further arguments where the federation needs them: those of `Correction` where the strategy corrects
+    gradients; `layers`, patterns of the parameters to train, where only named layers are exchanged; for FedMD `own`,
+    the client's state, and `imitation_steps`, with mean outputs in place of weights; and `optimiser` where the rules
+    keep optimisers: the state after the client's last round, empty at first, which the update has as `optimiser` after
+    this one.
     """
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> Update:
@@ -127,7 +127,7 @@ class Trainable(Protocol):
 
 @runtime_checkable
 class Counts(Protocol):
-    """A client that reports its number of samples before it trains."""
+    """A client that can report its number of samples before it trains."""
 
     def count_samples(self, steps: int) -> int:
         """Return the number of distinct samples that `steps` local steps train on: the update's `samples`."""
@@ -135,7 +135,7 @@ class Counts(Protocol):
 
 
 def count_samples(client: Trainable, steps: int) -> int:
-    """Return the number of samples of a client that `Counts`; raises TypeError for any other client."""
+    """Return the number of samples of a client that is `Counts`; raises TypeError for any other client."""
     if not isinstance(client, Counts):
         raise TypeError(f"{type(client).__name__} does not say how many samples it has: no count_samples")
     return client.count_samples(steps)
@@ -143,29 +143,29 @@ def count_samples(client: Trainable, steps: int) -> int:
 
 @runtime_checkable
 class Accounts(Protocol):
-    """A client with a link of its own to clients, whose budget its training may exceed: an edge server."""
+    """A client that is itself a server, and whose training may exceed the budget of its link: an edge server."""
 
     account: Any  # of that link, `flcav.federation.links.metered.Account`
 
 
 @runtime_checkable
 class Answers(Protocol):
-    """A client that answers questions beside its training, on data that stay with it."""
+    """A client that also answers questions about its data, which stay with it."""
 
     def answer(self, question: str, arrays: Weights) -> Weights:
-        """Return the answer to a question; `arrays` come with it, such as the weights to score."""
+        """Return the answer to a question that comes with `arrays`, such as the weights to score."""
         ...
 
 
 def answer_question(client: Trainable, question: str, arrays: Weights) -> Weights:
-    """Return the answer of a client that `Answers`; raises TypeError for any other client."""
+    """Return the answer of a client that is `Answers`; raises TypeError for any other client."""
     if not isinstance(client, Answers):
         raise TypeError(f"{type(client).__name__} answers no questions, such as '{question}'")
     return client.answer(question, arrays)
 
 
 class Distiller(Protocol):
-    """Network of the server in output distillation: its outputs on shared samples, and training towards a mean."""
+    """The server's network in output distillation: it predicts on shared samples, and learns from mean outputs."""
 
     def outputs(self, weights: Weights) -> Weights:
         """Return the outputs of a network with these weights."""

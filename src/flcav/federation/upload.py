@@ -1,6 +1,6 @@
-"""The form of a client's update on the link: named layers alone, and their changes in fewer bits or fewer coordinates.
+"""Compression of a client's update: a choice of layers, and their changes quantised or sparsified.
 
-Nothing but arrays crosses the link, so that an update's bytes in the ledger are those of its serialised message.
+An update consists of arrays only, so that its bytes in the ledger are those of its serialised message.
 """
 
 from collections.abc import Mapping, Sequence
@@ -14,11 +14,11 @@ from pydantic import Field, model_validator
 from flcav.config import Config, InputError
 from flcav.federation.trainable import Arrays, Forms, Weights, forms_of, learned_names
 
-INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compressed change; no parameter is called so
-LEVELS = 127  # of int8, on either side of 0
+INDICES, VALUES, SCALES = "#indices", "#values", "#scales"  # arrays of a compressed change, unlike any parameter
+LEVELS = 127  # levels of int8 on either side of 0
 
 
-Patterns = tuple[Annotated[str, Field(min_length=1)], ...]  # of names of arrays, as of files in a shell
+Patterns = tuple[Annotated[str, Field(min_length=1)], ...]  # shell patterns of names of arrays
 
 
 def name_like(weights: Weights, patterns: Patterns) -> list[str]:
@@ -49,15 +49,15 @@ class Upload(Config):
         return self
 
     def check_layers(self, weights: Weights) -> None:
-        """Raise `InputError` where a pattern matches no array, or all of them together none that is learned."""
+        """Raise `InputError` where a pattern matches no array, or all of them together no learned array."""
         for layer in self.layers:
             if not any(fnmatchcase(name, layer) for name in weights):
                 raise InputError(
                     f"layers: '{layer}' matches none of {len(weights)} arrays, such as '{next(iter(weights))}'"
                 )
         if not {*learned_names(weights)} & {*self.exchanged(weights)}:
-            told = f"layers {', '.join(self.layers)}: match" if self.layers else "a federation of weights with"
-            raise InputError(f"{told} no array that is learned")
+            subject = f"layers {', '.join(self.layers)}: match" if self.layers else "a federation of weights with"
+            raise InputError(f"{subject} no array that is learned")
 
     def exchanged(self, weights: Weights) -> list[str]:
         """Return the names of the arrays that are sent."""
@@ -66,24 +66,27 @@ class Upload(Config):
 
 
 def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | None, seed: int) -> tuple[Arrays, Arrays]:
-    """Return a change of floating arrays as it is sent, and what is kept for the next round under `VALUES`.
+    """Return a compressed change of floating arrays, and the residual for the next round, under `VALUES`.
 
-    residual: (coordinates,) what was left out before, None at first. `seed` is that of the rounding. What is kept is
-    empty unless something is left out.
+    residual: (coordinates,) left out so far by error feedback, None at first. seed: of stochastic rounding. The
+    returned residual is empty unless top-k keeps one.
     """
     match upload.compression:
         case "fp16":
             limit = float(np.finfo(np.float16).max)
             sent = {
-                name: np.where(np.isinf(array), array, np.clip(array, -limit, limit))  # infinite ones are refused
+                name: np.where(np.isinf(array), array, np.clip(array, -limit, limit))  # infinite ones are to be refused
                 for name, array in change.items()
             }
             return {name: array.astype(np.float16) for name, array in sent.items()}, {}
         case "int8":
-            rng, sent, scales = np.random.default_rng(seed), {}, []
+            rng = np.random.default_rng(seed)
+            sent = {}
+            scales = []
             for name, array in change.items():
                 scale = np.float32(np.abs(array).max(initial=0.0) / LEVELS)
-                with np.errstate(invalid="ignore"):  # of a scale that is not finite, which is refused
+                # floor(x + u) with u uniform in [0, 1) rounds stochastically, without bias
+                with np.errstate(invalid="ignore"):  # a scale that is not finite is refused by the server
                     levels = array / (scale or 1.0) + rng.random(array.shape)
                     sent[name] = np.clip(np.floor(levels), -LEVELS, LEVELS).astype(np.int8)
                 scales.append(scale)
@@ -93,7 +96,8 @@ def compress(upload: Upload, change: Weights, residual: NDArray[np.number] | Non
             if residual is not None:
                 flat = flat + residual
             kept = _kept_coordinates(upload, flat.size)
-            size = np.where(np.isnan(flat), np.inf, np.abs(flat))  # what is no number is sent, and so refused
+            size = np.where(np.isnan(flat), np.inf, np.abs(flat))  # NaN is sent, so that the server refuses it
+            # stable, so that equal magnitudes give the same choice on every machine
             indices = np.sort(np.argsort(-size, kind="stable")[:kept])
             sent = {INDICES: indices.astype(np.uint32), VALUES: flat[indices]}
             flat[indices] = 0.0
@@ -107,7 +111,7 @@ def _kept_coordinates(upload: Upload, size: int) -> int:
 
 
 def compressed_forms(upload: Upload, like: Weights) -> Forms:
-    """Return shape and type of each array that `compress` makes of a change of arrays like these."""
+    """Return shape and dtype of every array that `compress` returns for a change of arrays `like` these."""
     match upload.compression:
         case "fp16":
             return {name: (array.shape, np.dtype(np.float16)) for name, array in like.items()}
@@ -122,10 +126,10 @@ def compressed_forms(upload: Upload, like: Weights) -> Forms:
 
 
 def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
-    """Return the change of floating arrays that `compress` sent; `like` has their names, shapes and types.
+    """Return the change of floating arrays that `compress` encoded; `like` has their names, shapes and dtypes.
 
-    What was sent has the forms of `compressed_forms`. Raises ValueError for coordinates that do not rise, or are none
-    of the arrays'.
+    `sent` has the forms of `compressed_forms`. Raises ValueError for coordinates of top-k that do not increase, or are
+    out of range.
     """
     match upload.compression:
         case "int8":
@@ -149,12 +153,12 @@ def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
 
 
 def find_change(weights: Weights, start: Weights, names: Sequence[str]) -> Arrays:
-    """Return the change of the arrays `names` in a round, in their own types."""
+    """Return the change of the arrays `names` in a round, in the dtypes of `start`."""
     return {name: (weights[name].astype(np.float64) - start[name]).astype(start[name].dtype) for name in names}
 
 
 def apply_change(start: Weights, change: Mapping[str, NDArray[np.number]]) -> Arrays:
-    """Return the weights `start` with their `change` added to those arrays that it names."""
+    """Return the weights `start` plus a `change` of some of their arrays."""
     return {
         name: (array.astype(np.float64) + change[name]).astype(array.dtype) if name in change else np.asarray(array)
         for name, array in start.items()

@@ -1,7 +1,7 @@
-"""Messages on the wire: records of Flower's messages, updates as they are sent, and replies as they arrive.
+"""The wire format: records of Flower's messages, encoded updates, and the order of replies.
 
 Weights and updates (NumPy) become the array records of a message and back. An update is sent whole or in the form of
-`Upload`, clipped and with noise where clients add it. Of the replies to requests, `list_events` says which came.
+`Upload`, clipped and with noise where clients add it. `list_events` orders the replies to requests.
 """
 
 import math
@@ -27,22 +27,22 @@ from flcav.federation.upload import VALUES, apply_change, compress, compressed_f
 from flcav.statistics.streams import derive_seed
 
 ARRAYS, CONFIG, METRICS = "arrays", "config", "metrics"  # records of a message, by key
-EXTRA = "extra"  # a strategy's arrays beside the weights, where it has any
-CENTRE = "centre"  # the model that clients are pulled to, where it is not the round's
-ASK = "ask"  # record and its entry: what is to be sent, where it is not the update after training
+EXTRA = "extra"  # arrays that a strategy exchanges in addition to the weights
+CENTRE = "centre"  # centre of the proximal term, where it is not the round's initial model
+ASK = "ask"  # record and its entry: the kind of the request, where it is not the update after training
 VECTOR = "#masked"  # the one array of an update under secure aggregation
-NORM, SEND = "norm", "send"  # ask for the norm of the update after training; for the update whose norm was sent
-COUNT = "count"  # ask for the number of samples before training
-LOST = "lost"  # record of a message whose answer will not arrive
-GRANT, GRANTED = "grant", "bytes"  # record of a message and its entry: most bytes that its answer may have
-OVER_BUDGET = 101  # error code in the place of an answer over that
+NORM, SEND = "norm", "send"  # requests for the norm of the update after training, and for that update
+COUNT = "count"  # request for the number of samples before training
+LOST = "lost"  # record of a request whose answer will not arrive
+GRANT, GRANTED = "grant", "bytes"  # record of a request and its entry: most bytes of the answer
+OVER_BUDGET = 101  # error code in place of an answer beyond the grant
 CLIENT_APP_RAISED = 2  # Flower's error code of an exception in a client app
-LOST_BY_NETWORK = 100  # error code in the place of an answer that does not arrive; Flower's own codes are below
-KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # ask, in this order, under secure aggregation
+LOST_BY_NETWORK = 100  # error code in place of an answer that does not arrive; Flower's codes are below 100
+KEYS, SHARES, MASKED, UNMASK = "keys", "shares", "masked", "unmask"  # requests of secure aggregation, in this order
 NAMES, CIPHERS, MASKS = "names", "ciphers", "masks"  # entries of its messages; that of shares is `SHARES`
-CERTIFICATES, SIGNATURES = "certificates", "signatures"  # entries beside keys, of clients with an authority
+CERTIFICATES, SIGNATURES = "certificates", "signatures"  # entries next to the keys, of certified clients
 SAMPLES, LOSS = "num-examples", "loss"  # entries of the metrics
-ANSWER_S = 3600.0  # that answers are waited for where nodes are elsewhere
+ANSWER_S = 3600.0  # timeout of answers from remote nodes [s]
 
 NUMBERS = {  # types of arrays in messages, by name
     str(np.dtype(code)): np.dtype(code) for code in (*np.typecodes["AllInteger"], *np.typecodes["AllFloat"], "?")
@@ -50,17 +50,17 @@ NUMBERS = {  # types of arrays in messages, by name
 
 
 class NoCount(ValueError):
-    """A number of samples that no message can hold."""
+    """A number of samples that does not fit in a message."""
 
 
 @dataclass(frozen=True)
 class LocalWork:
-    """The local training that every client does in one round."""
+    """The local training of every client in one round."""
 
     round: int  # 1-based within its federation
     steps: int  # local optimiser steps
     learning_rate: float
-    seed: int  # of the round; each client derives its own from it and its name
+    seed: int  # of the round; every client derives its seed from this and its name
 
     def record(self) -> ConfigRecord:
         """Return the work as the config record of a Flower message."""
@@ -86,21 +86,22 @@ def to_weights(arrays: ArrayRecord) -> dict[str, np.ndarray]:
 
 
 def _to_array(value: NDArray[np.number]) -> Array:
-    """Return an array in C order as Flower does, in NumPy's file format, but copied once instead of twice."""
+    """Return a C-ordered array as a Flower array in NumPy's file format, copied once where Flower copies twice."""
     data = b"".join((_header(value.shape, value.dtype, fortran_order=False), value.data))
     return Array(dtype=type_name(value.dtype), shape=value.shape, stype=SType.NUMPY, data=data)
 
 
 @lru_cache(maxsize=256)
 def type_name(dtype: np.dtype) -> str:
-    """Return the name of a type of numbers, as messages have it."""
+    """Return the name of a dtype in messages."""
     return str(dtype)
 
 
 @lru_cache(maxsize=4096)
 def _header(shape: tuple[int, ...], dtype: np.dtype, fortran_order: bool) -> bytes:
     """Return the header of an array in version 1.0 of NumPy's file format."""
-    head, descr = BytesIO(), np.lib.format.dtype_to_descr(dtype)
+    head = BytesIO()
+    descr = np.lib.format.dtype_to_descr(dtype)
     about = {"shape": shape, "fortran_order": fortran_order, "descr": descr}
     np.lib.format.write_array_header_1_0(head, about)
     return head.getvalue()
@@ -109,19 +110,21 @@ def _header(shape: tuple[int, ...], dtype: np.dtype, fortran_order: bool) -> byt
 def to_numpy(array: Array) -> np.ndarray:
     """Return the numbers of a Flower array from any sender: what `array.numpy()` does, for arrays of numbers.
 
-    The header of NumPy's file format is not parsed but compared with the one of the array's declared shape and type,
-    whose size must be that of the data: so nothing is allocated that was not received. Raises TypeError for another
-    format, ValueError where header, declaration and data do not agree.
+    The header of NumPy's file format is not parsed but compared with that of the declared shape and dtype, whose size
+    must be that of the data: a sender cannot make the receiver allocate more than it sent. Raises TypeError for another
+    format, ValueError where header, declaration and data disagree.
     """
     if array.stype != SType.NUMPY:
         raise TypeError(f"'{array.stype}' is no format of arrays")
-    shape, dtype, data = tuple(array.shape), NUMBERS.get(array.dtype), array.data
+    shape = tuple(array.shape)
+    dtype = NUMBERS.get(array.dtype)
+    data = array.data
     if dtype is None:
         raise ValueError(f"{shorten(array.dtype)} is no type of numbers")
     start = 10 + int.from_bytes(data[8:10], "little")  # of the numbers
     for fortran_order in (False, True):
         known = _header(shape, dtype, fortran_order)
-        if data[:8] == known[:8] and data[10:start].rstrip() == known[10:].rstrip():  # padded by any number of spaces
+        if data[:8] == known[:8] and data[10:start].rstrip() == known[10:].rstrip():  # any padding by spaces
             break
     else:
         raise ValueError(f"its header is not that of {dtype} {shape}")
@@ -133,8 +136,8 @@ def to_numpy(array: Array) -> np.ndarray:
 def read_arrays(content: RecordDict, key: str) -> dict[str, np.ndarray]:
     """Return the weights in a record of a message or a state.
 
-    Raises KeyError where it is missing, TypeError where it has none, and as `to_numpy`. `content.array_records` would
-    leave a reference cycle, by which the arrays stay in memory until they are collected.
+    Raises KeyError where the record is missing, TypeError where it holds no arrays, and as `to_numpy`. The property
+    `content.array_records` would leave a reference cycle, which keeps the arrays in memory until garbage collection.
     """
     record = content[key]
     if not isinstance(record, ArrayRecord):
@@ -157,14 +160,14 @@ def update_content(update: Update, extra: Weights) -> RecordDict:
 
 
 def to_metrics(update: Update) -> MetricRecord:
-    """Return samples and loss of an update as metrics; raises `NoCount` for samples that no message can hold."""
+    """Return samples and loss of an update as metrics; raises `NoCount` for a number that does not fit in a message."""
     return MetricRecord({SAMPLES: _count(update.samples), LOSS: float(update.loss)})
 
 
 def reply_norm(message: Message, norm: float, samples: int) -> Message:
     """Return the reply to a request for an update's norm: the norm and the number of samples, as metrics.
 
-    Before training, where the number alone is asked for, the norm is 0. Raises as `to_metrics`.
+    Before training, where only the number is asked for, the norm is 0. Raises as `to_metrics`.
     """
     metrics = MetricRecord({NORM: float(norm), SAMPLES: _count(samples)})
     return Message(RecordDict({METRICS: metrics}), reply_to=message)
@@ -182,25 +185,26 @@ def _count(samples: float) -> int:
 
 
 def refuse_request(message: Message, reason: str) -> Message:
-    """Return the answer of a client that cannot do what is asked, with the reason."""
+    """Return a client's error reply, with the reason."""
     return Message(Error(CLIENT_APP_RAISED, reason), reply_to=message)
 
 
 def is_changed(rules: Rules) -> bool:
-    """Return whether the arrays of a message are changes of weights; otherwise they are weights."""
+    """Return whether messages carry changes of weights rather than weights."""
     return rules.upload.compression != "none" or is_local(rules)
 
 
 def encode_update(
     update: Update, start: Weights, rules: Rules, residual: Weights, seed: int, key: bytes | None = None
 ) -> tuple[LocalUpdate, Arrays]:
-    """Return an update as it is sent, and what the client keeps for the next round.
+    """Return an encoded update, and the residual that the client keeps for the next round.
 
-    `start` are the weights that the round began with, `residual` is what was kept in the last one, `seed` that of
-    rounding, and `seed` or `key` that of local noise, see `add_noise`. Under local privacy the number of samples, the
-    loss and all that is not learned stay with the client.
+    start: weights at the start of the round. residual: kept in the last round. seed: of stochastic rounding. seed or
+    key: of local noise, see `add_noise`. Under local privacy the number of samples, the loss and all arrays that are
+    not learned stay with the client.
     """
-    upload, weights = rules.upload, update.weights
+    upload = rules.upload
+    weights = update.weights
     names, learned = upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
         return LocalUpdate({name: weights[name] for name in names}, update.samples, update.loss), {}
@@ -213,7 +217,7 @@ def encode_update(
 
 
 def sent_forms(start: Weights, rules: Rules) -> Forms:
-    """Return shape and type of each array of the message that `encode_update` makes."""
+    """Return shape and dtype of every array that `encode_update` sends."""
     names, learned = rules.upload.exchanged(start), set(learned_names(start))
     whole = forms_of({name: start[name] for name in names})
     if not is_changed(rules):
@@ -223,9 +227,9 @@ def sent_forms(start: Weights, rules: Rules) -> Forms:
 
 
 def decode_update(sent: Weights, start: Weights, rules: Rules) -> Weights:
-    """Return the weights of a client after its local training, as far as its message tells; otherwise those of `start`.
+    """Return a client's weights after its local training; arrays that it did not send are those of `start`.
 
-    The arrays have the forms of `sent_forms`. Raises ValueError where they are not those of `encode_update`.
+    `sent` has the forms of `sent_forms`. Raises ValueError where it is no output of `encode_update`.
     """
     names, learned = rules.upload.exchanged(start), set(learned_names(start))
     if not is_changed(rules):
@@ -239,7 +243,7 @@ def decode_update(sent: Weights, start: Weights, rules: Rules) -> Weights:
 def flatten_change(
     update: Update, start: Weights, rules: Rules, seed: int, key: bytes | None = None
 ) -> NDArray[np.float64]:
-    """Return the change of all floating arrays that are sent, one after another (coordinates,).
+    """Return the change of all floating arrays that are sent, concatenated (coordinates,).
 
     Under local privacy these are the learned ones, clipped and with noise; `seed` and `key` are as in `encode_update`.
     """
@@ -248,12 +252,12 @@ def flatten_change(
 
 
 def count_coordinates(start: Weights, rules: Rules) -> int:
-    """Return the number of values of which `flatten_change` makes a vector."""
+    """Return the length of the vector of `flatten_change`."""
     return sum(start[name].size for name in _floating(start, rules))
 
 
 def unflatten(change: NDArray[np.float64], start: Weights, rules: Rules) -> Weights:
-    """Return the weights `start` with a change of their floating arrays added: the inverse of `flatten_change`."""
+    """Return `start` plus a change (coordinates,) of its floating arrays: the inverse of `flatten_change`."""
     names = _floating(start, rules)
     parts = np.split(change, np.cumsum([start[name].size for name in names])[:-1])
     return apply_change(start, {name: part.reshape(start[name].shape) for name, part in zip(names, parts, strict=True)})
@@ -268,7 +272,7 @@ def _floating(start: Weights, rules: Rules) -> list[str]:
 
 
 def _protect(change: Arrays, rules: Rules, seed: int, key: bytes | None) -> Arrays:
-    """Return a change of learned arrays clipped and with noise, where noise is the clients'; else as it is."""
+    """Return a change of learned arrays, clipped and with noise under local privacy."""
     privacy = rules.privacy
     if privacy is None or not is_local(rules):
         return change
@@ -277,7 +281,7 @@ def _protect(change: Arrays, rules: Rules, seed: int, key: bytes | None) -> Arra
 
 
 def is_local(rules: Rules) -> bool:
-    """Return whether each client adds noise to its own update; all that is not learned then stays with it."""
+    """Return whether clients add the noise; arrays that are not learned then stay with them."""
     return rules.privacy is not None and rules.privacy.local
 
 
@@ -300,7 +304,7 @@ class Lost:
 
 @dataclass(frozen=True)
 class TimedOut:
-    """A client that has not answered in time."""
+    """A client without an answer in time."""
 
     client: str
 
@@ -309,18 +313,21 @@ Event = Arrived | Lost | TimedOut
 
 
 def list_events(awaited: Iterable[str], replies: Iterable[Message], names: Mapping[int, str]) -> Iterator[Event]:
-    """Yield what becomes of the clients that are `awaited`, in that order: so results do not depend on who is faster.
+    """Yield the outcome for every awaited client in the given order, so that results do not depend on who is faster.
 
-    Replies that come in that order are yielded as they come, and not kept. `names` are the clients' names by node.
+    A reply whose turn it is is yielded at once and not kept. `names` are the clients' names by node.
     """
     nodes = {name: node for node, name in names.items()}
-    left, early = deque(nodes[name] for name in awaited), dict[int, Message]()
+    left = deque(nodes[name] for name in awaited)
+    early = dict[int, Message]()
+    # the final None stands for the end of replies: whoever is still awaited has timed out
     for message in chain(replies, [None]):
         if message is not None:
             early[message.metadata.src_node_id] = message
         while left and (message is None or left[0] in early):
             node = left.popleft()
-            found, client = early.pop(node, None), names[node]
+            found = early.pop(node, None)
+            client = names[node]
             if found is None:
                 yield TimedOut(client)
             elif found.has_error():

@@ -1,1 +1,1 @@
-"""A deployed fleet: its authority and registry, the proxy before Flower's SuperLink, vehicles, releases, its status."""
+"""A deployed fleet: authority, registry, the proxy in front of Flower's SuperLink, vehicles, releases, and status."""

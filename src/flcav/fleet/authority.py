@@ -1,7 +1,7 @@
-"""The authority of a fleet: it certifies the keys of vehicles and servers (X.509), in a folder on the operator's host.
+"""The certificate authority of a fleet, which certifies the keys of vehicles and servers (X.509).
 
-A folder has `ca.crt` and `ca.key`, the registry `registry.sqlite`, and the keys of the servers and of the publisher who
-signs apps. Only the authority's public certificate leaves it.
+Its folder on the operator's host has `ca.crt` and `ca.key`, the registry `registry.sqlite`, and the keys of the servers
+and of the publisher that signs apps. Only the authority's certificate leaves it.
 """
 
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ DAY = timedelta(days=1)
 
 @dataclass(frozen=True)
 class Authority:
-    """An authority's key and certificate, and its registry of vehicles."""
+    """A certificate authority: key, certificate, and registry of vehicles."""
 
     folder: Path
     key: ec.EllipticCurvePrivateKey
@@ -45,24 +45,25 @@ class Authority:
     registry: VehicleRegistry
 
     def register(self, request: Path, days: float = VEHICLE_DAYS) -> bytes:
-        """Return the certificate (PEM) of a new vehicle, by its signing request; it is in the registry.
+        """Register a new vehicle by its signing request, and return its certificate (PEM).
 
-        Raises `InputError` where the identifier or the key is registered already, or the request is none.
+        days: validity. Raises `InputError` where the identifier or the key is registered already, or the request is
+        invalid.
         """
-        asked = read_request(request)
-        made = self._certify(asked, timedelta(days=days))
-        self.registry.register(_describe(made, asked))
+        signing_request = read_request(request)
+        made = self._certify(signing_request, timedelta(days=days))
+        self.registry.register(_describe(made, signing_request))
         return made.public_bytes(serialization.Encoding.PEM)
 
     def rotate(self, request: Path, days: float = VEHICLE_DAYS) -> bytes:
-        """Return the certificate (PEM) of a registered vehicle's new key; the one it had is refused from now on."""
-        asked = read_request(request)
-        made = self._certify(asked, timedelta(days=days))
-        self.registry.rotate(_describe(made, asked))
+        """Return the certificate (PEM) of a registered vehicle's new key, for `days`; the old one is void at once."""
+        signing_request = read_request(request)
+        made = self._certify(signing_request, timedelta(days=days))
+        self.registry.rotate(_describe(made, signing_request))
         return made.public_bytes(serialization.Encoding.PEM)
 
     def certify_server(self, hosts: tuple[str, ...]) -> None:
-        """Make key and certificate of the servers, reached by these names and addresses, in the authority's folder."""
+        """Write key and certificate of the servers with the names and addresses `hosts` to the authority's folder."""
         key = make_key()
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "server")])
         valid = self.certificate.not_valid_after_utc - datetime.now(UTC)
@@ -72,9 +73,9 @@ class Authority:
         signed = made.sign(self.key, hashes.SHA384())
         write_bytes(self.folder / SERVER, signed.public_bytes(serialization.Encoding.PEM))
 
-    def _certify(self, asked: x509.CertificateSigningRequest, valid: timedelta) -> x509.Certificate:
-        vehicle = requested_name(asked)
-        key = asked.public_key()
+    def _certify(self, request: x509.CertificateSigningRequest, valid: timedelta) -> x509.Certificate:
+        vehicle = requested_name(request)
+        key = request.public_key()
         assert isinstance(key, ec.EllipticCurvePublicKey)
         name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, vehicle)])
         made = certificate_of(key, name, self.certificate.subject, valid, (), self.key.public_key())
@@ -86,20 +87,23 @@ class Authority:
         return made.sign(self.key, hashes.SHA384())
 
 
-def _describe(made: x509.Certificate, asked: x509.CertificateSigningRequest) -> RegisteredVehicle:
-    spki = asked.public_key().public_bytes(serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo)
+def _describe(made: x509.Certificate, request: x509.CertificateSigningRequest) -> RegisteredVehicle:
+    spki = request.public_key().public_bytes(
+        serialization.Encoding.DER, serialization.PublicFormat.SubjectPublicKeyInfo
+    )
     begin, end = int(made.not_valid_before_utc.timestamp()), int(made.not_valid_after_utc.timestamp())
-    return RegisteredVehicle(requested_name(asked), made.fingerprint(hashes.SHA256()).hex(), spki, begin, end)
+    return RegisteredVehicle(requested_name(request), made.fingerprint(hashes.SHA256()).hex(), spki, begin, end)
 
 
 def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
-    """Make an authority in `folder`, whose servers are reached by `hosts` beside the loopback; return it.
+    """Create and return an authority in `folder`, whose servers are reached by `hosts` and the loopback.
 
     Raises `InputError` where the folder has one already.
     """
     if (folder / AUTHORITY).exists() or (folder / REGISTRY).exists():
         raise InputError(f"{folder}: has an authority already")
-    key, name = make_key(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "flcav fleet authority")])
+    key = make_key()
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "flcav fleet authority")])
     made = certificate_of(key.public_key(), name, name, AUTHORITY_YEARS * 365 * DAY)
     uses = dict.fromkeys(
         (
@@ -127,7 +131,7 @@ def found_authority(folder: Path, hosts: tuple[str, ...] = ()) -> Authority:
 
 
 def open_authority(folder: Path) -> Authority:
-    """Return the authority in `folder`; raises `InputError` where there is none, or its parts are of several."""
+    """Return the authority in `folder`; raises `InputError` if there is none, or its files do not belong together."""
     certificate = load_certificate(folder)
     key = load_key(folder / AUTHORITY_KEY)
     if key.public_key() != certificate.public_key():
@@ -143,15 +147,15 @@ def open_authority(folder: Path) -> Authority:
 
 
 def open_registry(folder: Path, busy_s: float = BUSY_S) -> VehicleRegistry:
-    """Return the registry of the authority in `folder`; raises `InputError` where it is another one's.
+    """Return the registry of the authority in `folder`; raises `InputError` if it is another authority's.
 
-    busy_s: time that its calls wait for another process.
+    busy_s: timeout of its calls where another process has locked it [s].
     """
     return VehicleRegistry.open(folder / REGISTRY, load_certificate(folder).fingerprint(hashes.SHA256()).hex(), busy_s)
 
 
 def load_certificate(folder: Path) -> x509.Certificate:
-    """Return the certificate of the authority in `folder`; raises `InputError` where there is none."""
+    """Return the certificate of the authority in `folder`; raises `InputError` if there is none."""
     if not (folder / AUTHORITY).exists():
         raise InputError(f"{folder}: has no authority; make one with flcav fleet init {folder}")
     try:

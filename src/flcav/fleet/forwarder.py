@@ -1,7 +1,7 @@
 """A vehicle's forwarder: a local proxy that adds the client certificate, which Flower's SuperNode does not support.
 
-It listens on the vehicle's loopback alone, and passes calls on with the vehicle's certificate. FL requests go to the
-proxy directly.
+It only listens on the vehicle's loopback, and passes calls on with the vehicle's certificate. FL requests are sent to
+the proxy directly.
 """
 
 import ssl
@@ -17,7 +17,7 @@ from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
 from flcav.fleet.mutual_tls import serve_https
 from flcav.interface.wording import make_printable
 
-LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which lets a vehicle have twice as many
+LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which allows a vehicle twice as many
 
 
 class Forwarder:
@@ -35,10 +35,10 @@ class Forwarder:
         call = scope["path"].removeprefix(relay.FLEET)
         try:
             if scope["method"] != "POST" or scope["path"] != relay.FLEET + call or call not in relay.CALLS:
-                raise relay.CallRefused(403, "no call of a node")
+                raise relay.RequestRefused(403, "no call of a node")
             headers = relay.choose_headers(relay.check_headers(scope["headers"]), (relay.NODE_KEY, *relay.SENT))
             body = await relay.read_body(scope, receive, relay.largest_body(call))
-        except relay.CallRefused as refused:
+        except relay.RequestRefused as refused:
             await relay.answer(send, refused.status, refused.why)
             return
         await relay.relay(self._client, relay.FLEET + call, headers, body, send)
@@ -66,7 +66,7 @@ def send_request(folder: Path, server: str, request: FLRequest) -> None:
     Raises `InputError` where it is refused, `OSError` where the proxy cannot be reached.
     """
     try:
-        told = httpx.post(
+        response = httpx.post(
             f"https://{server}{PATH}",
             content=request.as_bytes(),
             verify=vehicle_tls(folder),
@@ -75,5 +75,5 @@ def send_request(folder: Path, server: str, request: FLRequest) -> None:
         )
     except httpx.HTTPError as error:
         raise OSError(f"{server}: the fleet cannot be reached: {error}") from None
-    if told.status_code != httpx.codes.OK:
-        raise InputError(f"{server}: the request is refused: {make_printable(told.text)}")
+    if response.status_code != httpx.codes.OK:
+        raise InputError(f"{server}: the request is refused: {make_printable(response.text)}")

@@ -1,7 +1,7 @@
-"""Keys and signing requests of a fleet's parties. A private key is made where it is used, and never leaves there.
+"""Keys and signing requests of a fleet's parties. A private key is made where it is used, and never leaves that place.
 
-Vehicles use one elliptic-curve key (NIST P-384) for TLS and for Flower's node authentication, so that the node that a
-message is from and the certificate that it came with are the same vehicle's.
+Vehicles use one elliptic-curve key (NIST P-384) for TLS and for Flower's node authentication, so that the sending node
+of a message and the certificate of its connection belong to the same vehicle.
 """
 
 import os
@@ -20,14 +20,14 @@ from flcav.interface.wording import make_printable
 from flcav.storage.files import write_bytes
 
 KEY, FLOWER_KEY, REQUEST, CERTIFICATE, AUTHORITY = "key.pem", "flower.key", "vehicle.csr", "vehicle.crt", "ca.crt"
-NEXT = "next"  # folder of the key and the request of a rotation, until its certificate is there
-LOOPBACK_KEY, LOOPBACK = "loopback.key", "loopback.crt"  # of a vehicle's forwarder, for its own SuperNode alone
+NEXT = "next"  # folder with key and request of a rotation, until its certificate is installed
+LOOPBACK_KEY, LOOPBACK = "loopback.key", "loopback.crt"  # of a vehicle's forwarder, for its SuperNode
 IDENTIFIER = re.compile(r"[a-z0-9][a-z0-9._-]{0,61}[a-z0-9]|[a-z0-9]")
 LARGEST_REQUEST = 1 << 16  # bytes
 
 
 def check_identifier(name: str) -> str:
-    """Return a vehicle's identifier; raises `InputError` for one that is none, such as a path."""
+    """Return a valid identifier of a vehicle; raises `InputError` for any other text, such as a path."""
     if not IDENTIFIER.fullmatch(name) or ".." in name:
         raise InputError(
             f"vehicle '{make_printable(name, 80)}': an identifier has 1 to 63 of a-z 0-9 . _ - and no other characters"
@@ -36,7 +36,8 @@ def check_identifier(name: str) -> str:
 
 
 def write_private(path: Path, data: bytes) -> None:
-    """Write a secret to `path`, atomically, readable by its owner alone."""
+    """Write a secret to `path`, atomically, and readable only by its owner."""
+    # the file is created with its final mode: no moment at which others could read it
     before = os.umask(0o077)
     try:
         write_bytes(path, data)
@@ -50,13 +51,13 @@ def make_key() -> ec.EllipticCurvePrivateKey:
 
 
 def private_pem(key: ec.EllipticCurvePrivateKey) -> bytes:
-    """Return a private key as PEM (PKCS #8), as TLS libraries read it."""
+    """Return a private key as PEM (PKCS #8), the format of TLS libraries."""
     pem, pkcs8 = serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8
     return key.private_bytes(pem, pkcs8, serialization.NoEncryption())
 
 
 def load_key(path: Path) -> ec.EllipticCurvePrivateKey:
-    """Return the private key (PEM) at `path`; raises `InputError` where there is none."""
+    """Return the private elliptic-curve key (PEM) at `path`; raises `InputError` if it is none."""
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
     except (ValueError, TypeError) as error:
@@ -72,16 +73,15 @@ def public_der(key: ec.EllipticCurvePublicKey) -> bytes:
 
 
 def public_pem(der: bytes) -> bytes:
-    """Return a public key, given as DER, as PEM, as Flower knows its nodes by it."""
+    """Return a public key, given as DER, as PEM, which identifies a node in Flower."""
     pem, spki = serialization.Encoding.PEM, serialization.PublicFormat.SubjectPublicKeyInfo
     return serialization.load_der_public_key(der).public_bytes(pem, spki)
 
 
 def request_certificate(folder: Path, vehicle: str) -> Path:
-    """Make a vehicle's key in `folder`, and return the path of its signing request (PKCS #10), which goes up.
+    """Make a vehicle's key in `folder`, and return the path of its signing request (PKCS #10) to the authority.
 
-    Where the vehicle has a certificate already, the new key and its request lie in `folder`/next until
-    `take_certificate`.
+    If the vehicle has a certificate already, the new key and its request are in `folder`/next until `take_certificate`.
     """
     check_identifier(vehicle)
     at = folder / NEXT if (folder / CERTIFICATE).exists() else folder
@@ -96,21 +96,23 @@ def request_certificate(folder: Path, vehicle: str) -> Path:
 
 
 def check_certificate(folder: Path) -> None:
-    """Check that the vehicle in `folder` has a certificate of its key that is in force, else raise `InputError`."""
+    """Raise `InputError` unless the vehicle in `folder` has an unexpired certificate of its key."""
     try:
-        own = x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
+        certificate = x509.load_pem_x509_certificate((folder / CERTIFICATE).read_bytes())
     except ValueError:
         raise InputError(f"{folder / CERTIFICATE}: is no certificate (PEM)") from None
     except FileNotFoundError:
         raise InputError(f"{folder}: has no certificate yet; flcav fleet install takes it") from None
-    if own.public_key() != load_key(folder / KEY).public_key():
+    if certificate.public_key() != load_key(folder / KEY).public_key():
         raise InputError(f"{folder / CERTIFICATE}: is for another key than {folder / KEY}")
-    if own.not_valid_after_utc < datetime.now(UTC):
-        raise InputError(f"{folder / CERTIFICATE}: is expired since {own.not_valid_after_utc:%Y-%m-%dT%H:%M:%SZ}")
+    if certificate.not_valid_after_utc < datetime.now(UTC):
+        raise InputError(
+            f"{folder / CERTIFICATE}: is expired since {certificate.not_valid_after_utc:%Y-%m-%dT%H:%M:%SZ}"
+        )
 
 
 def take_certificate(folder: Path, certificate: bytes, authority: bytes) -> None:
-    """Put the certificate of a vehicle's key, and the authority's, both PEM, into its `folder`; a new key is then used.
+    """Install the certificate of a vehicle's key and the authority's (PEM) in its `folder`, and put a new key in use.
 
     Raises `InputError` where the certificate is for another key.
     """
@@ -132,7 +134,7 @@ def take_certificate(folder: Path, certificate: bytes, authority: bytes) -> None
 
 
 def read_request(path: Path) -> x509.CertificateSigningRequest:
-    """Return a signing request; raises `InputError` where the file is none, or not signed by the key that it names."""
+    """Return a signing request; raises `InputError` if the file is none, or is not signed with its key."""
     with path.open("rb") as file:
         data = file.read(LARGEST_REQUEST + 1)
     try:
@@ -145,14 +147,15 @@ def read_request(path: Path) -> x509.CertificateSigningRequest:
 
 
 def requested_name(request: x509.CertificateSigningRequest) -> str:
-    """Return the identifier that a signing request is for; raises `InputError` where it has none."""
+    """Return the vehicle's identifier in a signing request; raises `InputError` if there is none."""
     names = request.subject.get_attributes_for_oid(NameOID.COMMON_NAME)
     return check_identifier(str(names[0].value) if len(names) == 1 else "")
 
 
 def make_loopback(folder: Path) -> None:
-    """Make the key and the self-signed certificate (127.0.0.1) of a vehicle's forwarder, which its SuperNode trusts."""
-    key, name = make_key(), x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "forwarder")])
+    """Make key and self-signed certificate (127.0.0.1) of a vehicle's forwarder, which its SuperNode trusts."""
+    key = make_key()
+    name = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, "forwarder")])
     made = certificate_of(key.public_key(), name, name, timedelta(days=3650), hosts=("127.0.0.1", "localhost"))
     write_private(folder / LOOPBACK_KEY, private_pem(key))
     write_bytes(folder / LOOPBACK, made.sign(key, hashes.SHA384()).public_bytes(serialization.Encoding.PEM))
@@ -166,9 +169,9 @@ def certificate_of(
     hosts: tuple[str, ...] = (),
     issuer_key: ec.EllipticCurvePublicKey | None = None,
 ) -> x509.CertificateBuilder:
-    """Return a certificate (X.509) of a key to be signed by its issuer's (None: the key itself), valid from now on.
+    """Return the builder of a certificate (X.509) of `key`, valid from now on.
 
-    Servers are named by `hosts`.
+    hosts: names and addresses of a server. issuer_key: that will sign it; None: `key` itself.
     """
     begin = datetime.now(UTC).replace(microsecond=0)
     made = x509.CertificateBuilder(issuer, subject, key, x509.random_serial_number(), begin, begin + valid)

@@ -1,10 +1,10 @@
-"""Mutual TLS: a uvicorn server that passes the client certificate of each request to its app, within limits.
+"""Mutual TLS: a uvicorn server that passes the client's certificate to its app, with limits on connections.
 
-`scope["state"]` of a request has the client's certificate (DER; None: it has none) and its connection, whose bytes are
-read where they cross: the kernel counts those of a TCP socket (TCP_INFO, Linux), TLS records included.
+`scope["state"]` of a request has the client's certificate (DER; None: it has none) and its connection. Bytes are those
+that the kernel counts on the TCP socket (TCP_INFO, Linux), TLS records included.
 
-A connection that has sent no whole request is closed after some seconds, and where there are too many, the oldest of
-the client with most gives way: so a crowd of idle connections keeps nobody else out.
+A connection without a complete request is closed after some seconds; where there are too many, the oldest connection of
+the client with most is closed, so that idle connections cannot lock other clients out.
 """
 
 import asyncio
@@ -27,27 +27,28 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 
 CERTIFICATE, CONNECTION = "certificate", "connection"  # keys of the state
 RECEIVED_AT, SENT_AT, INFO_BYTES = 128, 200, 216  # tcpi_bytes_received, tcpi_bytes_sent and _retrans in linux/tcp.h
-HANDSHAKES, OF_EACH, IN_ALL = 256, 16, 768  # connections: before a certificate is known; of one client; all with one
-FILES = 4096  # that a server may have open, where the system lets it: those, and as many to where it passes calls on
-BACKLOG = 128  # connections that the kernel keeps until they are accepted
-HANDSHAKE_S, HEADER_S, CLOSE_S = 10.0, 10.0, 2.0  # for TLS's handshake; for each request's header; for TLS's farewell
+HANDSHAKES, OF_EACH, IN_ALL = 256, 16, 768  # limits of connections: in handshake; per client; all after handshake
+FILES = 4096  # limit of open files, if the system allows it: these connections, and as many to the next server
+BACKLOG = 128  # connections that the kernel queues until they are accepted
+HANDSHAKE_S, HEADER_S, CLOSE_S = 10.0, 10.0, 2.0  # timeouts of TLS's handshake, a request's header, TLS's closing [s]
 LARGEST_HEADER = 8192  # bytes
-SWEPT = 256  # connections after which what is left of them is looked for: asyncio's TLS refers to itself
-BUFFER = 1 << 15  # bytes that each connection of asyncio's TLS has from its beginning, in the place of 256 KiB
+SWEPT = 256  # connections between garbage collections, which asyncio's TLS needs, as its objects form cycles
+BUFFER = 1 << 15  # initial buffer of a connection in asyncio's TLS [bytes], in place of 256 KiB
 
 Key = TypeVar("Key")
 
 
 class ClientConnection:
-    """A client's connection, and how many of its bytes were counted already."""
+    """A client's connection, with its bytes counted so far."""
 
     def __init__(self, transport: Any) -> None:
-        self._socket, self.abort = transport.get_extra_info("socket"), transport.abort
+        self._socket = transport.get_extra_info("socket")
+        self.abort = transport.abort
         self.is_closed = transport.is_closing
         self._counted = (0, 0)
 
     def count_bytes(self) -> tuple[int, int]:
-        """Return the bytes received and sent since the last call; zeros where the system does not report them."""
+        """Return the bytes received and sent since the last call; zeros if the system does not report them."""
         if not hasattr(socket, "TCP_INFO"):
             return 0, 0
         try:
@@ -60,14 +61,15 @@ class ClientConnection:
             struct.unpack_from("=Q", info, RECEIVED_AT),
             struct.unpack_from("=QQ", info, SENT_AT),
         )
+        # the kernel counts retransmitted bytes as sent, and an application did not send them
         before, self._counted = self._counted, (received, sent - again)
         return received - before[0], sent - again - before[1]
 
 
 def find_superfluous(owners: Mapping[Key, Hashable], of_each: int, most: int) -> Key | None:
-    """Return the connection that is to give way: the oldest of the client with most; None where there are not too many.
+    """Return the connection to close, the oldest of the client with most; None if there are not too many.
 
-    owners: of the connections, the oldest first. of_each: connections that one of them may have. most: of all.
+    owners: client by connection, oldest first. of_each: limit per client. most: limit of all.
     """
     counts = Counter(owners.values()).most_common(1)
     if not counts or (counts[0][1] <= of_each and len(owners) <= most):
@@ -76,15 +78,15 @@ def find_superfluous(owners: Mapping[Key, Hashable], of_each: int, most: int) ->
 
 
 class Door(socket.socket):
-    """Listening socket that closes a TCP connection whose handshake is under way where there are too many."""
+    """A listening socket that limits the TCP connections in TLS handshake."""
 
     def __init__(self, *about: Any) -> None:
         super().__init__(*about)
-        self._accepted: dict[int, tuple[socket.socket, str]] = {}  # by file descriptor: connections, their addresses
+        self._accepted: dict[int, tuple[socket.socket, str]] = {}  # connection and address, by file descriptor
         self._count = 0
 
     def accept(self) -> tuple[socket.socket, Any]:
-        """Accept a connection; the one that gives way is shut down, which ends its handshake."""
+        """Accept a connection; where there are too many, shut one down, which ends its handshake."""
         connection, address = super().accept()
         self._count += 1
         if self._count % SWEPT == 0:
@@ -98,12 +100,12 @@ class Door(socket.socket):
         return connection, address
 
     def let_in(self, connection: Any) -> None:
-        """Note that the handshake of a connection is over."""
+        """Remove a connection whose handshake is complete."""
         self._accepted.pop(connection.fileno(), None)
 
 
 class CertifiedProtocol(H11Protocol):
-    """HTTP/1.1 of uvicorn, with the client's certificate and connection in the state of each request."""
+    """uvicorn's HTTP/1.1 protocol, with the client's certificate and connection in the state of requests."""
 
     def __init__(
         self,
@@ -113,13 +115,13 @@ class CertifiedProtocol(H11Protocol):
         find_owner: Callable[[bytes | None], Hashable],
         **more: Any,
     ) -> None:
-        """Belong to the connections `inside`, with their owners, of which `find_owner` finds one by its certificate."""
+        """Register in `inside`, owner by connection; `find_owner` returns the owner of a certificate (DER)."""
         super().__init__(*args, **more)
         self._door, self._inside, self._find_owner = door, inside, find_owner
         self._late: asyncio.TimerHandle | None = None
 
     def connection_made(self, transport: Any) -> None:  # type: ignore[override]
-        """Begin a connection, whose TLS handshake is over."""
+        """Begin a connection after its TLS handshake."""
         super().connection_made(transport)
         self._door.let_in(transport.get_extra_info("socket"))
         tls = transport.get_extra_info("ssl_object")
@@ -139,23 +141,23 @@ class CertifiedProtocol(H11Protocol):
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
-        """Take data in pieces: a header is held to its limit before more of it is looked at."""
+        """Process data in pieces, so that a header is checked against its limit before more of it is parsed."""
         for start in range(0, len(data), LARGEST_HEADER):
             if not self.transport.is_closing():
                 super().data_received(data[start : start + LARGEST_HEADER])
 
     def handle_events(self) -> None:
-        """Handle what has come."""
+        """Handle the received events."""
         super().handle_events()
         self._watch()
 
     def on_response_complete(self) -> None:
-        """Wait for another request."""
+        """Wait for the next request."""
         super().on_response_complete()
         self._watch()
 
     def _watch(self) -> None:
-        """Have the connection closed unless a whole header comes in time; not while a request is being answered."""
+        """Close the connection unless a complete header arrives in time; not while a request is being answered."""
         answering = self.cycle is not None and not self.cycle.response_complete
         if answering and self._late is not None:
             self._late.cancel()
@@ -165,7 +167,7 @@ class CertifiedProtocol(H11Protocol):
 
 
 class PatientLoop(asyncio.SelectorEventLoop):
-    """Event loop whose servers do not wait for clients that leave TLS's handshake, or its end, open."""
+    """An event loop whose servers time out clients that do not complete TLS's handshake or closing."""
 
     async def create_server(self, *args: Any, **more: Any) -> asyncio.Server:  # type: ignore[override]
         """Create a server with these limits."""
@@ -174,14 +176,14 @@ class PatientLoop(asyncio.SelectorEventLoop):
 
 
 class DoorServer(uvicorn.Server):
-    """Server that listens at a door."""
+    """A uvicorn server that listens on a `Door`."""
 
     def __init__(self, config: uvicorn.Config, door: Door) -> None:
         super().__init__(config)
         self._door = door
 
     def run(self, sockets: list[socket.socket] | None = None) -> None:
-        """Serve until the process gets a signal to end."""
+        """Serve until the process receives a signal to end."""
         super().run([self._door, *(sockets or [])])
 
 
@@ -194,9 +196,10 @@ def serve_https(
     authority: Path | None = None,
     find_owner: Callable[[bytes | None], Hashable] = lambda _: "",
 ) -> uvicorn.Server:
-    """Return a server of `app`, to be run; `authority`: of the certificates without which no client is let in.
+    """Return a server of `app`, to be run.
 
-    find_owner: returns whose certificate (DER) one is; an owner may have `OF_EACH` connections.
+    authority: its certificates are required of clients; None: none are. find_owner: returns the owner of a certificate
+    (DER); an owner may have `OF_EACH` connections.
     """
     sslproto.SSLProtocol.max_size = BUFFER
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -219,7 +222,7 @@ def serve_https(
         ssl_keyfile=key,
         ssl_ca_certs=None if authority is None else str(authority),
         ssl_cert_reqs=ssl.CERT_NONE if authority is None else ssl.CERT_REQUIRED,
-        timeout_keep_alive=int(HEADER_S),  # longer than httpx keeps a connection, which so ends it first
+        timeout_keep_alive=int(HEADER_S),  # longer than httpx's, so that the client closes first
         timeout_graceful_shutdown=2,
     )
     config.load()

@@ -1,4 +1,4 @@
-"""The live page of a fleet's status, on the loopback interface of the operator's host."""
+"""The live status page of a fleet, on the loopback interface of the operator's host."""
 
 import asyncio
 import json
@@ -72,26 +72,28 @@ follow();
 
 
 def make_page(folder: Path) -> Starlette:
-    """Return the app of the page; it answers requests for this host alone."""
+    """Return the app of the page, which only answers requests to this host's names."""
 
     async def page(_: Request) -> HTMLResponse:
         return HTMLResponse(PAGE, headers={"content-security-policy": POLICY})
 
     async def status(_: Request) -> Response:
         found = await asyncio.to_thread(read_fleet_status, folder)
-        told = "" if found.federation is None else found.federation.describe()
+        progress = "" if found.federation is None else found.federation.describe()
         asked = [each.describe() for each in found.requests]
-        networks = {own.name: own.release.describe() for own in found.vehicles if own.release is not None}
-        values = {**found.as_json(), "told": told, "asked": asked, "networks": networks}
+        networks = {
+            vehicle.name: vehicle.release.describe() for vehicle in found.vehicles if vehicle.release is not None
+        }
+        values = {**found.as_json(), "told": progress, "asked": asked, "networks": networks}
         return Response(json.dumps(values), media_type="application/json")
 
     routes = [Route("/", page), Route("/status.json", status)]
-    local = Middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost"])  # no page elsewhere reads it
+    local = Middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost"])  # against DNS rebinding
     return Starlette(routes=routes, middleware=[local])
 
 
 def serve_page(folder: Path, port: int, report: Callable[[str], None]) -> None:
-    """Serve the page on the loopback until interrupted; raises `InputError` where there is no fleet, or no port."""
+    """Serve the page on the loopback until interrupted; raises `InputError` if there is no fleet or no free port."""
     read_fleet_status(folder)
     port = check_port("127.0.0.1", port)
     report(f"http://127.0.0.1:{port}/ follows {folder}")

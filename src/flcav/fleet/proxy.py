@@ -1,9 +1,9 @@
-"""The fleet's reverse proxy before Flower's SuperLink: it only admits registered certificates and calls of nodes.
+"""The fleet's reverse proxy in front of Flower's SuperLink: it only admits registered certificates and calls of nodes.
 
-A call passes where its path is one of a node's under `/v1/fleet/`, its TLS connection has the certificate of a vehicle
-that is in the registry, neither revoked nor replaced nor expired at that moment, and Flower's node key is that
-vehicle's. FL requests and releases, which need the certificate alone, are for the proxy itself. The control side of the
-SuperLink listens on the operator's host alone.
+A call passes if its path is a node's call under `/v1/fleet/`, its TLS connection has the certificate of a registered
+vehicle, at that moment neither revoked nor replaced nor expired, and Flower's node key is that vehicle's. FL requests
+and releases only need the certificate, and are answered by the proxy itself. The control interface of the SuperLink
+only listens on the operator's host.
 """
 
 import asyncio
@@ -36,26 +36,27 @@ from flcav.fleet.releases import LARGEST_REPORT, RELEASES, REPORT, KeptReport, f
 from flcav.fleet.traffic import ProxyTraffic, read_traffic
 from flcav.interface.wording import make_printable
 
-OLDEST_S = 300.0  # of a signature that Flower accepts
-SAVE_S = 0.5  # between savings of what was counted
-BUSY_S = 0.1  # that a call waits for a registry which another process holds
+OLDEST_S = 300.0  # largest age of a signature that Flower accepts [s]
+SAVE_S = 0.5  # interval of saving the traffic counts [s]
+BUSY_S = 0.1  # timeout of a call for a registry locked by another process [s]
 LIMITS = httpx.Limits(max_connections=IN_ALL, max_keepalive_connections=20)  # to the SuperLink
-AT_ONCE = 2  # objects of one vehicle that are taken at a time, as many as Flower sends
+AT_ONCE = 2  # simultaneous uploads of objects per vehicle, as many as Flower sends
 
 
 class FleetProxy:
-    """ASGI app in front of a SuperLink."""
+    """The proxy's ASGI app in front of a SuperLink."""
 
     def __init__(self, client: httpx.AsyncClient, folder: Path) -> None:
         self._client, self._folder = client, folder
         self._registry: VehicleRegistry | None = None
-        self._file: tuple[int, int] | None = None  # device and number of the registry's file
+        self._file: tuple[int, int] | None = None  # device and inode of the registry's file
         self._objects = defaultdict[str, asyncio.Semaphore](lambda: asyncio.Semaphore(AT_ONCE))
-        self._traffic, self._changed = read_traffic(folder), True
+        self._traffic = read_traffic(folder)
+        self._changed = True
         self._traffic.lose_all()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        """Pass a vehicle's call on, or refuse it: 401 for who calls, 403 for what is called."""
+        """Pass a vehicle's call on, or refuse it: 401 for an unauthenticated caller, 403 for a forbidden call."""
         if scope["type"] == "lifespan":
             saving = asyncio.create_task(self._save())
             while not await relay.keep_alive(receive, send):
@@ -76,13 +77,15 @@ class FleetProxy:
                 vehicle = self.find(certificate)
                 caller = vehicle.name
                 await self._answer(vehicle, scope, receive, soon)
-            except relay.CallRefused as refused:
+            except relay.RequestRefused as refused:
                 await self._refuse(soon, refused.status, caller, refused.why)
         except TimeoutError:  # the client does not read its answer
             connection.abort()
 
     async def _answer(self, vehicle: RegisteredVehicle, scope: Scope, receive: Receive, send: Send) -> None:
-        path, headers, came = scope["path"], relay.check_headers(scope["headers"]), time.time()
+        path = scope["path"]
+        headers = relay.check_headers(scope["headers"])
+        came = time.time()
         if path == REQUEST_PATH and scope["method"] == "POST":
             await self._take_request(vehicle.name, scope, receive, send)
             return
@@ -91,10 +94,11 @@ class FleetProxy:
             return
         call = path.removeprefix(relay.FLEET)
         if scope["method"] != "POST" or path != relay.FLEET + call or call not in relay.CALLS:
-            raise relay.CallRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
+            raise relay.RequestRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
         if node_key(headers.get(relay.NODE_KEY, b"")) != vehicle.public_key:
-            raise relay.CallRefused(401, "the node's key is not the certificate's")
-        passed, gone = [*relay.choose_headers(headers), relay.name_key(vehicle)], False
+            raise relay.RequestRefused(401, "the node's key is not the certificate's")
+        passed = [*relay.choose_headers(headers), relay.name_key(vehicle)]
+        gone = False
         connection: ClientConnection = scope["state"][CONNECTION]
 
         async def checked(event: Message) -> None:
@@ -102,10 +106,11 @@ class FleetProxy:
             gone |= connection.is_closed()
             await send(event)
 
+        # bodies of objects are held in memory while they are relayed, which bounds a vehicle's share of it
         slot = self._objects[vehicle.name] if call == "push-object" else contextlib.nullcontext()
         async with slot:
             body = await relay.read_body(scope, receive, relay.largest_body(call))
-            vehicle = self.find(scope["state"][CERTIFICATE])  # which may have been revoked meanwhile
+            vehicle = self.find(scope["state"][CERTIFICATE])  # its certificate may have been revoked meanwhile
             done = await relay.relay(self._client, path, passed, relay.check_body(call, body, vehicle), checked)
         if done.status == httpx.codes.UNAUTHORIZED:
             self._traffic.refuse(vehicle.name, describe_clock(headers.get(relay.SIGNED_AT, b""), came))
@@ -113,9 +118,9 @@ class FleetProxy:
         self._changed = True
 
     def find(self, certificate: bytes | None) -> RegisteredVehicle:
-        """Return the vehicle whose certificate (DER) is in force; raises `CallRefused` where there is none.
+        """Return the vehicle whose certificate (DER) is in force; raises `RequestRefused` where there is none.
 
-        The registry is opened anew where its file is another one, or it could not be read.
+        The registry is reopened where its file was replaced, or could not be read.
         """
         try:
             found = (self._folder / REGISTRY).stat()
@@ -126,9 +131,9 @@ class FleetProxy:
             vehicle = find_caller(self._registry, certificate)
         except (InputError, OSError, ValueError, TypeError):
             self._close()
-            raise relay.CallRefused(503, "the fleet's registry cannot be read") from None
+            raise relay.RequestRefused(503, "the fleet's registry cannot be read") from None
         if isinstance(vehicle, str):
-            raise relay.CallRefused(401, vehicle)
+            raise relay.RequestRefused(401, vehicle)
         return vehicle
 
     def _close(self) -> None:
@@ -137,28 +142,28 @@ class FleetProxy:
         self._registry = None
 
     def find_owner(self, certificate: bytes | None) -> str:
-        """Return the vehicle that a connection counts for; all whose certificate is not in force are one."""
+        """Return the vehicle that a connection counts for; all without a certificate in force count as one."""
         try:
             return self.find(certificate).name
-        except relay.CallRefused:
+        except relay.RequestRefused:
             return ""
 
     async def _take_request(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Keep a vehicle's FL request, or refuse it: 400 for another message, 409 for one that came before."""
+        """Store a vehicle's FL request, or refuse it: 400 for an invalid message, 409 for a replay."""
         content = await relay.read_body(scope, receive, LARGEST)
         try:
             request = parse_request(content)
         except ValueError as error:
-            raise relay.CallRefused(400, str(error)) from None
+            raise relay.RequestRefused(400, str(error)) from None
         now = time.time()
-        if (odd := check_age(request, now)) is not None:
-            raise relay.CallRefused(400, odd)
+        if (wrong_age := check_age(request, now)) is not None:
+            raise relay.RequestRefused(400, wrong_age)
         try:
             why = await asyncio.to_thread(self._keep_request, vehicle, request.nonce, content, now)
         except (InputError, OSError) as error:
-            raise relay.CallRefused(503, f"the registry cannot be written: {error}") from None
+            raise relay.RequestRefused(503, f"the registry cannot be written: {error}") from None
         if why is not None:
-            raise relay.CallRefused(409, why)
+            raise relay.RequestRefused(409, why)
         await relay.answer(send, 200, "the request is taken")
 
     def _keep_request(self, *about: Any) -> str | None:
@@ -169,7 +174,7 @@ class FleetProxy:
             registry.close()
 
     async def _answer_release(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Send a file of the repositories on offer, keep a vehicle's report, or refuse its call."""
+        """Send a file of the offered repositories, store a vehicle's report, or refuse its call."""
         connection: ClientConnection = scope["state"][CONNECTION]
 
         def count() -> int:
@@ -182,9 +187,9 @@ class FleetProxy:
             count()
 
     async def _refuse(self, send: Send, status: int, who: str | bytes | None, why: str) -> None:
-        told = who if isinstance(who, str) else "nobody" if who is None else hashlib.sha256(who).hexdigest()[:16]
+        caller = who if isinstance(who, str) else "nobody" if who is None else hashlib.sha256(who).hexdigest()[:16]
         plain = make_printable(why)
-        self._traffic.refuse(told, plain)
+        self._traffic.refuse(caller, plain)
         self._changed = True
         await relay.answer(send, status, plain)
 
@@ -196,14 +201,14 @@ class FleetProxy:
                 try:
                     now = ProxyTraffic(dict(self._traffic.vehicles), self._traffic.refused)
                     await asyncio.to_thread(now.save, self._folder)
-                except OSError:  # no room: what was counted is written later
+                except OSError:  # a full disk: the counts are written later
                     self._changed = True
 
 
 def find_caller(
     registry: VehicleRegistry, certificate: bytes | None, now: float | None = None
 ) -> RegisteredVehicle | str:
-    """Return the vehicle whose certificate (DER) is in force, or in words why there is none."""
+    """Return the vehicle whose certificate (DER) is in force at `now` [s since 1970], or a sentence why none is."""
     if certificate is None:
         return "a certificate is wanted"
     found = registry.find(hashlib.sha256(certificate).hexdigest())
@@ -217,7 +222,10 @@ def find_caller(
 
 
 def describe_clock(signed_at: bytes, now: float | None = None) -> str:
-    """Return in words why Flower refused a node's signature: most often its clock; `signed_at` is its header."""
+    """Return a sentence on why Flower refused a node's signature, usually its clock.
+
+    signed_at: header with the time of signing. now: [s since 1970].
+    """
     try:
         late = (time.time() if now is None else now) - datetime.fromisoformat(signed_at.decode("ascii")).timestamp()
     except (ValueError, OverflowError):
@@ -230,7 +238,7 @@ def describe_clock(signed_at: bytes, now: float | None = None) -> str:
 
 
 def node_key(header: bytes) -> bytes:
-    """Return the public key in Flower's header as DER; empty where it has none."""
+    """Return the public key in Flower's header as DER; empty if there is none."""
     try:
         key = load_pem_public_key(base64.b64decode(header, validate=True))
     except (ValueError, binascii.Error):
@@ -255,21 +263,21 @@ def run_proxy(folder: Path, host: str, port: int, superlink: str) -> None:
 async def answer_release(
     fleet: Path, vehicle: str, scope: Scope, receive: Receive, send: Send, count: Callable[[], int]
 ) -> None:
-    """Answer a registered vehicle's call; raises `CallRefused`.
+    """Answer a registered vehicle's call for releases; raises `RequestRefused`.
 
-    count: called for each piece that was sent; returns the bytes that this vehicle's releases took so far.
+    count: called after every piece that is sent; returns the bytes of this vehicle's releases so far.
     """
-    asked, method = scope["path"].removeprefix(RELEASES), scope["method"]
-    if method == "POST" and asked == REPORT:
+    name, method = scope["path"].removeprefix(RELEASES), scope["method"]
+    if method == "POST" and name == REPORT:
         await _take_report(fleet, vehicle, await relay.read_body(scope, receive, LARGEST_REPORT), count)
         await relay.answer(send, 200, "the report is taken")
         return
     if method != "GET":
-        raise relay.CallRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
+        raise relay.RequestRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
     try:
-        path = await asyncio.to_thread(find_offered, fleet, asked)
+        path = await asyncio.to_thread(find_offered, fleet, name)
     except ValueError as error:
-        raise relay.CallRefused(403, f"{scope['path'][:100]} {error}") from None
+        raise relay.RequestRefused(403, f"{scope['path'][:100]} {error}") from None
     if path is None:
         await relay.answer(send, 404, "no such file is on offer")
     else:
@@ -280,10 +288,10 @@ async def _take_report(fleet: Path, vehicle: str, content: bytes, count: Callabl
     try:
         report = parse_report(content)
     except ValueError as error:
-        raise relay.CallRefused(400, str(error)) from None
-    if report.shadow is not None:  # the certificate says whose it is
+        raise relay.RequestRefused(400, str(error)) from None
+    if report.shadow is not None:  # the certificate determines the vehicle
         report = replace(report, shadow=replace(report.shadow, vehicle=vehicle))
     try:
         await asyncio.to_thread(KeptReport(vehicle, time.time(), count(), report).save, fleet)
     except OSError as error:
-        raise relay.CallRefused(503, f"the report cannot be kept: {error}") from None
+        raise relay.RequestRefused(503, f"the report cannot be kept: {error}") from None

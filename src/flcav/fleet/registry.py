@@ -1,7 +1,7 @@
 """The registry of a fleet's vehicles (SQLite): their certificates, and an audit trail of every change.
 
-A row of `certificates` is one certificate. It is in force, or revoked, or replaced by that of a newer key; it expires
-by itself. Each change and its entry in `audit` are one transaction; entries are never changed.
+A row of `certificates` is one certificate: in force, revoked, or replaced by that of a newer key. Expiry needs no
+change of state. A change and its entry in `audit` are one transaction; entries are never changed.
 """
 
 import sqlite3
@@ -51,10 +51,10 @@ CREATE TABLE IF NOT EXISTS answered (
     nonce TEXT PRIMARY KEY,  -- of a request that a group was formed from
     time REAL NOT NULL  -- when, seconds since 1970
 );
-"""  # one who opens a registry of an earlier version makes the table
-KEPT_S = 86400.0  # that an FL request stays
-WINDOW_S, MOST = 300.0, 60  # requests of one vehicle within such a time
-BUSY_S = 10.0  # that another process may hold the registry
+"""  # these tables are added when a registry of an earlier version is opened
+KEPT_S = 86400.0  # retention of an FL request [s]
+WINDOW_S, MOST = 300.0, 60  # rate limit of one vehicle: window [s] and number of requests
+BUSY_S = 10.0  # timeout of a registry locked by another process [s]
 
 
 class RegistryLost(OSError):
@@ -62,8 +62,8 @@ class RegistryLost(OSError):
 
 
 @contextmanager
-def _told(path: Path) -> Iterator[None]:
-    """Raise what SQLite raises as `RegistryLost`, in a sentence."""
+def _registry_errors(path: Path) -> Iterator[None]:
+    """Turn SQLite's errors into `RegistryLost`, with a sentence."""
     try:
         yield
     except sqlite3.Error as error:
@@ -73,28 +73,28 @@ def _told(path: Path) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class RegisteredVehicle:
-    """A vehicle's certificate as it is registered."""
+    """A registered certificate of a vehicle."""
 
     name: str  # unique identifier
     fingerprint: str  # SHA-256 of the certificate, hexadecimal
     public_key: bytes  # SubjectPublicKeyInfo, DER
-    issued: int  # seconds since 1970, UTC
-    expires: int
+    issued: int  # [s since 1970, UTC]
+    expires: int  # [s since 1970, UTC]
     state: State = "registered"
     node: int | None = None  # id at the SuperLink
 
     def describe_state(self, now: float | None = None) -> str:
-        """Return the state in a word; a registered certificate may have expired."""
+        """Return the state in a word, "expired" for an expired certificate; now: [s since 1970]."""
         expired = (time.time() if now is None else now) >= self.expires
         return "expired" if expired and self.state == "registered" else self.state
 
 
 @dataclass(frozen=True)
 class AuditEntry:
-    """One change of the registry."""
+    """The audit entry of one change of the registry."""
 
     number: int
-    time: int  # seconds since 1970, UTC
+    time: int  # [s since 1970, UTC]
     action: str
     vehicle: str
     fingerprint: str
@@ -102,21 +102,21 @@ class AuditEntry:
 
 
 class VehicleRegistry:
-    """The registry in a file; every call is a transaction of its own, so several processes may use it.
+    """The registry in an SQLite file; every call is one transaction, so that several processes can use it.
 
     All calls raise `RegistryLost` where the file cannot be used.
     """
 
     def __init__(self, path: Path, busy_s: float = BUSY_S) -> None:
         self.path = path
-        with _told(path):
+        with _registry_errors(path):
             self._connection = sqlite3.connect(path, timeout=busy_s, isolation_level=None, check_same_thread=False)
 
     @classmethod
     def create(cls, path: Path, authority: str) -> "VehicleRegistry":
         """Return a new, empty registry of the authority with this fingerprint."""
         made = cls(path)
-        with _told(path):
+        with _registry_errors(path):
             made._connection.execute("PRAGMA journal_mode=WAL")
             made._connection.executescript(f"BEGIN; {SCHEMA} {REQUESTS} COMMIT;")
         with made._change() as cursor:
@@ -126,9 +126,9 @@ class VehicleRegistry:
 
     @classmethod
     def open(cls, path: Path, authority: str, busy_s: float = BUSY_S) -> "VehicleRegistry":
-        """Return the registry at `path`; raises `InputError` where it is none, or that of another authority.
+        """Return the registry at `path`; raises `InputError` where there is none, or another authority's.
 
-        busy_s: time that its calls wait for another process.
+        busy_s: timeout of its calls where another process has locked it [s].
         """
         if not path.exists():
             raise InputError(f"{path}: no such registry")
@@ -141,7 +141,7 @@ class VehicleRegistry:
         return found
 
     def _check(self, authority: str) -> None:
-        with _told(self.path):
+        with _registry_errors(self.path):
             try:
                 row = self._connection.execute("SELECT fingerprint FROM authority").fetchone()
             except sqlite3.DatabaseError as error:
@@ -151,7 +151,7 @@ class VehicleRegistry:
         if row != (authority,):
             raise InputError(f"{self.path}: is the registry of another authority than {self.path.parent / 'ca.crt'}")
         if len(self._read("SELECT name FROM sqlite_master WHERE name IN ('requests_by_time', 'answered')")) < 2:
-            with _told(self.path):
+            with _registry_errors(self.path):
                 self._connection.executescript(f"BEGIN; {REQUESTS} COMMIT;")
 
     def close(self) -> None:
@@ -159,7 +159,7 @@ class VehicleRegistry:
         self._connection.close()
 
     def register(self, vehicle: RegisteredVehicle) -> None:
-        """Enter a new vehicle; raises `InputError` where its identifier or its key is in the registry."""
+        """Register a new vehicle; raises `InputError` where its identifier or its key is known."""
         with self._change() as cursor:
             known = cursor.execute("SELECT 1 FROM certificates WHERE vehicle = ?", (vehicle.name,)).fetchone()
             if known:
@@ -169,7 +169,7 @@ class VehicleRegistry:
             self._insert(cursor, vehicle, "register")
 
     def rotate(self, vehicle: RegisteredVehicle) -> None:
-        """Enter the certificate of a vehicle's new key in the place of the one in force, or of a revoked one.
+        """Register the certificate of a vehicle's new key, in place of the one in force or a revoked one.
 
         Raises `InputError` where the vehicle is not registered, or the key is known.
         """
@@ -182,7 +182,7 @@ class VehicleRegistry:
             self._insert(cursor, vehicle, "rotate")
 
     def revoke(self, name: str, reason: str = "") -> None:
-        """Revoke a vehicle's certificate, which is refused from now on; raises `InputError` where none is in force."""
+        """Revoke a vehicle's certificate at once; raises `InputError` where none is in force."""
         with self._change() as cursor:
             row = cursor.execute(
                 "SELECT fingerprint FROM certificates WHERE vehicle = ? AND state = 'registered'", (name,)
@@ -193,7 +193,7 @@ class VehicleRegistry:
             self._note(cursor, "revoke", name, row[0], reason)
 
     def set_node(self, fingerprint: str, node: int | None) -> None:
-        """Note the id that a certificate's key has at the SuperLink; None: it is enrolled no more."""
+        """Set the node id of a certificate's key at the SuperLink; None: it is no longer enrolled."""
         with self._change() as cursor:
             cursor.execute(
                 "UPDATE certificates SET node = ? WHERE fingerprint = ?",
@@ -205,12 +205,12 @@ class VehicleRegistry:
             self._note(cursor, "enrol" if node is not None else "strike", name, fingerprint, "")
 
     def find(self, fingerprint: str) -> RegisteredVehicle | None:
-        """Return the vehicle whose certificate has this SHA-256 fingerprint; None: it is not registered."""
+        """Return the vehicle whose certificate has this SHA-256 fingerprint; None if it is not registered."""
         found = [*self._select("WHERE fingerprint = ?", (fingerprint,))]
         return found[0] if found else None
 
     def list_vehicles(self) -> list[RegisteredVehicle]:
-        """Return the latest certificate of each vehicle, by identifier."""
+        """Return the latest certificate of every vehicle, ordered by identifier."""
         latest = "WHERE rowid IN (SELECT max(rowid) FROM certificates GROUP BY vehicle) ORDER BY vehicle"
         return [*self._select(latest)]
 
@@ -219,7 +219,10 @@ class VehicleRegistry:
         return [*self._select("WHERE node IS NOT NULL")]
 
     def take_request(self, vehicle: str, nonce: str, content: bytes, now: float) -> str | None:
-        """Store a vehicle's FL request for a day; return in words why it is refused: a replay, or the rate limit."""
+        """Store a vehicle's FL request for a day; return a sentence if it is a replay or exceeds the rate limit.
+
+        now: [s since 1970].
+        """
         with self._change() as cursor:
             cursor.execute("DELETE FROM requests WHERE time < ?", (now - KEPT_S,))
             cursor.execute("DELETE FROM answered WHERE nonce NOT IN (SELECT nonce FROM requests)")
@@ -233,30 +236,30 @@ class VehicleRegistry:
         return None
 
     def list_requests(self, most: int) -> list[tuple[str, float, bytes]]:
-        """Return vehicle, time of arrival and content of the last requests, the latest last."""
-        asked = "SELECT vehicle, time, content FROM requests ORDER BY time DESC LIMIT ?"
-        return self._read(asked, (most,))[::-1]
+        """Return vehicle, time of arrival [s since 1970] and content of the last `most` requests, latest last."""
+        query = "SELECT vehicle, time, content FROM requests ORDER BY time DESC LIMIT ?"
+        return self._read(query, (most,))[::-1]
 
     def list_open_requests(self, since: float) -> list[tuple[str, bytes]]:
-        """Return vehicle and content of the requests that came after `since` and are not answered, the latest last."""
-        asked = "SELECT vehicle, content FROM requests WHERE time > ? AND nonce NOT IN (SELECT nonce FROM answered)"
-        return self._read(f"{asked} ORDER BY time", (since,))
+        """Return vehicle and content of the unanswered requests after `since` [s since 1970], latest last."""
+        query = "SELECT vehicle, content FROM requests WHERE time > ? AND nonce NOT IN (SELECT nonce FROM answered)"
+        return self._read(f"{query} ORDER BY time", (since,))
 
     def answer_requests(self, nonces: Iterable[str], now: float) -> None:
-        """Note that a group was formed from the requests with these nonces; one that is noted stays as it is."""
+        """Mark the requests with these nonces as answered by a group at the time `now` [s since 1970]."""
         with self._change() as cursor:
             cursor.executemany("INSERT OR IGNORE INTO answered VALUES (?, ?)", [(nonce, now) for nonce in nonces])
 
     def list_answered(self) -> set[str]:
-        """Return the nonces of the requests that a group was formed from."""
+        """Return the nonces of the answered requests."""
         return {nonce for (nonce,) in self._read("SELECT nonce FROM answered")}
 
     def count_changes(self) -> int:
-        """Return how many changes the registry has seen."""
+        """Return the number of changes of the registry so far."""
         return self._read("SELECT coalesce(max(number), 0) FROM audit")[0][0]
 
     def list_audit(self, vehicle: str | None = None) -> list[AuditEntry]:
-        """Return the audit trail, of one vehicle or of all, the oldest entry first."""
+        """Return the audit trail of one vehicle or of all, oldest entry first."""
         rows = self._read("SELECT * FROM audit WHERE ?1 IS NULL OR vehicle = ?1 ORDER BY number", (vehicle,))
         return [AuditEntry(*row) for row in rows]
 
@@ -266,29 +269,38 @@ class VehicleRegistry:
             yield RegisteredVehicle(*row, node=None if node is None else int(node))
 
     def _read(self, sql: str, values: tuple[object, ...] = ()) -> list[tuple[Any, ...]]:
-        with _told(self.path):
+        with _registry_errors(self.path):
             return self._connection.execute(sql, values).fetchall()
 
     @contextmanager
     def _change(self) -> Iterator[sqlite3.Cursor]:
-        with _told(self.path):
+        with _registry_errors(self.path):
             cursor = self._connection.cursor()
+            # takes the write lock at once: what is read within the change stays true until its end
             cursor.execute("BEGIN IMMEDIATE")
             try:
                 yield cursor
                 cursor.execute("COMMIT")
             except BaseException:
-                if self._connection.in_transaction:  # SQLite has ended it where the disk is full
+                if self._connection.in_transaction:  # on a full disk SQLite has rolled back already
                     cursor.execute("ROLLBACK")
                 raise
 
-    def _insert(self, cursor: sqlite3.Cursor, own: RegisteredVehicle, action: str) -> None:
-        row = (own.fingerprint, own.name, own.public_key, own.issued, own.expires, "registered", None)
+    def _insert(self, cursor: sqlite3.Cursor, vehicle: RegisteredVehicle, action: str) -> None:
+        row = (
+            vehicle.fingerprint,
+            vehicle.name,
+            vehicle.public_key,
+            vehicle.issued,
+            vehicle.expires,
+            "registered",
+            None,
+        )
         try:
             cursor.execute("INSERT INTO certificates VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         except sqlite3.IntegrityError:
-            raise InputError(f"vehicle '{own.name}': its key is in the registry already; make a new one") from None
-        self._note(cursor, action, own.name, own.fingerprint, "")
+            raise InputError(f"vehicle '{vehicle.name}': its key is in the registry already; make a new one") from None
+        self._note(cursor, action, vehicle.name, vehicle.fingerprint, "")
 
     @staticmethod
     def _note(cursor: sqlite3.Cursor, action: str, vehicle: str, fingerprint: str, reason: str) -> None:

@@ -1,8 +1,8 @@
-"""Relaying of calls of Flower's nodes to another server, and answers with a sentence or a file (ASGI).
+"""Relay of calls of Flower's nodes to another server, and responses with a sentence or a file (ASGI).
 
-Flower reads the first of repeated headers, and believes the node id in a body. So nothing that a vehicle sent is passed
-on as it came: of the headers those in `SENT`, each once, the public key being the registry's; of the body what was
-parsed, in which the node is the one of the certificate.
+Flower reads the first of repeated headers, and trusts the node id in a body. A vehicle's request is therefore never
+passed on verbatim: it is rebuilt from the headers in `SENT`, once each, with the public key of the registry, and from
+the parsed body, whose node must be that of the certificate.
 """
 
 import asyncio
@@ -43,26 +43,26 @@ CALLS: Mapping[str, type[Message]] = {
     "push-object": PushObjectRequest,
     "pull-object": PullObjectRequest,
     "confirm-message-received": ConfirmMessageReceivedRequest,
-}  # of a node; registering one is the authority's
+}  # calls of a node; only the authority may register nodes
 NODE_KEY = b"flwr-public-key"  # PEM in base 64
-SIGNED_AT = b"flwr-timestamp"  # when the node signed
+SIGNED_AT = b"flwr-timestamp"  # time of the node's signature
 SENT = (SIGNED_AT, b"flwr-signature", b"flwr-package-name", b"flwr-package-version", b"flwr-component-name")
 PROTOBUF = ((b"content-type", b"application/protobuf"), (b"accept", b"application/protobuf"))
-VALUE = re.compile(rb"[!-~](?:[ -~]{0,510}[!-~])?")  # of a header
+VALUE = re.compile(rb"[!-~](?:[ -~]{0,510}[!-~])?")  # value of a header
 MOST_HEADERS = 40
 LONGEST_NAME = 200  # characters of an identifier in a body
 LARGEST_OBJECT, LARGEST_CALL = 16_000_000, 4_000_000  # bytes of a body; Flower cuts arrays into pieces of 5 MiB
 
 HOP_BY_HOP = {b"connection", b"keep-alive", b"transfer-encoding", b"te", b"trailer", b"upgrade", b"host"}  # RFC 9110
-PIECE_BYTES = 1 << 18  # of a file
+PIECE_BYTES = 1 << 18  # piece of a file that is sent at a time
 TIMEOUT = httpx.Timeout(60.0, connect=5.0)
-QUIET_S, BODY_S = 20.0, 300.0  # that a body may pause, and take in all
+QUIET_S, BODY_S = 20.0, 300.0  # timeouts of a body: between two pieces, and in total [s]
 
 Headers = Sequence[tuple[bytes, bytes]]
 
 
-class CallRefused(Exception):
-    """A request is refused with an HTTP status and a sentence."""
+class RequestRefused(Exception):
+    """The refusal of a request, with an HTTP status and a sentence."""
 
     def __init__(self, status: int, why: str) -> None:
         super().__init__(why)
@@ -71,15 +71,15 @@ class CallRefused(Exception):
 
 @dataclass
 class Relayed:
-    """Sizes of the bodies of one exchange [bytes], and its answer."""
+    """The result of one relayed exchange: sizes of the bodies [bytes] and status."""
 
     up: int = 0
     down: int = 0
-    status: int = 0  # of the answer; 0: the other server gave none
+    status: int = 0  # of the response; 0: there was none
 
 
 async def answer(send: Send, status: int, text: str) -> None:
-    """Send a response of one sentence."""
+    """Send a response with one sentence as its body."""
     body = text.encode()
     headers = [(b"content-type", b"text/plain; charset=utf-8"), (b"content-length", str(len(body)).encode())]
     await send({"type": "http.response.start", "status": status, "headers": headers})
@@ -87,7 +87,7 @@ async def answer(send: Send, status: int, text: str) -> None:
 
 
 async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
-    """Send a file as a response, with its size at the beginning; `sent` is called after each piece."""
+    """Send a file as a response with a content length; `sent` is called after every piece."""
     with path.open("rb") as file:
         left = os.fstat(file.fileno()).st_size
         headers = [(b"content-type", b"application/octet-stream"), (b"content-length", str(left).encode())]
@@ -96,7 +96,7 @@ async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
         while more:
             piece = await asyncio.to_thread(file.read, min(left, PIECE_BYTES))
             left -= len(piece)
-            more = left > 0 and bool(piece)  # of a file that was cut, less than its size is sent, which breaks the call
+            more = left > 0 and bool(piece)  # a truncated file ends short of its length: the call breaks
             await send({"type": "http.response.body", "body": piece, "more_body": more})
             sent()
 
@@ -104,108 +104,111 @@ async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
 async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
     """Return the body of a request.
 
-    Raises `CallRefused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than `BODY_S`,
-    or breaks off.
+    Raises `RequestRefused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than
+    `BODY_S`, or is interrupted.
     """
-    told = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
-    if int(told) > most:
-        raise CallRefused(400, f"the message has more than {most} bytes")
-    body, more = bytearray(), True
+    declared = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
+    if int(declared) > most:
+        raise RequestRefused(400, f"the message has more than {most} bytes")
+    body = bytearray()
+    more = True
     try:
         async with asyncio.timeout(BODY_S):
             while more:
                 async with asyncio.timeout(QUIET_S):
                     event = await receive()
                 if event["type"] == "http.disconnect":
-                    raise CallRefused(400, "the client has left")
+                    raise RequestRefused(400, "the client has left")
                 body += event.get("body", b"")
                 if len(body) > most:
-                    raise CallRefused(400, f"the message has more than {most} bytes")
+                    raise RequestRefused(400, f"the message has more than {most} bytes")
                 more = event.get("more_body", False)
     except TimeoutError:
-        raise CallRefused(408, "the message does not come") from None
+        raise RequestRefused(408, "the message does not come") from None
     return bytes(body)
 
 
 def check_headers(headers: Headers) -> dict[bytes, bytes]:
-    """Return headers by their names in lower case; raises `CallRefused` for repeated ones, or an unknown length."""
+    """Return headers by lower-case name; raises `RequestRefused` for repeated headers, or a body of unknown length."""
     if len(headers) > MOST_HEADERS:
-        raise CallRefused(431, f"more than {MOST_HEADERS} headers")
+        raise RequestRefused(431, f"more than {MOST_HEADERS} headers")
     name, count = Counter(name.lower() for name, _ in headers).most_common(1)[0] if headers else (b"", 0)
     if count > 1:
-        raise CallRefused(400, f"the header {name.decode('latin-1')} comes {count} times")
+        raise RequestRefused(400, f"the header {name.decode('latin-1')} comes {count} times")
     found = {name.lower(): value for name, value in headers}
     if b"transfer-encoding" in found:
-        raise CallRefused(411, "the length of the body is wanted before it")
+        raise RequestRefused(411, "the length of the body is wanted before it")
     return found
 
 
 def largest_body(call: str) -> int:
-    """Return how many bytes the body of a call may have."""
+    """Return the size limit of a call's body [bytes]."""
     return LARGEST_OBJECT if call == "push-object" else LARGEST_CALL
 
 
 def choose_headers(headers: Mapping[bytes, bytes], names: Iterable[bytes] = SENT) -> list[tuple[bytes, bytes]]:
-    """Return the headers that are passed on, of these `names`; raises `CallRefused` for one that is no ASCII."""
+    """Return the headers to pass on, out of `names`; raises `RequestRefused` for a value that is not plain ASCII."""
     if headers.get(b"content-type", b"") != PROTOBUF[0][1]:
-        raise CallRefused(415, "a body of another type than application/protobuf")
+        raise RequestRefused(415, "a body of another type than application/protobuf")
     chosen = [(name, headers[name]) for name in names if name in headers]
     for name, value in chosen:
         if not VALUE.fullmatch(value):
-            raise CallRefused(400, f"the header {name.decode()} is no plain text, or too long")
+            raise RequestRefused(400, f"the header {name.decode()} is no plain text, or too long")
     return [*PROTOBUF, *chosen]
 
 
 def name_key(vehicle: RegisteredVehicle) -> tuple[bytes, bytes]:
-    """Return Flower's header of a vehicle's key, as the registry has it."""
+    """Return Flower's header with a vehicle's registered key."""
     return NODE_KEY, b64encode(public_pem(vehicle.public_key))
 
 
 def check_body(call: str, body: bytes, vehicle: RegisteredVehicle) -> bytes:
-    """Return the body of a vehicle's call written anew.
+    """Return the body of a vehicle's call, parsed and serialised again.
 
-    Raises `CallRefused` where it is of another call, or names another node or key than the vehicle's own.
+    Raises `RequestRefused` where it is not of that call, or names another vehicle's node or key.
     """
     try:
-        asked = CALLS[call].FromString(body)
+        message_ = CALLS[call].FromString(body)
     except DecodeError:
-        raise CallRefused(400, f"the body is none of {call}") from None
-    asked.DiscardUnknownFields()
-    _check_texts(asked)
-    if isinstance(asked, ActivateNodeRequest):
-        if asked.public_key != public_pem(vehicle.public_key):
-            raise CallRefused(401, "the key to activate is not the certificate's")
-        return asked.SerializeToString()
+        raise RequestRefused(400, f"the body is none of {call}") from None
+    # fields unknown here might be known to another version of Flower behind the proxy
+    message_.DiscardUnknownFields()
+    _check_texts(message_)
+    if isinstance(message_, ActivateNodeRequest):
+        if message_.public_key != public_pem(vehicle.public_key):
+            raise RequestRefused(401, "the key to activate is not the certificate's")
+        return message_.SerializeToString()
     if vehicle.node is None:
-        raise CallRefused(503, "the vehicle is being enrolled")
-    node = asked if isinstance(asked, DeactivateNodeRequest) else asked.node  # type: ignore[attr-defined]
+        raise RequestRefused(503, "the vehicle is being enrolled")
+    node = message_ if isinstance(message_, DeactivateNodeRequest) else message_.node  # type: ignore[attr-defined]
     named = {node.node_id}
-    if isinstance(asked, PushMessagesRequest):
-        for message in asked.messages_list:
+    if isinstance(message_, PushMessagesRequest):
+        for message in message_.messages_list:
             _check_texts(message.metadata)
             named.add(message.metadata.src_node_id)
     if named != {vehicle.node}:
-        raise CallRefused(401, "the node in the body is not the certificate's")
-    return asked.SerializeToString()
+        raise RequestRefused(401, "the node in the body is not the certificate's")
+    return message_.SerializeToString()
 
 
 def _check_texts(message: Message) -> None:
-    """Refuse identifiers that are none, which Flower would write to its log."""
+    """Refuse unprintable or long identifiers, which Flower would write to its log."""
     for field, value in message.ListFields():
         texts = [value] if isinstance(value, str) else value if field.type == field.TYPE_STRING else ()
         if not all(text.isprintable() and len(text) <= LONGEST_NAME for text in texts):
-            raise CallRefused(400, f"{field.name} is no identifier")
+            raise RequestRefused(400, f"{field.name} is no identifier")
 
 
 async def relay(client: httpx.AsyncClient, path: str, headers: Headers, body: bytes, send: Send) -> Relayed:
-    """Pass a POST request on by `client`, whose base address is the other server's; return the sizes.
+    """Pass a POST request on by `client`, whose base URL is that of the other server; return the result.
 
-    Where the other server cannot be reached, the answer is 503, after which Flower's nodes try again.
+    If the other server cannot be reached, the response is 503, after which Flower's nodes try again.
     """
-    done, begun = Relayed(up=len(body)), False
+    done = Relayed(up=len(body))
+    begun = False
     try:
         request = client.build_request("POST", path, headers=[*headers], content=body)
-        for name in ("accept-encoding", "user-agent"):  # httpx's own
+        for name in ("accept-encoding", "user-agent"):  # added by httpx
             request.headers.pop(name, None)
         response = await client.send(request, stream=True)
         try:
@@ -227,7 +230,7 @@ async def relay(client: httpx.AsyncClient, path: str, headers: Headers, body: by
 
 
 async def keep_alive(receive: Receive, send: Send) -> bool:
-    """Handle an event of the server's lifespan; return whether it has ended."""
+    """Handle an event of the server's lifespan; return whether that has ended."""
     event = await receive()
     await send({"type": f"{event['type']}.complete"})
     return event["type"] == "lifespan.shutdown"

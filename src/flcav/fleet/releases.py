@@ -1,10 +1,10 @@
-"""Releases on a fleet: the repositories on offer, and the reports of vehicles on the network that drives them.
+"""Releases on a fleet: the offered repositories, and the reports of vehicles on their driving networks.
 
-FLEET/releases/offer.json            where the published repositories of provider and customer are
+FLEET/releases/offer.json            folders of the published repositories of provider and customer
 FLEET/releases/vehicles/NAME.json    the latest report of a vehicle
 
-A report goes to the proxy with the vehicle's certificate, which says whose it is (a vehicle version manifest, Uptane
-Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without ECUs of their own).
+A report is sent to the proxy, where the TLS certificate identifies the vehicle (a vehicle version manifest, Uptane
+Standard for Design and Implementation 2.1.0, section 5.4.2.1.1, without separate ECUs).
 """
 
 import json
@@ -18,16 +18,16 @@ from flcav.interface.wording import make_printable, plural
 from flcav.storage.files import write_json
 from flcav.storage.records import LEFT_OUT, Record
 
-RELEASES = "/v1/flcav/release/"  # at the proxy: of the repositories' files, and of reports
+RELEASES = "/v1/flcav/release/"  # path at the proxy of the repositories' files, and of reports
 REPORT = "report"
 LARGEST_REPORT = 4096  # bytes of a report
-MOST = 10**9  # of any number in it
+MOST = 10**9  # bound of any number in a report
 TASK, SHA256 = re.compile("[a-z][a-z0-9_]{0,31}"), re.compile("[0-9a-f]{64}")
 
 
 @dataclass(frozen=True)
 class ShadowReport(Record):
-    """The shadow run of one vehicle: numbers of detections from the score of use on."""
+    """The result of a vehicle's shadow run: numbers of detections above the score threshold in use."""
 
     vehicle: str
     task: str
@@ -45,7 +45,7 @@ class ShadowReport(Record):
         return 1 - 2 * self.agreed / found if found else 0.0
 
     def check(self) -> None:
-        """Raise ValueError for numbers that cannot be, in words."""
+        """Raise ValueError, with a sentence, for impossible numbers."""
         if not all(0 <= each < MOST for each in (self.frames, self.driving_found, self.candidate_found, self.agreed)):
             raise ValueError("a number below 0, or too large")
         if self.agreed > min(self.driving_found, self.candidate_found):
@@ -56,30 +56,30 @@ class ShadowReport(Record):
 
 @dataclass(frozen=True)
 class ReleaseReport(Record):
-    """State of a vehicle's network: what drives, what it has verified, and how that disagrees with what drove."""
+    """A vehicle's report: its driving and its verified release, and their disagreement in the shadow run."""
 
     task: str
-    release: int  # that drives; 0: none
-    verified: int  # whose signatures and weights were verified, and which drives or is to drive; 0: none
-    refused: str = ""  # why what is on offer was not taken
-    shadow: Annotated[ShadowReport | None, LEFT_OUT] = None  # of the verified release; None: there was no run
+    release: int  # driving release; 0: none
+    verified: int  # latest release with verified signatures and weights, driving or about to; 0: none
+    refused: str = ""  # reason of refusing the offered release
+    shadow: Annotated[ShadowReport | None, LEFT_OUT] = None  # of the verified release; None: no run
 
     def as_bytes(self) -> bytes:
-        """Return it as it is sent: JSON."""
+        """Return the report as JSON, as it is sent."""
         return json.dumps(self.as_json()).encode()
 
     def describe(self) -> str:
-        """Return it in words."""
-        told = f"drives release {self.release} of {self.task}" if self.release else f"drives no {self.task}"
+        """Return the report in words."""
+        text = f"drives release {self.release} of {self.task}" if self.release else f"drives no {self.task}"
         if self.verified > self.release:
-            told += f", has verified release {self.verified}"
+            text += f", has verified release {self.verified}"
         if self.shadow is not None:
-            told += f", disagreement {self.shadow.disagreement:.3f} over {plural(self.shadow.frames, 'frame')}"
-        return f"{told}; refuses what is on offer: {self.refused}" if self.refused else told
+            text += f", disagreement {self.shadow.disagreement:.3f} over {plural(self.shadow.frames, 'frame')}"
+        return f"{text}; refuses what is on offer: {self.refused}" if self.refused else text
 
 
 def parse_report(data: bytes) -> ReleaseReport:
-    """Return the report in a message; raises ValueError for another message, in words."""
+    """Return the report in a message; raises ValueError, with a sentence, for an invalid message."""
     try:
         found = ReleaseReport.from_json(json.loads(data), "report")
     except (InputError, ValueError, RecursionError):
@@ -98,32 +98,32 @@ LARGEST_FILE = 1_000_000_000  # bytes
 
 @dataclass(frozen=True)
 class ReleaseOffer(Record):
-    """Folders of the published repositories, each with metadata and targets in it."""
+    """The offer of a fleet: folders of the published repositories, which have metadata and targets."""
 
     image: str  # the provider's
     director: str  # the customer's
 
     def save(self, fleet: Path) -> None:
-        """Write it to a fleet's folder: its vehicles find the repositories from now on."""
+        """Write the offer to a fleet's folder, where its vehicles find it."""
         write_json(fleet / OFFER, self.as_json())
 
 
 @dataclass(frozen=True)
 class KeptReport(Record):
-    """The latest report of a vehicle, and the time of its arrival."""
+    """The latest report of a vehicle, with its time of arrival."""
 
     vehicle: str  # by its certificate
     time: float  # [s since 1970]
-    down_bytes: int  # that crossed the vehicle's sockets for releases until then, TLS included
+    down_bytes: int  # downloaded by the vehicle for releases so far, on its sockets, TLS included
     report: ReleaseReport
 
     def save(self, fleet: Path) -> None:
-        """Write it to a fleet's folder, in the place of the one before."""
+        """Write the report to a fleet's folder, over the previous one."""
         write_json(fleet / REPORTS / f"{self.vehicle}.json", self.as_json())
 
 
 def read_reports(fleet: Path) -> dict[str, KeptReport]:
-    """Return the latest report of each vehicle, by name; its words are fit for a terminal."""
+    """Return the latest reports by vehicle, with printable texts."""
     paths = sorted((fleet / REPORTS).glob("[!.]*.json"))
     found = [KeptReport.from_json(read_json(path), str(path)) for path in paths]
     plain = [replace(each.report, refused=make_printable(each.report.refused)) for each in found]
@@ -131,9 +131,9 @@ def read_reports(fleet: Path) -> dict[str, KeptReport]:
 
 
 def find_offered(fleet: Path, asked: str) -> Path | None:
-    """Return the file of a repository on offer that is asked for as image/… or director/…; None: there is none.
+    """Return the offered file with the path image/… or director/…; None if there is none.
 
-    Raises ValueError, in words, for a path that is no repository's, leads out of it, or has a file that is too large.
+    Raises ValueError, with a sentence, for a path of no repository, one that leads out of it, or too large a file.
     """
     found = FILE.fullmatch(asked)
     if found is None:

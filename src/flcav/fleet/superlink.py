@@ -1,10 +1,9 @@
 """Control of Flower's SuperLink: enrolment of nodes, start of runs, and this process as the server app of a run.
 
-Uses private parts of Flower (pinned to 1.42): the clients of its control and runtime interfaces, and its table of app
-bundles; so do `vehicle`, for its node and executor, and federation's `links.vehicle_app` and `links.in_process`, for
-messages.
-The control side wants no credential, so the SuperLink listens on the loopback of the operator's host; the
-secret of the executor is in a file that its owner alone can read.
+It uses private parts of Flower (pinned to 1.42): the clients of its control and runtime interfaces, and its table of
+app bundles; so do `vehicle`, for its node and executor, and the federation's `links.vehicle_app` and
+`links.in_process`, for messages. The control interface needs no credential, so that the SuperLink listens on the
+loopback of the operator's host only; the executor's secret is in a file that only its owner can read.
 """
 
 import base64
@@ -48,30 +47,30 @@ from flcav.storage.files import write_bytes
 
 SECRET, DATABASE = "executor.secret", "superlink.sqlite"  # in the fleet's folder
 ACQUIRE = frozenset({"/flwr.proto.Runtime/AcquireTask"})
-HEARTBEAT_S = 20.0  # Flower ends a run whose server has been silent for a minute
+HEARTBEAT_S = 20.0  # [s]; Flower ends a run whose server has been silent for a minute
 ONLINE = "online"
-SuperLinkLost = (httpx.HTTPError, RuntimeError, OSError)  # what its clients raise where it is not there
+SuperLinkLost = (httpx.HTTPError, RuntimeError, OSError)  # raised by its clients where it cannot be reached
 
 
 @dataclass(frozen=True)
 class SuperLink:
-    """The SuperLink of the fleet in `folder`, at an address of this host."""
+    """The SuperLink of a fleet, at an address of this host."""
 
     folder: Path
     address: str  # host:port
 
     def is_up(self) -> bool:
-        """Return whether it answers."""
+        """Return whether the SuperLink answers."""
         try:
-            asked = httpx.get(
+            response = httpx.get(
                 f"https://{self.address}/health", verify=str(self.folder / AUTHORITY), timeout=2.0, trust_env=False
             )
         except httpx.HTTPError:
             return False
-        return asked.status_code == httpx.codes.OK
+        return response.status_code == httpx.codes.OK
 
     def wait(self, seconds: float) -> None:
-        """Wait until the SuperLink answers; raises `OSError` after a time-out."""
+        """Wait until the SuperLink answers; raises `OSError` after a timeout of `seconds` [s]."""
         end = time.monotonic() + seconds
         while not self.is_up():
             if time.monotonic() > end:
@@ -86,21 +85,25 @@ class SuperLink:
             yield client
 
     def enrol(self, registry: VehicleRegistry) -> None:
-        """Make the SuperLink's nodes those of the registry's vehicles in force: enrol new ones, strike out others."""
-        wanted = {own.fingerprint: own for own in registry.list_vehicles() if own.describe_state() == "registered"}
+        """Make the SuperLink's nodes equal to the registry's vehicles in force: enrol new ones, remove others."""
+        wanted = {
+            vehicle.fingerprint: vehicle
+            for vehicle in registry.list_vehicles()
+            if vehicle.describe_state() == "registered"
+        }
         with self._control() as control:
             there = {node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info}
-            for own in registry.list_enrolled():
-                if own.fingerprint not in wanted:
-                    if own.node in there:
-                        control.UnregisterNode(UnregisterNodeRequest(node_id=own.node))
-                    registry.set_node(own.fingerprint, None)
-            for own in wanted.values():
-                if own.node not in there:
+            for vehicle in registry.list_enrolled():
+                if vehicle.fingerprint not in wanted:
+                    if vehicle.node in there:
+                        control.UnregisterNode(UnregisterNodeRequest(node_id=vehicle.node))
+                    registry.set_node(vehicle.fingerprint, None)
+            for vehicle in wanted.values():
+                if vehicle.node not in there:
                     answer = control.RegisterNode(
-                        RegisterNodeRequest(public_key=public_pem(own.public_key), name=own.name)
+                        RegisterNodeRequest(public_key=public_pem(vehicle.public_key), name=vehicle.name)
                     )
-                    registry.set_node(own.fingerprint, answer.node_id)
+                    registry.set_node(vehicle.fingerprint, answer.node_id)
 
     def list_online(self) -> set[int]:
         """Return the ids of the nodes that are online."""
@@ -108,7 +111,7 @@ class SuperLink:
             return {node.node_id for node in control.ListNodes(ListNodesRequest()).nodes_info if node.status == ONLINE}
 
     def begin(self, bundle: bytes | None = None, signature: dict[str, str] | None = None) -> "ServerRun":
-        """Begin a run with a bundle (None: the vehicles' app, signed by the publisher); return its server's end."""
+        """Start a run of a bundle (None: the vehicles' app, signed by the publisher); return its server side."""
         bundle = build_bundle() if bundle is None else bundle
         signature = sign_bundle(self.folder, bundle) if signature is None else signature
         certificate = (self.folder / AUTHORITY).read_bytes()
@@ -117,23 +120,24 @@ class SuperLink:
             SuperExecAuthHttpInterceptor(master_secret=(self.folder / SECRET).read_bytes(), protected_methods=ACQUIRE),
         ]
         with (
-            locked(self.folder / f"{SECRET}.lock"),  # so that the task which is pending is this run's
+            locked(self.folder / f"{SECRET}.lock"),  # so that the pending task is that of this run
             self._control() as control,
             RuntimeHttpClient.from_server_address(self.address, False, certificate, interceptors) as runtime,
         ):
+            # this process takes the task of the server app, in place of Flower's executor
             number = control.StartRun(StartRunRequest(fab=Fab(content=bundle))).run_id
             self._attach(bundle, signature)
             while True:
                 task = runtime.AcquireTask(AcquireTaskRequest(supported_task_types=[TaskType.SERVER_APP]))
                 if task.token and task.task.run_id == number:
                     return ServerRun(self.address, certificate, task.token)
-                if task.token:  # of a run whose command was killed, or lost the answer, before it had its task
+                if task.token:  # of a run whose command died before it had its task
                     ServerRun(self.address, certificate, task.token).end(failed=True)
                 else:
                     time.sleep(0.05)
 
     def _attach(self, bundle: bytes, signature: dict[str, str]) -> None:
-        """Store a bundle's signature beside it; Flower does so for apps of its own hub alone."""
+        """Store a bundle's signature in Flower's database, as Flower does for apps of its hub."""
         with contextlib.closing(sqlite3.connect(self.folder / DATABASE, timeout=10.0)) as connection, connection:
             values = json.dumps(signature), hashlib.sha256(bundle).hexdigest()
             if connection.execute("UPDATE fab SET verifications = ? WHERE fab_hash = ?", values).rowcount != 1:
@@ -141,25 +145,26 @@ class SuperLink:
 
 
 class ServerRun:
-    """A run under way, whose server app is this process."""
+    """A run in progress, with this process as its server app."""
 
     def __init__(self, address: str, certificate: bytes, token: str) -> None:
         self.grid: Any = HttpGrid(address, False, certificate, token=token)
-        self.grid._retry_invoker = None  # Flower's ends the process where the SuperLink has forgotten the run
+        self.grid._retry_invoker = None  # Flower's ends this process where the SuperLink has lost the run
         self._client = self.grid._runtime_client
         given = self._client.PullTaskInput(PullTaskInputRequest())
         self._identity = given.task_id, given.run.run_id, given.context.node_id
-        self._context, self.id = given.context, given.run.run_id
+        self._context = given.context
+        self.id = given.run.run_id
         self.grid.set_run(run_from_proto(given.run))
         self._ended = threading.Event()
         threading.Thread(target=self._beat, daemon=True).start()
 
     def identify(self) -> None:
-        """Give messages that are created from now on the identity of this run's server."""
+        """Set the sender of messages created from now on to this run's server."""
         TaskIdentity.task_id, TaskIdentity.run_id, TaskIdentity.node_id = self._identity
 
     def end(self, failed: bool = False) -> None:
-        """End the run; does nothing where the SuperLink is not there."""
+        """End the run; does nothing where the SuperLink cannot be reached."""
         self._ended.set()
         status = SubStatus.FAILED if failed else SubStatus.COMPLETED
         with contextlib.suppress(*SuperLinkLost):
@@ -174,7 +179,7 @@ class ServerRun:
 
 @contextlib.contextmanager
 def locked(path: Path) -> Iterator[None]:
-    """Hold the lock of a file; waits while another holds it."""
+    """Hold the lock of a file; waits while another process holds it."""
     with path.open("a") as file:
         fcntl.flock(file, fcntl.LOCK_EX)
         yield
@@ -216,7 +221,7 @@ def build_bundle(client: str = CLIENT) -> bytes:
 
 
 def make_publisher(folder: Path) -> None:
-    """Make the publisher's key in `folder`, and beside it the file of keys that vehicles trust."""
+    """Make the publisher's key in `folder`, and the file of keys that vehicles trust."""
     key = ed25519.Ed25519PrivateKey.generate()
     openssh = serialization.PrivateFormat.OpenSSH
     write_private(
@@ -227,14 +232,14 @@ def make_publisher(folder: Path) -> None:
 
 
 def sign_bundle(folder: Path, bundle: bytes) -> dict[str, str]:
-    """Return the publisher's signature of a bundle as Flower stores it, by the name of the key."""
+    """Return the publisher's signature of a bundle in Flower's format, by the name of the key."""
     key = serialization.load_ssh_private_key((folder / PUBLISHER_KEY).read_bytes(), None)
     if not isinstance(key, ed25519.Ed25519PrivateKey):
         raise InputError(f"{folder / PUBLISHER_KEY}: an Ed25519 key is wanted")
     now = int(time.time())
     signature = key.sign(now.to_bytes(8, "big") + hashlib.sha256(bundle).digest())
-    told = json.dumps({"signed_at": now, "signature": base64.urlsafe_b64encode(signature).decode().rstrip("=")})
-    return {"valid_license": "Valid", _name_key(key.public_key()): told}
+    stored = json.dumps({"signed_at": now, "signature": base64.urlsafe_b64encode(signature).decode().rstrip("=")})
+    return {"valid_license": "Valid", _name_key(key.public_key()): stored}
 
 
 def _name_key(key: ed25519.Ed25519PublicKey) -> str:

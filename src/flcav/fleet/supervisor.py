@@ -1,7 +1,7 @@
-"""Supervisor of a fleet's processes: forks of a process with all imports done, restarted when they end.
+"""Supervisor of a fleet's processes, which are forks of a process with all imports done, restarted when they end.
 
-They end with the supervisor. A process that ends at once is started again later and later, up to half a minute: a node
-that was refused, for its clock or its certificate, comes back when that is corrected.
+They end with the supervisor. A process that ends at once is restarted with increasing delay, up to half a minute, so
+that a node that was refused, for its clock or its certificate, comes back once that is corrected.
 """
 
 import contextlib
@@ -19,7 +19,7 @@ from flcav.storage.files import write_bytes
 
 PROCESSES, LOGS = "processes.json", "logs"
 TICK_S, LONGEST_S, ENDING_S = 0.1, 30.0, 5.0
-STEADY_S = 10.0  # after which a process is taken to run well
+STEADY_S = 10.0  # run time after which a process restarts without delay [s]
 FLOWER = {
     "FLWR_TELEMETRY_ENABLED": "0",
     "FLWR_DISABLE_UPDATE_CHECK": "1",
@@ -45,10 +45,10 @@ def supervise(
     later: Mapping[str, Callable[[], None]] = {},
     is_up: Callable[[], bool] = lambda: True,
 ) -> None:
-    """Run `processes`, by name, until this process gets SIGTERM or SIGINT; those for `later` once the others are up.
+    """Run `processes`, by name, until this process receives SIGTERM or SIGINT, and those of `later` once `is_up`.
 
-    `is_up` is called about ten times a second, and tells.
-    Their output goes to `folder`/logs, their ids to processes.json there. This process must have one thread alone.
+    `is_up` is called about ten times a second. Output goes to `folder`/logs, process ids to `folder`/processes.json.
+    This process must have a single thread, since it forks.
     """
     ended = False
 
@@ -57,18 +57,21 @@ def supervise(
         ended = True
 
     before = {number: signal.signal(number, end) for number in (signal.SIGTERM, signal.SIGINT)}
-    all_, waiting = {name: _Supervised(do) for name, do in processes.items()}, dict(later)
+    all_ = {name: _Supervised(do) for name, do in processes.items()}
+    waiting = dict(later)
     changed = False
     try:
         while not ended:
             changed |= _reap(all_)
-            for name, own in all_.items():
-                if not own.pid and time.monotonic() >= own.started + own.pause_s:
-                    own.pid, own.started, own.starts = _fork(folder, name, own.do), time.monotonic(), own.starts + 1
+            for name, process in all_.items():
+                if not process.pid and time.monotonic() >= process.started + process.pause_s:
+                    process.pid = _fork(folder, name, process.do)
+                    process.started = time.monotonic()
+                    process.starts += 1
                     changed = True
             if changed:
-                told = {name: {"pid": own.pid, "starts": own.starts} for name, own in all_.items()}
-                changed = not _write(folder / PROCESSES, json.dumps(told).encode())
+                status = {name: {"pid": process.pid, "starts": process.starts} for name, process in all_.items()}
+                changed = not _write(folder / PROCESSES, json.dumps(status).encode())
             if is_up() and waiting:
                 all_ |= {name: _Supervised(do) for name, do in waiting.items()}
                 waiting = {}
@@ -76,20 +79,24 @@ def supervise(
     finally:
         _end(all_)
         (folder / PROCESSES).unlink(missing_ok=True)
-        for number, handler in before.items():  # what is pressed again while this process ends changes nothing
+        for number, handler in before.items():  # further signals while this process ends are ignored
             signal.signal(number, signal.SIG_IGN if ended else handler)
 
 
 def read_processes(folder: Path) -> dict[str, int]:
-    """Return the ids of the processes that are supervised in `folder`, by name; of those alone that are running."""
+    """Return the ids of the running processes supervised in `folder`, by name."""
     try:
-        return {name: own["pid"] for name, own in json.loads((folder / PROCESSES).read_bytes()).items() if own["pid"]}
+        return {
+            name: process["pid"]
+            for name, process in json.loads((folder / PROCESSES).read_bytes()).items()
+            if process["pid"]
+        }
     except FileNotFoundError:
         return {}
 
 
 def _write(path: Path, data: bytes) -> bool:
-    """Write a status file that other processes read; return whether the disk had room for it."""
+    """Write a status file for other processes; return whether that succeeded."""
     try:
         write_bytes(path, data)
     except OSError:
@@ -98,30 +105,31 @@ def _write(path: Path, data: bytes) -> bool:
 
 
 def _reap(all_: Mapping[str, _Supervised]) -> bool:
-    """Note which processes have ended; return whether one has."""
+    """Note the processes that have ended; return whether there are any."""
     changed = False
-    for own in all_.values():
-        if own.pid and os.waitpid(own.pid, os.WNOHANG)[0]:
-            steady = time.monotonic() - own.started > STEADY_S
-            own.pause_s = 0.0 if steady else min(max(2 * own.pause_s, 1.0), LONGEST_S)
-            own.pid, changed = 0, True
+    for process in all_.values():
+        if process.pid and os.waitpid(process.pid, os.WNOHANG)[0]:
+            steady = time.monotonic() - process.started > STEADY_S
+            process.pause_s = 0.0 if steady else min(max(2 * process.pause_s, 1.0), LONGEST_S)
+            process.pid = 0
+            changed = True
     return changed
 
 
 def _end(all_: Mapping[str, _Supervised]) -> None:
     for how in (signal.SIGTERM, signal.SIGKILL):
-        for own in all_.values():
-            if own.pid:
+        for process in all_.values():
+            if process.pid:
                 with contextlib.suppress(ProcessLookupError):
-                    os.kill(own.pid, how)
+                    os.kill(process.pid, how)
         end = time.monotonic() + ENDING_S
-        while any(own.pid for own in all_.values()) and time.monotonic() < end:
+        while any(process.pid for process in all_.values()) and time.monotonic() < end:
             _reap(all_)
             time.sleep(0.02)
 
 
 def end_with_parent(parent: int, how: signal.Signals) -> None:
-    """Have this process, a fork of `parent`, get a signal when that ends (Linux); end it where that has ended."""
+    """Let this fork of `parent` receive a signal when that ends (Linux); exit if it has ended already."""
     ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, how)
     if os.getppid() != parent:
         os._exit(1)
@@ -137,9 +145,9 @@ def _fork(folder: Path, name: str, do: Callable[[], None]) -> int:
         end_with_parent(parent, signal.SIGTERM)
         for number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(number, signal.SIG_DFL)
-        own = folder / LOGS / name
-        own.parent.mkdir(parents=True, exist_ok=True)
-        log = os.open(own.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
+        base = folder / LOGS / name
+        base.parent.mkdir(parents=True, exist_ok=True)
+        log = os.open(base.with_suffix(".log"), os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600)
         for stream in (1, 2):
             os.dup2(log, stream)
         sys.stdout, sys.stderr = os.fdopen(1, "w", buffering=1), os.fdopen(2, "w", buffering=1)
@@ -154,7 +162,7 @@ def _fork(folder: Path, name: str, do: Callable[[], None]) -> int:
 
         traceback.print_exc()
     finally:
-        with contextlib.suppress(BaseException):  # where there is no room for the log, this process still ends here
+        with contextlib.suppress(BaseException):  # also on a full disk this process must end here
             sys.stdout.flush()
             sys.stderr.flush()
         os._exit(code & 255)

@@ -1,4 +1,4 @@
-"""Start of a fleet: the SuperLink, the proxy in front of it and, for tests, vehicles on this machine."""
+"""Start-up of a fleet: the SuperLink, the proxy in front of it and, for tests, vehicles on this machine."""
 
 import contextlib
 import fcntl
@@ -29,23 +29,23 @@ from flcav.interface.wording import plural
 from flcav.storage.files import write_bytes, write_json
 
 READY, VEHICLES, LOCK = "ready.json", "vehicles", "up.lock"
-SILENT_S = 60.0  # without an answer of the SuperLink, after which a warning is printed
-CHECK_S = 1.0  # between looks at the registry
-MOST_VEHICLES = 64  # on this machine
+SILENT_S = 60.0  # without an answer of the SuperLink before a warning is printed [s]
+CHECK_S = 1.0  # interval of reading the registry [s]
+MOST_VEHICLES = 64  # on one machine
 
 
 @dataclass(frozen=True)
 class Ready:
-    """Addresses of a running fleet."""
+    """The addresses of a running fleet."""
 
     proxy: str  # host:port
     superlink: str  # host:port on the operator's host
     pid: int  # of the supervisor
-    since: int  # seconds since 1970
+    since: int  # [s since 1970]
 
 
 def read_ready(folder: Path) -> Ready:
-    """Return where the running fleet of `folder` is reached; raises `InputError` where it is not up."""
+    """Return the addresses of the running fleet of `folder`; raises `InputError` if it is not up."""
     try:
         return Ready(**json.loads((folder / READY).read_bytes()))
     except FileNotFoundError:
@@ -55,14 +55,14 @@ def read_ready(folder: Path) -> Ready:
 
 
 def name_vehicles(count: int) -> list[str]:
-    """Return the identifiers of a number of vehicles on this machine."""
+    """Return the identifiers of `count` vehicles on this machine."""
     return [f"vehicle-{number:03d}" for number in range(1, count + 1)]
 
 
 def prepare_fleet(folder: Path, host: str, port: int, vehicles: int) -> tuple[Authority, str, str]:
-    """Make what `run_fleet` needs in the authority's folder; return it, and addresses of proxy and SuperLink.
+    """Prepare the authority's folder for `run_fleet`; return authority, and addresses of proxy and SuperLink.
 
-    port: of the proxy; 0: any that is free. vehicles: whose keys and certificates are made on this machine. Raises
+    port: of the proxy; 0: any free one. vehicles: number whose keys and certificates are made on this machine. Raises
     `InputError` where the port is in use, the folder is another authority's, or a certificate is not in force.
     """
     if not 0 <= vehicles <= MOST_VEHICLES:
@@ -82,21 +82,21 @@ def prepare_fleet(folder: Path, host: str, port: int, vehicles: int) -> tuple[Au
 def prepare_vehicle(authority: Authority, name: str, proxy: str, days: float = VEHICLE_DAYS) -> Path:
     """Make key, certificate and settings of a vehicle on this machine; return its folder.
 
-    Raises `InputError` where the certificate that is there is not in force.
+    days: validity of the certificate. Raises `InputError` where an existing certificate is not in force.
     """
-    own = authority.folder / VEHICLES / name
-    if not (own / CERTIFICATE).exists():
-        request = own / REQUEST if (own / REQUEST).exists() else request_certificate(own, name)
-        take_certificate(own, authority.register(request, days), (authority.folder / AUTHORITY).read_bytes())
+    folder = authority.folder / VEHICLES / name
+    if not (folder / CERTIFICATE).exists():
+        request = folder / REQUEST if (folder / REQUEST).exists() else request_certificate(folder, name)
+        take_certificate(folder, authority.register(request, days), (authority.folder / AUTHORITY).read_bytes())
     found = next((each for each in authority.registry.list_vehicles() if each.name == name), None)
     state = "not registered with this authority" if found is None else found.describe_state()
     if state != "registered":
         raise InputError(
-            f"{own / CERTIFICATE}: the certificate of '{name}' is {state}; flcav fleet rotate gives another"
+            f"{folder / CERTIFICATE}: the certificate of '{name}' is {state}; flcav fleet rotate gives another"
         )
-    write_bytes(own / TRUSTED, (authority.folder / TRUSTED).read_bytes())
-    VehicleSettings(proxy, check_port("127.0.0.1", 0), check_port("127.0.0.1", 0)).save(own)
-    return own
+    write_bytes(folder / TRUSTED, (authority.folder / TRUSTED).read_bytes())
+    VehicleSettings(proxy, check_port("127.0.0.1", 0), check_port("127.0.0.1", 0)).save(folder)
+    return folder
 
 
 def run_fleet(
@@ -108,24 +108,26 @@ def run_fleet(
     report: Callable[[str], None],
     others: Mapping[str, Callable[[Path], None]] = {},
 ) -> None:
-    """Run a fleet until this process gets a signal to end; see `prepare_fleet`.
+    """Run a fleet until this process receives a signal to end; see `prepare_fleet`.
 
-    prepare: of the vehicles' executors. report: called with a sentence when the fleet is up. others: further processes
-    of each vehicle, by name.
+    prepare: see `run_executor`. report: called with a sentence when the fleet is up. others: further processes of every
+    vehicle, by name.
     """
     with _alone(folder):
         _, proxy, superlink = prepare_fleet(folder, host, port, vehicles)
-        link, state = SuperLink(folder, superlink), _Enrolment(folder)
+        link = SuperLink(folder, superlink)
+        state = _Enrolment(folder)
         processes: dict[str, Callable[[], None]] = {
             "superlink": lambda: run_superlink(folder, superlink),
             "proxy": lambda: run_proxy(folder, host, int(proxy.rpartition(":")[2]), superlink),
         }
         later: dict[str, Callable[[], None]] = {}
         for name in name_vehicles(vehicles):
-            own = vehicle_processes(folder / VEHICLES / name, prepare, others)
-            later |= {f"{name}-{kind}": do for kind, do in own.items()}
+            functions = vehicle_processes(folder / VEHICLES / name, prepare, others)
+            later |= {f"{name}-{kind}": do for kind, do in functions.items()}
 
-        begun, silent = time.monotonic(), True
+        begun = time.monotonic()
+        silent = True
 
         def is_up() -> bool:
             nonlocal silent
@@ -146,8 +148,8 @@ def run_fleet(
             (folder / READY).unlink(missing_ok=True)
 
 
-def run_vehicle(folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}) -> None:
-    """Run the vehicle in `folder`, with `others` of its processes, until a signal ends it.
+def run_vehicle_processes(folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}) -> None:
+    """Run the vehicle in `folder`, including its further processes `others`, until a signal ends it.
 
     Raises `InputError` where the vehicle's certificate is not in force.
     """
@@ -178,10 +180,10 @@ def run_superlink(folder: Path, address: str) -> None:
 
 
 def import_flower() -> None:
-    """Import what SuperLink and SuperNodes need, so that the forks of this process have it.
+    """Import the modules of SuperLink and SuperNodes, so that forks of this process share them.
 
-    Their collectors leave it alone: they look at all that lives only when it has grown by a quarter, and of so much
-    they would keep the bodies of calls that are over.
+    The modules are frozen for garbage collection in the forks: a full collection only runs once the number of objects
+    has grown by a quarter, so that with so many objects the bodies of finished calls would stay in memory.
     """
     import flwr.superlink.cli.flower_superlink
     import flwr.superlink.main
@@ -191,18 +193,18 @@ def import_flower() -> None:
 
     gc.collect()
     gc.freeze()
-    gc.collect()  # now of next to nothing
+    gc.collect()  # resets the collector's count of objects to almost 0
 
 
 class _Enrolment:
-    """The nodes of the SuperLink are made those of the registry whenever either has changed."""
+    """The enrolment of nodes: keeps the SuperLink's nodes equal to the registry's vehicles."""
 
     def __init__(self, folder: Path) -> None:
         self._folder, self._seen, self._next = folder, -1, 0.0
-        self.wrong = ""  # why it is not so
+        self.wrong = ""  # reason of the last failure
 
     def update(self, link: SuperLink) -> bool:
-        """Bring the enrolled nodes up to date; return whether they are the registry's vehicles."""
+        """Enrol changes of the registry; return whether the nodes are its vehicles."""
         if time.monotonic() < self._next:
             return self._seen >= 0
         self._next = time.monotonic() + (CHECK_S if self._seen >= 0 else 0.1)
@@ -211,7 +213,12 @@ class _Enrolment:
                 if registry.count_changes() != self._seen:
                     link.enrol(registry)
                     self._seen = registry.count_changes()
-        except (*SuperLinkLost, InputError, ValueError, TypeError) as error:  # not there yet, or not now; or damaged
+        except (
+            *SuperLinkLost,
+            InputError,
+            ValueError,
+            TypeError,
+        ) as error:  # SuperLink starting or absent, or a damaged file
             self.wrong = str(error)
         return self._seen >= 0
 

@@ -1,7 +1,7 @@
-"""A vehicle's processes: its forwarder, Flower's SuperNode, and an executor of its app, one fork a message.
+"""A vehicle's processes: its forwarder, Flower's SuperNode, and an executor that forks its app for every message.
 
-Flower starts a process for every message, which imports everything anew. Here the executor imports once, and forks.
-A vehicle is installed with its certificate, the keys that it trusts, and the address of the fleet.
+Flower would start a process per message, which imports everything again; the executor imports once and forks. A
+vehicle is installed with its certificate, its trusted keys, and the address of the fleet.
 """
 
 import contextlib
@@ -26,21 +26,21 @@ from flcav.fleet.supervisor import end_with_parent
 from flcav.plugins import PLACE
 from flcav.storage.files import write_bytes, write_json
 
-SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # the second: environment variable of the app
-POLL_S = 0.1  # between looks for a message
+SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # file name; environment variable of the app
+POLL_S = 0.1  # interval of polling for a message [s]
 
 
 @dataclass(frozen=True)
 class VehicleSettings:
-    """Addresses of a vehicle, and its own client."""
+    """The settings of a vehicle: addresses, and its client."""
 
     server: str  # host:port of the fleet's proxy
     forwarder_port: int  # on the vehicle's loopback
     node_port: int
-    client: str = ""  # module:NAME of its own part in a federation; "": the one in its folder
+    client: str = ""  # module:NAME of its `Assignment`; "": the one in its folder
 
     def save(self, folder: Path) -> None:
-        """Write them to a vehicle's folder, with the secrets that its processes know each other by."""
+        """Write the settings to a vehicle's folder, with the secrets by which its processes authenticate."""
         write_json(folder / SETTINGS, asdict(self))
         if not (folder / SECRET).exists():
             write_private(folder / SECRET, os.urandom(32).hex().encode())
@@ -49,7 +49,7 @@ class VehicleSettings:
 
 
 def load_settings(folder: Path) -> VehicleSettings:
-    """Return the settings in a vehicle's folder; raises `InputError` where there are none."""
+    """Return the settings in a vehicle's folder; raises `InputError` if there are none."""
     try:
         return VehicleSettings(**json.loads((folder / SETTINGS).read_bytes()))
     except FileNotFoundError:
@@ -58,46 +58,46 @@ def load_settings(folder: Path) -> VehicleSettings:
         raise InputError(f"{folder / SETTINGS}: {error}") from None
 
 
-Prepare = Callable[[Path], None]  # called with the vehicle's folder before each message, to have imported what it needs
+Prepare = Callable[[Path], None]  # called with the vehicle's folder before every message, to import its modules
 
 
 def vehicle_processes(
     folder: Path, prepare: Prepare, others: Mapping[str, Callable[[Path], None]] = {}
 ) -> dict[str, Callable[[], None]]:
-    """Return what the processes of the vehicle in `folder` run, by name; `others` are called with the folder."""
-    own = load_settings(folder)
+    """Return the functions of a vehicle's processes by name; those of `others` are called with its folder."""
+    settings = load_settings(folder)
 
     def forward() -> None:
         from flcav.fleet.forwarder import run_forwarder
 
-        run_forwarder(folder, own.forwarder_port, own.server)
+        run_forwarder(folder, settings.forwarder_port, settings.server)
 
     return {
         "forwarder": forward,
-        "supernode": lambda: run_supernode(folder, own),
-        "executor": lambda: run_executor(folder, f"127.0.0.1:{own.node_port}", prepare),
+        "supernode": lambda: run_supernode(folder, settings),
+        "executor": lambda: run_executor(folder, f"127.0.0.1:{settings.node_port}", prepare),
         **{name: partial(do, folder) for name, do in others.items()},
     }
 
 
-def run_supernode(folder: Path, own: VehicleSettings) -> None:
+def run_supernode(folder: Path, settings: VehicleSettings) -> None:
     """Run `flower-supernode` in this process until it ends."""
     from flwr.supernode.cli.flower_supernode import flower_supernode
 
     sys.argv = [
         "flower-supernode",
-        *("--superlink", f"127.0.0.1:{own.forwarder_port}"),
+        *("--superlink", f"127.0.0.1:{settings.forwarder_port}"),
         *("--root-certificates", str(folder / LOOPBACK)),
         *("--auth-supernode-private-key", str(folder / FLOWER_KEY)),
         *("--trusted-entities", str(folder / TRUSTED)),
         *("--isolation", "process", "--superexec-auth-secret-file", str(folder / SECRET)),
-        *("--host", "127.0.0.1", "--port", str(own.node_port)),
+        *("--host", "127.0.0.1", "--port", str(settings.node_port)),
     ]
     flower_supernode()
 
 
 def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
-    """Run the app for each message that the SuperNode at `node` has, in a fork of this process, one at a time."""
+    """Run the app for the messages of the SuperNode at `node`, one at a time, in forks of this process."""
     import httpx
     from flwr.proto.runtime_pb2 import AcquireTaskRequest
     from flwr.supercore.constant import TaskType
@@ -123,7 +123,7 @@ def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
 
 
 def _fork(node: str, token: str) -> int:
-    """Return the id of a process that runs the app for one message."""
+    """Fork a process that runs the app for one message; return its id."""
     parent, child = os.getpid(), os.fork()
     if child:
         return child
@@ -141,7 +141,7 @@ def _fork(node: str, token: str) -> int:
 
 
 def check_port(host: str, port: int) -> int:
-    """Return a port that can be listened on, `port` or, for 0, a free one; raises `InputError` where it is in use."""
+    """Return a port that is free to listen on, for 0 any; raises `InputError` if `port` is in use."""
     with contextlib.closing(socket.socket(socket.AF_INET, socket.SOCK_STREAM)) as door:
         door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
@@ -156,8 +156,8 @@ def install_vehicle(
 ) -> None:
     """Install the authority's files in a vehicle's folder; raises `InputError` for a file of another kind.
 
-    server: host:port of the proxy. client: module:NAME of the vehicle's own part in a federation, an `Assignment`
-    of federation's `links.vehicle_app`; "": the one that is put into its folder.
+    server: host:port of the proxy. client: module:NAME of the vehicle's `Assignment` (`links.vehicle_app` of the
+    federation); "": that in its folder.
     """
     if client and not PLACE.fullmatch(client):
         raise InputError(f"--client {client[:80]}: a module, a colon and a name in it are wanted")
@@ -165,10 +165,10 @@ def install_vehicle(
         raise InputError(f"--server {server[:80]}: HOST:PORT is wanted")
     keys = trusted.read_bytes()
     try:
-        named = yaml.safe_load(keys)
+        parsed = yaml.safe_load(keys)
     except (yaml.YAMLError, ValueError, RecursionError):
-        named = None
-    if not isinstance(named, dict) or not named:
+        parsed = None
+    if not isinstance(parsed, dict) or not parsed:
         raise InputError(f"{trusted}: names no key that apps are signed by")
     take_certificate(folder, certificate.read_bytes(), authority.read_bytes())
     write_bytes(folder / TRUSTED, keys)

@@ -1,10 +1,10 @@
-"""A release candidate: weights with their card, hashes of data and recipe, the ledger, and who acknowledges it.
+"""A release candidate: weights with their card, hashes of data and recipe, the ledger, and acknowledgements.
 
-A candidate is a folder. `candidate.json` holds the SHA-256 of every other file that was proposed; `verification.json`
-and `report.html` come with the verification, `acknowledgements` with those who sign it: signatures in OpenSSF's format,
-which `model_signing verify key` verifies. A party's key signs the hashes of all files of the folder but the
+A candidate is a folder. `candidate.json` has the SHA-256 of every other proposed file; `verification.json` and
+`report.html` are added by the verification, `acknowledgements` by the signing parties, as signatures in OpenSSF's
+format, which `model_signing verify key` verifies. A party's key signs the hashes of all files in the folder except the
 acknowledgements and the page (a Sigstore bundle with an in-toto statement; OpenSSF Model Signing v1.0). Keys are
-elliptic, of NIST's curves, in PEM files.
+elliptic-curve keys on NIST's curves, in PEM files.
 """
 
 import contextlib
@@ -37,13 +37,13 @@ LARGEST = 1_000_000_000  # bytes of weights
 FORMAT = "flcav-candidate-1"
 CARD_KEY = "flcav.card"  # as in `flcav.perception.weights`, which needs torch
 MOST_HEADER_BYTES = 10_000_000
-MOST_TEXT_BYTES = 10_000_000  # of a description, a card, a verification
+MOST_TEXT_BYTES = 10_000_000  # of a description, a card or a verification
 
 Sha256 = Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")]
 
 
 class DataHash(Config):
-    """Provenance of one dataset that a network was trained on, or had its best epoch chosen by."""
+    """The provenance of one training or validation dataset of a network."""
 
     name: str
     manifest: Sha256  # of its manifest, which lists the hashes of all its files
@@ -54,7 +54,7 @@ class DataHash(Config):
 
 
 class LedgerSum(Config):
-    """Bytes on one link in one direction that the training of a candidate cost."""
+    """The bytes of a candidate's training in one stage, on one link, in one direction."""
 
     stage: str
     link: Literal["wireless", "wireline"]
@@ -63,7 +63,7 @@ class LedgerSum(Config):
 
 
 class Candidate(Config):
-    """A release candidate, as `candidate.json` describes it."""
+    """A release candidate, the content of `candidate.json`."""
 
     document: ClassVar[str | None] = None
 
@@ -86,7 +86,7 @@ class Candidate(Config):
 def read_candidate(folder: Path) -> Candidate:
     """Return the description of the candidate in `folder`.
 
-    Raises `InputError` for a bundle of another format, and one with links, special files or texts that are too large.
+    Raises `InputError` for a folder of another format, and one with links, special files or too large texts.
     """
     path = folder / CANDIDATE
     if not path.is_file():
@@ -99,7 +99,7 @@ def read_candidate(folder: Path) -> Candidate:
 
 
 def parse_candidate(data: bytes, origin: str) -> Candidate:
-    """Return the candidate that the bytes of a `candidate.json` describe; raises `InputError` for another format."""
+    """Return the candidate in the bytes of a `candidate.json`; raises `InputError` for another format."""
     try:
         values = json.loads(data, object_pairs_hook=_unique)
     except (ValueError, RecursionError):
@@ -111,7 +111,7 @@ def parse_candidate(data: bytes, origin: str) -> Candidate:
 
 
 def _unique(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
-    """Return a JSON object; raises ValueError for a key twice, of which readers take the first or the last."""
+    """Return a JSON object; raises ValueError for a repeated key, which JSON readers treat differently."""
     found = dict(pairs)
     if len(found) < len(pairs):
         raise ValueError("a key is given twice")
@@ -119,7 +119,7 @@ def _unique(pairs: list[tuple[str, Json]]) -> dict[str, Json]:
 
 
 def _check_kinds(folder: Path) -> None:
-    """Raise `InputError` where a candidate's folder has links, special files, or files that are too large to read."""
+    """Raise `InputError` where a candidate's folder has links, special files, or too large files."""
     for path in folder.rglob("*"):
         name = str(path.relative_to(folder))
         if path.is_symlink() or path.is_dir() != (name == ACKNOWLEDGEMENTS) or not (path.is_file() or path.is_dir()):
@@ -129,7 +129,7 @@ def _check_kinds(folder: Path) -> None:
 
 
 def check_files(folder: Path, candidate: Candidate) -> None:
-    """Raise `InputError` where a file of the candidate is missing or has another hash than its description says."""
+    """Raise `InputError` where a file of the candidate is missing, or differs in hash from its description."""
     wanted = {WEIGHTS: candidate.weights, RECIPE: candidate.recipe, LEDGER: candidate.ledger}
     for name, digest in wanted.items():
         path = folder / name
@@ -145,7 +145,7 @@ def check_files(folder: Path, candidate: Candidate) -> None:
 
 
 def check_bundle(folder: Path) -> None:
-    """Raise `InputError` where a candidate's folder has files of another name, or another card than its weights."""
+    """Raise `InputError` where a candidate's folder has unknown files, or a card that differs from its weights'."""
     from flcav.perception.weights import read_card
 
     for path in sorted(folder.rglob("*")):
@@ -158,10 +158,11 @@ def check_bundle(folder: Path) -> None:
 
 
 def hash_card(weights: Path) -> str:
-    """Return the SHA-256 of the model card in the metadata of a safetensors file; raises `InputError` for none."""
+    """Return the SHA-256 of the model card in a safetensors file's metadata; raises `InputError` if there is none."""
     try:
         check_is_file(weights, None)
         with weights.open("rb") as file:
+            # safetensors: the length of the header, 8 bytes, then the header as JSON
             size = int.from_bytes(file.read(8), "little")
             if size > MOST_HEADER_BYTES:
                 raise ValueError("its header is too long")
@@ -176,13 +177,13 @@ def write_candidate_page(folder: Path, page: str) -> None:
     write_bytes(folder / REPORT, page.encode())
 
 
-UNSIGNED = (ACKNOWLEDGEMENTS, REPORT)  # the page is drawn anew with every acknowledgement, from what is signed
+UNSIGNED = (ACKNOWLEDGEMENTS, REPORT)  # the page is rewritten with every acknowledgement, from the signed files
 MOST_BYTES = 1_000_000  # of a signature
 
 
 @dataclass(frozen=True)
 class Acknowledgement:
-    """Signatures of one party: the names of its keys that signed, and how many are wanted."""
+    """The acknowledgement of one party: its keys with a valid signature, and their threshold."""
 
     party: str
     keys: tuple[str, ...]
@@ -201,9 +202,9 @@ def acknowledge(folder: Path, key: Path) -> Path:
 
 
 def check_acknowledgement(folder: Path, key: PublicKey) -> None:
-    """Raise `InputError` where a key does not sign the candidate in `folder`.
+    """Raise `InputError` unless a key signs the candidate in `folder`.
 
-    Its signature is missing, of another format, or of another content than the folder has now.
+    The signature may be missing, of another format, or of other content.
     """
     from model_signing import hashing, verifying
 
@@ -221,12 +222,12 @@ def check_acknowledgement(folder: Path, key: PublicKey) -> None:
                 verifying.Config().set_hashing_config(hashed).use_elliptic_key_verifier(public_key=Path(pem.name))
             )
             verifier.verify(folder, path)
-    except Exception as error:  # a damaged bundle raises what its parser raises
+    except Exception as error:  # a damaged bundle raises the errors of its parser
         raise InputError(f"{path}: does not sign this candidate ({str(error)[:200] or type(error).__name__})") from None
 
 
 def find_acknowledgements(folder: Path, party: str, keys: list[PublicKey], threshold: int) -> Acknowledgement:
-    """Return the signatures of a party's keys over the candidate as it is now."""
+    """Return the valid signatures of a party's keys over the present candidate."""
     found = []
     for key in keys:
         with contextlib.suppress(InputError):

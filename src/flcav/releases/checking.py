@@ -1,9 +1,9 @@
-"""A vehicle's check of a release: both repositories name it with the same hash (Uptane's full verification).
+"""A vehicle's verification of a release, which both repositories must name with the same hash (Uptane).
 
-Uptane Standard for Design and Implementation 2.1.0, section 5.4.4.2: root, timestamp, snapshot and targets of the
-director, then of the image repository, each by The Update Framework's client workflow; then the two are compared.
-Files come from a repository's folder or web address. Their size is bounded by The Update Framework's client, which
-stops at the expected length, the time by the fetchers of this module.
+Full verification by the Uptane Standard for Design and Implementation 2.1.0, section 5.4.4.2: root, timestamp, snapshot
+and targets of the director, then of the image repository, by The Update Framework's client workflow; then both are
+compared. Files are read from a repository's folder or fetched from its web address. Sizes are limited by The Update
+Framework's client, which stops at the expected length, and times by the fetchers of this module.
 """
 
 import contextlib
@@ -38,11 +38,11 @@ if TYPE_CHECKING:
     from tuf.ngclient import Updater
 
 PIECE_BYTES = 1 << 16
-LONGEST_S = 120.0  # of one file
+LONGEST_S = 120.0  # timeout of one file [s]
 
 
 class RepositoryFetcher(FetcherInterface):
-    """A fetcher of files of a repository by `file://`, `http://` and `https://`; it gives up after `longest_s`."""
+    """A fetcher of a repository's files by `file://`, `http://` and `https://`, with a timeout `longest_s` [s]."""
 
     def __init__(self, longest_s: float = LONGEST_S) -> None:
         self.longest_s = longest_s
@@ -67,7 +67,7 @@ class RepositoryFetcher(FetcherInterface):
 
 
 class CertifiedFetcher(RepositoryFetcher):
-    """A fetcher of files by a client that has a vehicle's certificate."""
+    """A fetcher of files with an HTTP client that has a vehicle's certificate."""
 
     def __init__(self, client: "httpx.Client", longest_s: float = LONGEST_S) -> None:
         super().__init__(longest_s)
@@ -95,7 +95,7 @@ def _read(path: Path) -> Iterator[bytes]:
 
 
 def locate_repository(repository: str) -> str:
-    """Return the address of a repository that is given as a folder or an address; raises `InputError` for neither."""
+    """Return the URL of a repository given as a folder or a URL; raises `InputError` for anything else."""
     try:
         scheme = urlsplit(repository).scheme
     except ValueError as error:
@@ -108,18 +108,18 @@ def locate_repository(repository: str) -> str:
 
 
 REPOSITORIES = {"director": "customer", "image": "provider"}
-FIRST_ROOT = "first.root.json"  # that the vehicle was delivered with
-CLOCK_SLACK = timedelta(hours=1)
+FIRST_ROOT = "first.root.json"  # root with which the vehicle was delivered
+CLOCK_SLACK = timedelta(hours=1)  # tolerated error of the vehicle's clock
 MOST_METADATA_BYTES = 5_000_000
 
 
 class ReleaseRefused(InputError):
-    """Raised where a vehicle does not load a release; the message says why."""
+    """The refusal of a release by a vehicle, with the reason."""
 
 
 @dataclass(frozen=True)
 class RepositorySources:
-    """The two repositories as folders or addresses, and how they are fetched."""
+    """The URLs of both repositories, and their fetcher."""
 
     image: str
     director: str
@@ -128,7 +128,7 @@ class RepositorySources:
 
 @dataclass(frozen=True)
 class Approved:
-    """A release that both parties name with the same hashes."""
+    """A release that both parties sign with the same hashes."""
 
     task: str
     release: int
@@ -139,24 +139,24 @@ class Approved:
 
 @dataclass(frozen=True)
 class CheckedRelease:
-    """What a vehicle found: the release that it is to run, if it is assigned any, and what it downloaded so far."""
+    """The result of a vehicle's verification: its assigned release, if any, and the downloaded metadata."""
 
     approved: Approved | None
     directive: Directive | None
     metadata_bytes: int
-    updater: "Updater"  # of the image repository, which the weights are downloaded with
+    updater: "Updater"  # of the image repository, for downloading the weights
     target: "TargetFile | None"
 
 
 def open_sources(image: str, director: str) -> RepositorySources:
-    """Return the two repositories; raises `InputError` where one is neither a folder nor an address."""
+    """Return both repositories, given as folders or URLs; raises `InputError` for anything else."""
     return RepositorySources(locate_repository(image), locate_repository(director), RepositoryFetcher())
 
 
 def trust_roots(folder: Path, image_root: bytes, director_root: bytes) -> None:
-    """Keep the two roots that a vehicle is delivered with, in its folder.
+    """Write the two roots that a vehicle is delivered with to its folder.
 
-    Raises `InputError` for roots of the wrong party, and where a key is among those of both parties or of one twice.
+    Raises `InputError` for roots of the wrong party, and for a key that both parties have, or one has twice.
     """
     from tuf.api.exceptions import RepositoryError
     from tuf.api.metadata import Metadata, Root
@@ -186,10 +186,10 @@ def trusts_roots(folder: Path) -> bool:
 def check_release(
     folder: Path, vehicle: str, sources: RepositorySources, task: str = "objects", now: datetime | None = None
 ) -> CheckedRelease:
-    """Return the release of a task that `vehicle` is to run by both repositories; nothing is installed.
+    """Return the release of a task that both repositories assign to `vehicle`, without installing it.
 
-    folder: the vehicle's, see `trust_roots`; the metadata that it trusts are kept there. now: the vehicle's clock.
-    Raises `ReleaseRefused` for anything that both parties did not sign, and where the clock is off.
+    folder: of the vehicle, with its roots and trusted metadata, see `trust_roots`. now: the vehicle's clock. Raises
+    `ReleaseRefused` for anything that both parties did not sign, and for a wrong clock.
     """
     at = now or datetime.now(UTC)
     before = sources.fetcher.received_bytes
@@ -211,7 +211,7 @@ def check_release(
 
 
 def _refresh(folder: Path, name: str, sources: RepositorySources, at: datetime) -> "Updater":
-    """Return the updater of a repository after The Update Framework's client workflow."""
+    """Run The Update Framework's client workflow on a repository, and return its updater."""
     from tuf.ngclient import Updater, UpdaterConfig
 
     kept = folder / "metadata" / name
@@ -230,6 +230,7 @@ def _refresh(folder: Path, name: str, sources: RepositorySources, at: datetime) 
             config=config,
             bootstrap=root.read_bytes(),
         )
+        # the client checks expiry against the vehicle's clock rather than this machine's
         updater._trusted_set.reference_time = at
         updater.refresh()
     _check_clock(updater, name, at)
@@ -237,7 +238,7 @@ def _refresh(folder: Path, name: str, sources: RepositorySources, at: datetime) 
 
 
 def _check_clock(updater: "Updater", name: str, at: datetime) -> None:
-    """Raise `ReleaseRefused` where metadata expire later than any signed now: the clock is behind, or was set back."""
+    """Raise `ReleaseRefused` if the timestamp was signed in the future: the clock is behind, or was set back."""
     timestamp = updater._trusted_set.timestamp
     made = timestamp.expires - LIFETIME["timestamp"]
     if at + CLOCK_SLACK < made:
@@ -248,7 +249,7 @@ def _check_clock(updater: "Updater", name: str, at: datetime) -> None:
 
 
 def _check_parties(director: "Updater", image: "Updater") -> None:
-    """Raise `ReleaseRefused` where a key that was added later is among those of both parties, or of one twice."""
+    """Raise `ReleaseRefused` if the current roots share a key between both parties, or have one twice."""
     roots: list[Root] = [director._trusted_set.root, image._trusted_set.root]
     try:
         check_distinct([key for root in roots for key in root_keys(root)], "the keys of provider and customer together")
@@ -257,7 +258,7 @@ def _check_parties(director: "Updater", image: "Updater") -> None:
 
 
 def _same(director: "Updater", image: "Updater", name: str) -> "TargetFile":
-    """Return the image repository's entry of a target, which the director's must equal in hashes and length."""
+    """Return the image repository's entry of a target; raises `ReleaseRefused` unless the director's is equal."""
     with refuse_release(name):
         wanted, known = director.get_targetinfo(name), image.get_targetinfo(name)
     if wanted is None:
@@ -282,7 +283,7 @@ def _read_description(image: "Updater", target: "TargetFile", name: str) -> Cand
 
 @contextlib.contextmanager
 def refuse_release(what: str) -> Iterator[None]:
-    """Turn the errors of The Update Framework's client into `ReleaseRefused` with what it was about."""
+    """Turn the errors of The Update Framework's client into `ReleaseRefused`, whose message starts with `what`."""
     from tuf.api.exceptions import DownloadError, RepositoryError
 
     try:

@@ -1,9 +1,9 @@
-"""Atomic installation of a release in a vehicle: power may fail at any time, and the old network drives until then.
+"""Atomic installation of a release in a vehicle, safe against power failure at any time.
 
-FOLDER/metadata/{image,director}/     what the vehicle trusts
-FOLDER/incoming/                      files on their way
+FOLDER/metadata/{image,director}/     trusted metadata
+FOLDER/incoming/                      files being downloaded
 FOLDER/networks/HASH.safetensors      weights by their hash
-FOLDER/current.json                   the network that drives; replaced last, by a rename
+FOLDER/current.json                   the driving network; replaced last, by a rename
 """
 
 from dataclasses import dataclass
@@ -28,7 +28,7 @@ CURRENT = "current.json"
 
 @dataclass(frozen=True)
 class Installed(Record):
-    """The network that drives a vehicle."""
+    """The driving network of a vehicle."""
 
     task: str
     release: int
@@ -36,9 +36,9 @@ class Installed(Record):
 
 
 def read_installed(folder: Path) -> Installed | None:
-    """Return the network that drives; None before the first. Raises `ReleaseRefused` where its file has changed.
+    """Return the driving network; None before the first. Raises `ReleaseRefused` where its file has changed.
 
-    A vehicle calls it when it starts, so that weights that were changed on its disk are not loaded.
+    A vehicle calls it when it starts, so that weights modified on its disk are not loaded.
     """
     path = folder / CURRENT
     if not path.is_file():
@@ -51,24 +51,24 @@ def read_installed(folder: Path) -> Installed | None:
 
 
 def weights_path(folder: Path, installed: Installed) -> Path:
-    """Return the file of the weights of a network that was installed."""
+    """Return the file of an installed network's weights."""
     return folder / "networks" / f"{installed.weights}.safetensors"
 
 
 @dataclass(frozen=True)
 class Fetched:
-    """What a vehicle has fetched beside the network that drives."""
+    """The result of a fetch: the driving network, and a newer one."""
 
     driving: Installed | None
-    newer: Approved | None  # that is to drive instead; its weights are in the vehicle's folder, as approved
+    newer: Approved | None  # will replace it; its verified weights are in the vehicle's folder
 
 
 def update_vehicle(
     folder: Path, vehicle: str, sources: RepositorySources, task: str = "objects", now: datetime | None = None
 ) -> Installed | None:
-    """Install the release of a task that both parties name for `vehicle`; return the network that drives then.
+    """Install the release of a task that both parties sign for `vehicle`; return the driving network.
 
-    Without one that is newer than the installed, that one goes on. Raises `ReleaseRefused` as `fetch_release`.
+    Without a newer one it is unchanged. now: the vehicle's clock. Raises `ReleaseRefused` as `fetch_release`.
     """
     found = fetch_release(folder, vehicle, sources, task, now)
     return found.driving if found.newer is None else install_release(folder, found.newer)
@@ -77,10 +77,10 @@ def update_vehicle(
 def fetch_release(
     folder: Path, vehicle: str, sources: RepositorySources, task: str = "objects", now: datetime | None = None
 ) -> Fetched:
-    """Fetch and verify the release of a task that both parties name for `vehicle`; what drives is left as it is.
+    """Fetch and verify the release of a task that both parties sign for `vehicle`, without installing it.
 
-    Raises `ReleaseRefused` for anything that both parties did not sign, a number below the installed, and where the
-    clock is off.
+    now: the vehicle's clock. Raises `ReleaseRefused` for anything that both parties did not sign, a number that is not
+    above the installed one, and a wrong clock.
     """
     driving = read_installed(folder)
     checked = check_release(folder, vehicle, sources, task, now)
@@ -96,9 +96,9 @@ def fetch_release(
 
 
 def download(folder: Path, checked: CheckedRelease, approved: Approved) -> None:
-    """Download the weights of an approved release, unless the vehicle keeps them.
+    """Download the weights of an approved release, unless the vehicle has them.
 
-    Raises `ReleaseRefused` where the file is another than was approved, or its card another than its description's.
+    Raises `ReleaseRefused` where the file is not the approved one, or its card not that of the description.
     """
     kept = weights_path(folder, Installed(approved.task, approved.release, approved.weights))
     if kept.is_file() and sha256(kept) == approved.weights:
@@ -113,14 +113,15 @@ def download(folder: Path, checked: CheckedRelease, approved: Approved) -> None:
 
 
 def install_release(folder: Path, approved: Approved) -> Installed:
-    """Make an approved release, whose weights are in a vehicle's folder, the network that drives."""
+    """Make an approved release, whose weights are in a vehicle's folder, its driving network."""
+    # an atomic rename: until it, the old network drives, and from it on the new one
     installed = Installed(approved.task, approved.release, approved.weights)
     write_json(folder / CURRENT, installed.as_json())
     return installed
 
 
 def check_card(weights: Path, approved: Approved) -> None:
-    """Raise `ReleaseRefused` where the card in the weights is not the one that the parties acknowledged."""
+    """Raise `ReleaseRefused` where the card in the weights is not the acknowledged one."""
     try:
         known = hash_card(weights)
     except InputError as error:

@@ -1,4 +1,4 @@
-"""Signing keys of a party: elliptic keys of NIST's curve P-256, in PEM files.
+"""Signing keys of a party: elliptic-curve keys on NIST's P-256, in PEM files.
 
 The same key signs a candidate's folder (OpenSSF Model Signing) and a repository's metadata (The Update Framework).
 """
@@ -19,12 +19,12 @@ from flcav.config import InputError, check_is_file
 if TYPE_CHECKING:
     from securesystemslib.signer import CryptoSigner
 
-SHORT = 16  # hexadecimal digits of a key's name
+SHORT = 16  # hexadecimal digits in a key's name
 
 
 @dataclass(frozen=True)
 class PublicKey:
-    """A public key by its encoded point, so that a key has one name whatever text it comes from."""
+    """A public key in canonical PEM text, so that equal keys have equal names, whatever their encoding was."""
 
     pem: str  # SubjectPublicKeyInfo, as this module writes it
 
@@ -42,18 +42,18 @@ class PrivateKey:
 
     @property
     def public(self) -> PublicKey:
-        """Return its public key."""
+        """Return the public key."""
         return PublicKey(_pem(self.key.public_key()))
 
     def signer(self) -> "CryptoSigner":
-        """Return the signer of metadata."""
+        """Return the key as a signer of metadata."""
         from securesystemslib.signer import CryptoSigner
 
         return CryptoSigner(self.key)
 
 
 def generate_key(path: Path) -> PrivateKey:
-    """Write a new private key to `path`, which only its owner can read, and its public key beside it (.pub)."""
+    """Write a new private key to `path`, readable only by its owner, and its public key to `path` with suffix .pub."""
     key = ec.generate_private_key(ec.SECP256R1())
     text = key.private_bytes(
         serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
@@ -66,7 +66,7 @@ def generate_key(path: Path) -> PrivateKey:
 
 
 def read_private_key(path: Path) -> PrivateKey:
-    """Return the private key in a PEM file; raises `InputError` for none, and one of another curve."""
+    """Return the private key in a PEM file; raises `InputError` if there is none, or one on another curve."""
     check_is_file(path)
     try:
         key = serialization.load_pem_private_key(path.read_bytes(), None)
@@ -78,13 +78,13 @@ def read_private_key(path: Path) -> PrivateKey:
 
 
 def read_public_key(path: Path) -> PublicKey:
-    """Return the public key in a PEM file; raises `InputError` for a file without one, or with one of another curve."""
+    """Return the public key in a PEM file; raises `InputError` if there is none, or one on another curve."""
     check_is_file(path)
     return parse_public_key(path.read_bytes(), str(path))
 
 
 def parse_public_key(pem: bytes, origin: str) -> PublicKey:
-    """Return the public key in a PEM text, which is written anew from its point; raises as `read_public_key`."""
+    """Return the public key in a PEM text, encoded canonically; raises as `read_public_key`."""
     try:
         key = serialization.load_pem_public_key(pem)
     except (ValueError, TypeError, UnsupportedAlgorithm):
@@ -95,7 +95,7 @@ def parse_public_key(pem: bytes, origin: str) -> PublicKey:
 
 
 def check_distinct(keys: Sequence[PublicKey], whose: str) -> None:
-    """Raise `InputError` where a key is among `keys` twice, which would count one owner as two."""
+    """Raise `InputError` where `keys` contain a key twice, which would count one owner as two."""
     names = [key.pem for key in keys]
     for number, name in enumerate(names):
         if name in names[:number]:

@@ -1,4 +1,4 @@
-"""Proposal of a release: a trained network with its provenance becomes a candidate's folder."""
+"""Proposal of a release: creates a candidate's folder from a trained network and its provenance."""
 
 import shutil
 from collections.abc import Sequence
@@ -46,18 +46,18 @@ def propose(
     Args:
         out: the folder, which may not exist yet.
         weights: safetensors file of the candidate with its model card.
-        driving: safetensors file of the network that drives.
+        driving: safetensors file of the driving network.
         release: number of the release.
-        changes: what changed, in words.
-        audience: for whom, in words.
+        changes: description of the changes.
+        audience: description of its users.
         task: name of the perception task.
-        data: datasets that it was trained on, besides those of its card; weights without a card, as a federation's, get
-            one.
-        recipe: the recipe of the run that trained it.
-        ledger: the ledger of that run.
+        data: training datasets besides those of its card; weights without a card, such as a federation's, get one.
+        recipe: recipe of the run that trained it.
+        ledger: ledger of that run.
 
     Raises:
-        InputError: for a folder that exists, weights of no network of the task, without a card, or a wrong ledger.
+        InputError: for a folder that exists, weights that are no network of the task or have no card, or an invalid
+            ledger.
     """
     if out.exists():
         raise InputError(f"{out}: exists already; a candidate is a new folder")
@@ -102,9 +102,9 @@ def _enter(task: Task, data: Dataset, config: object) -> DataEntry:
 
 
 def _complete_card(task: Task, network: nn.Module, path: Path, entries: tuple[DataEntry, ...]) -> Card:
-    """Return the card of the weights at `path`, with the datasets in `entries` too; it is written into the file.
+    """Return the card of the weights at `path` plus the datasets in `entries`, and write it into the file.
 
-    Raises `InputError` for weights without a card where no dataset is named.
+    Raises `InputError` for weights without a card if no dataset is given.
     """
     try:
         card = read_card(path)
@@ -130,9 +130,9 @@ def _complete_card(task: Task, network: nn.Module, path: Path, entries: tuple[Da
 
 
 def trace_data(card: Card) -> tuple[DataHash, ...]:
-    """Return the datasets that a card names: of training, and the one by which its best epoch was chosen.
+    """Return the datasets in a card: those of training, and that of validation.
 
-    Raises `InputError` where what the card has for a manifest's SHA-256 is none.
+    Raises `InputError` where a manifest's SHA-256 in the card is invalid.
     """
     known = tuple(_trace(entry, "training") for entry in card.data)
     return known if card.validation is None else (*known, _trace(card.validation, "validation"))
@@ -152,7 +152,7 @@ def _trace(entry: DataEntry, use: Literal["training", "validation"]) -> DataHash
 
 
 def sum_ledger(ledger: Ledger) -> tuple[LedgerSum, ...]:
-    """Return the bytes of a ledger by stage, link and direction."""
+    """Return the sums of a ledger by stage, link and direction [bytes]."""
     sums: dict[tuple[str, str, str], int] = {}
     for entry in ledger:
         key = (entry.stage, entry.link, entry.direction)

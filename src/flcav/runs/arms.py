@@ -61,7 +61,7 @@ TRACKED = (*PRETRAINED, "placement", "labels")  # those that decide the vehicles
 OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
 
 
-class Calls(NamedTuple):
+class CalledNumbers(NamedTuple):
     """The numbers of vehicles that a plan chooses a group's from."""
 
     least: int
@@ -77,7 +77,7 @@ class Setting:
     repeat: int  # 0: the arm itself; n: its n-th retraining
     pretrain_repeat: int  # of its pretraining; 0 where retrainings share it
     plan: PlanRule
-    calls: Calls | None  # vehicles that the plan calls to a group; None: it does not decide
+    calls: CalledNumbers | None  # vehicles that the plan calls to a group; None: it does not decide
     placement: PlacementSettings
     labels: Mapping[str, str]  # kind of labels, by task
     fault: Fault | None  # of the labels, the rest of which are ground truth
@@ -159,7 +159,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
     )
 
 
-def find_calls(recipe: RunRecipe, how: Federation) -> Calls | None:
+def find_calls(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:
     """Return the numbers of vehicles that a plan chooses from; None where all of a region take part."""
     return next((found for find in load_all(CALLS) if (found := find(recipe, how)) is not None), None)
 

@@ -18,7 +18,7 @@ from flcav.runs.spread import list_spreads
 from flcav.runs.stages.deployment import deploy
 from flcav.runs.stages.graph import Graph
 from flcav.runs.tables import append_records
-from flcav.runs.training.records import save_rounds
+from flcav.runs.training.records import write_rounds
 
 WORK, HISTORY, SPREAD = "work", "history.csv", "spread.csv"
 RESULTS = Run.file
@@ -160,7 +160,7 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name
     append_records(history, make_history_points(result, name))
     if graph.recipe.retrainings:
         append_records(history.with_name(SPREAD), list_spreads(result, name))
-    save_rounds(result, out)
+    write_rounds(result, out)
     result.save(out)
     return result
 

@@ -98,6 +98,6 @@ def parse_history(task: str, text: str, origin: str) -> History:
     return found[task]
 
 
-def load_history(name: str) -> History:
+def load_known_history(name: str) -> History:
     """Return the package's learning history of the task `name`."""
     return parse_history(name, read_history(name, name, Path()), name)

@@ -17,7 +17,7 @@ from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.sources.recipe import CarlaRecipe, Recipe, parse_recipe
 
 pytest.importorskip("carla")
-from flcav.carla.recording.labels import CameraSight, LidarSweep, annotate_bodies, enter_box
+from flcav.carla.recording.labels import CameraSight, LabelledSweep, annotate_bodies, enter_box
 from flcav.carla.recording.sensors import Feed, SemanticSweep, read_depths, read_lidar_points
 from flcav.carla.recording.session import Session, _check_version, check_installed
 from flcav.carla.recording.source import CarlaSource
@@ -197,7 +197,7 @@ def test_occlusion_is_the_share_that_a_wall_hides(body: TrackedBody, wall_y: flo
     points = (lines[back] * distance[back, None]).astype(np.float32)
     actor = np.where(met[back] == 2, body.number, 0).astype(np.uint32)
     tag = np.where(met[back] == 2, 14, 4).astype(np.uint32)
-    sweep = LidarSweep(
+    sweep = LabelledSweep(
         LIDAR, HERE, np.column_stack((points, np.ones(len(points), np.float32))), SemanticSweep(points, actor, tag)
     )
     eye = Lens(width=640, height=240, fov_deg=60)

@@ -5,7 +5,7 @@ import pytest
 
 from flcav.optimization.graph import to_problem
 from flcav.reproductions.fig3a.run import Fig3a, article_graph, draw_fig3a, fig3a
-from flcav.runs.tables import load_history
+from flcav.runs.tables import load_known_history
 
 pytestmark = pytest.mark.slow
 
@@ -33,7 +33,7 @@ def test_bands_hold_their_curve_and_curves_rise(results: Fig3a) -> None:
 
 def test_every_point_of_our_own_history_is_drawn(results: Fig3a) -> None:
     drawn = sum(len(line.points) for line in results.own.lines)
-    assert drawn == len(load_history("objects").accuracy)
+    assert drawn == len(load_known_history("objects").accuracy)
 
 
 def test_the_figure_is_drawn_from_what_the_file_holds(results: Fig3a) -> None:

@@ -33,12 +33,16 @@ from flcav.runs.extras.distillation.labelling import RoadAverageLabels
 from flcav.runs.frames import Frames
 from flcav.runs.labels import quality
 from flcav.runs.labels.quality import measure_labels, read_label_history
+from flcav.runs.recipe import CLOUD, EDGE
 from flcav.runs.results.training import FoundTargets
+from flcav.runs.stages.regions import Labelling
+from flcav.runs.stages.settings import RegionInputs
 from flcav.sensors.frame import Annotations, Calibration, Frame
 from flcav.world.map.layers import MapLane, MapLayers
 
 CONFIG = second_tiny().config
 ACCURATE = Navigation(0.01, 0.001)
+GRID = RegionInputs(region="grid", plan="", pretrain="", frames="", place="", group_range_m=0.0, recorded=False)
 BOTH, ROAD_ALONE, OUT_OF_SIGHT, GHOST, UNSURE = (12.0, 3.0), (20.0, -6.0), (30.0, 15.0), (25.0, 4.0), (35.0, 16.0)
 
 
@@ -300,11 +304,8 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     monkeypatch.setattr(quality, "asked_of", lambda frame, config: truth)
     how, errors = Distillation(), NavigationErrors(position_m=0.05, heading_deg=0.1)
     split = Frames(cast(Any, data), (0, 1), {})
-    book, weights, about = (
-        Ledger(LinkMegabytes(1.0, 0.0)),
-        to_arrays(second_tiny()),
-        (how, errors, CONFIG, 0.6, split, (0, 1), (3,)),
-    )
+    book, weights = Ledger(LinkMegabytes(1.0, 0.0)), to_arrays(second_tiny())
+    about = Labelling(split, (0, 1), (3,), CONFIG, 0.6, GRID, book, EDGE)
     given: list[Any] = []
 
     def distil(*arguments: Any) -> Sample:
@@ -312,7 +313,7 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
         return distil_sample(*arguments)
 
     monkeypatch.setattr(road_average, "distil_sample", distil)
-    labels = RoadAverageLabels(*about, "grid", book, folder=tmp_path)
+    labels = RoadAverageLabels(how, errors, about, tmp_path)
     labels.send_views()
     assert {entry.bytes for entry in book.entries} == {len(seen.message())}
     assert [(entry.direction, entry.round) for entry in book.entries] == [("down", 0)] * 2
@@ -332,15 +333,16 @@ def test_each_round_sends_boxes_up_and_averages_down_and_labels_anew(
     labels.renew(2, weights)  # as after a stop
     history = read_label_history(tmp_path).rounds
     assert [(each.round, each.precision, each.recall) for each in history] == [(1, 1.0, 1.0), (2, 1.0, 1.0)]
-    last = RoadAverageLabels(*about, "grid", later := Ledger(LinkMegabytes(1.0, 0.0)), "cloud")
+    later = Ledger(LinkMegabytes(1.0, 0.0))
+    last = RoadAverageLabels(how, errors, replace(about, book=later, stage=CLOUD))
     last.renew(1, weights)
     assert [replace(entry, stage="edge") for entry in later.entries] == list(sent)  # the same messages
     assert {entry.stage for entry in later.entries} == {"cloud"}
     np.testing.assert_array_equal(last["grid/cav0"][0].boxes.array(), own[0].boxes.array())
     assert read_label_history(tmp_path).rounds == history
-    mapless = (how.model_copy(update={"map_context": False}), *about[1:])
-    as_told = RoadAverageLabels(*mapless, "grid", Ledger(LinkMegabytes(1.0, 0.0)), "cloud")
+    mapless, unused = how.model_copy(update={"map_context": False}), Ledger(LinkMegabytes(1.0, 0.0))
+    as_told = RoadAverageLabels(mapless, errors, replace(about, book=unused, stage=CLOUD))
     as_told.renew(1, weights)
     assert as_told["grid/cav0"][0].boxes.yaw == pytest.approx(0, abs=0.05)
     with pytest.raises(BudgetExceeded, match="wireless uplink budget exceeded: grid/cav1"):
-        RoadAverageLabels(*about, "grid", Ledger(LinkMegabytes(1e-4, 0.0))).renew(3, weights)
+        RoadAverageLabels(how, errors, replace(about, book=Ledger(LinkMegabytes(1e-4, 0.0)))).renew(3, weights)

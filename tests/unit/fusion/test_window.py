@@ -20,10 +20,14 @@ from flcav.runs.extras.distillation.labelling import RoadAverageLabels
 from flcav.runs.frames import Frames, list_window
 from flcav.runs.labels import pseudo_labels, sightings
 from flcav.runs.labels.pseudo_labels import pseudo_label_samples
+from flcav.runs.recipe import EDGE
+from flcav.runs.stages.regions import Labelling
+from flcav.runs.stages.settings import RegionInputs
 from flcav.sensors.frame import Annotations, Calibration, Frame
 
 CONFIG = second_tiny().config
 ACCURATE = Navigation(0.01, 0.001)
+GRID = RegionInputs(region="grid", plan="", pretrain="", frames="", place="", group_range_m=0.0, recorded=False)
 PLACE, HIDDEN = (15.0, 4.0), (20.0, -6.0)
 SPEED_MPS = 10.0
 
@@ -150,8 +154,8 @@ def test_labels_are_of_windows_and_each_frame_is_sent_once(
     monkeypatch.setattr(road_average, "road_views", see)
     monkeypatch.setattr(sightings, "detect_in", lambda network, frames, **how: [car(*PLACE, z=-1.0)])
     how, errors = Distillation(window_s=window_s), NavigationErrors(position_m=0.05, heading_deg=0.1)
-    book, about = Ledger(LinkMegabytes(1.0, 0.0)), (how, errors, CONFIG, 0.6, split, split.vehicles, (3,))
-    labels = RoadAverageLabels(*about, "grid", book)
+    book = Ledger(LinkMegabytes(1.0, 0.0))
+    labels = RoadAverageLabels(how, errors, Labelling(split, split.vehicles, (3,), CONFIG, 0.6, GRID, book, EDGE))
     labels.renew(1, to_arrays(second_tiny()))
     sent = [(each.direction, each.client) for each in book.entries]
     assert (sent.count(("up", "grid/cav0")), sent.count(("up", "grid/cav1"))) == (told / 2, told / 2)

@@ -17,7 +17,7 @@ from flcav.optimization.allocation.allocate import Allocation, allocate, weighte
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.allocation.replanning import PlanState, condition_problem
 from flcav.optimization.solvers.instance import Infeasible, build_instance
-from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, relax
+from flcav.optimization.solvers.separable import ContinuousOptimum, Separable, solve_two_budgets
 
 MODELS = ("additive", "effective", "federated")
 
@@ -100,7 +100,7 @@ def both_solvers(wireline: float, members: int) -> tuple[ContinuousOptimum, floa
     of = np.repeat(np.arange(n), members)
     low, high = np.zeros(n), np.tile([5000.0, 100.0, 100.0], n // 3)
     budget = 1000.0 * n / 3 * np.array([1.0, wireline])
-    ours = relax(Separable(a, b, x0, low, high, cost.reshape(-1, 2), budget, of if members > 1 else None))
+    ours = solve_two_budgets(Separable(a, b, x0, low, high, cost.reshape(-1, 2), budget, of if members > 1 else None))
     x = cp.Variable(n)
     error = cp.sum(cp.multiply(a, cp.exp(cp.multiply(-b, cp.log(x[of] + x0)))))
     theirs = cp.Problem(cp.Minimize(error), [cost.reshape(-1, 2).T @ x <= budget, x >= low, x <= high])
@@ -115,7 +115,7 @@ def test_marginal_values_are_the_slope_of_the_relaxed_optimum():
     rates = (plan.marginal_error_per_gb.wireless_mb, plan.marginal_error_per_gb.wireline_mb)
     for link, rate in enumerate(rates):
         step = 1e-3 * powers.budget[link] * np.eye(2)[link]
-        less, more = (relax(replace(powers, budget=powers.budget + sign * step)).bound for sign in (-1, 1))
+        less, more = (solve_two_budgets(replace(powers, budget=powers.budget + sign * step)).bound for sign in (-1, 1))
         assert rate > 0
         assert rate == pytest.approx(1000 * (less - more) / (2 * step[link]), rel=0.02)
 

@@ -28,7 +28,7 @@ from flcav.optimization.solvers.fairness import (
 )
 from flcav.optimization.solvers.instance import Instance as Arrays
 from flcav.optimization.solvers.instance import build_instance
-from flcav.optimization.solvers.separable import relax as relax_separable
+from flcav.optimization.solvers.separable import solve_two_budgets as relax_separable
 from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
 
 POLES, ERRORS = 16, 60

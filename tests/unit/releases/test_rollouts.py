@@ -19,7 +19,7 @@ from flcav.releases.candidate import CANDIDATE, WEIGHTS, read_candidate
 from flcav.releases.repositories.metadata import Directive, is_assigned
 from flcav.releases.repositories.repository import publish
 from flcav.releases.rollout.deployed import share_of
-from flcav.releases.rollout.simulated_fleet import deliver
+from flcav.releases.rollout.simulated_fleet import deliver_release
 from flcav.releases.rollout.stages import (
     STAGES,
     change_share,
@@ -155,7 +155,7 @@ def test_delivery_takes_as_long_as_the_rate_says_and_is_priced():
         radio, time_s, ("cav0", "cav1"), ("pole0",), np.full(shape, 50.0), np.zeros(shape, np.int8), loss
     )
     ledger, size = Ledger(LinkMegabytes(0, 0)), 4_000_000
-    first, second = deliver(links, links.vehicle, 7, size, NetworkSettings(radio=radio), ledger)
+    first, second = deliver_release(links, links.vehicle, 7, size, NetworkSettings(radio=radio), ledger)
     rate = float(lone_rate_bps(links.received_dbm[0, 0], radio)[0])
     shared_s = NetworkSettings().rounds.outage_s  # until the second gives up, each has half of the band
     assert first.at_s == pytest.approx(8 * size / rate + shared_s / 2, rel=1e-6)

@@ -21,7 +21,7 @@ from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER
 from flcav.runs.results.training import FederatedRound, LabelQuality, PrivacySpent, StageResult
 from flcav.runs.training.checkpoints import Checkpoint
-from flcav.runs.training.records import EVENTS, ROUNDS, read_rounds, save_rounds, tabulate_rounds
+from flcav.runs.training.records import EVENTS, ROUNDS, read_rounds, tabulate_federated_rounds, write_rounds
 
 
 def entry(link: Link, direction: Direction, round_: int, client: str, size: int) -> LedgerEntry:
@@ -64,10 +64,10 @@ def with_rounds(*records: FederatedRound) -> Run:
 def test_rounds_are_a_table_curves_and_rows_of_the_page(tmp_path: Path) -> None:
     first = FederatedRound("grid", 1, ("grid/cav0",), {"grid/cav1": "no power"}, 6, 0.5, 2_000_000, 50, 3.5, 12.5)
     run = with_rounds(first, replace(first, round=2, failed={}, loss=0.25, epsilon=5.0))
-    save_rounds(run, tmp_path)
-    save_rounds(run, tmp_path)  # a run that is collected again leaves one set of curves
+    write_rounds(run, tmp_path)
+    write_rounds(run, tmp_path)  # a run that is collected again leaves one set of curves
     rows = pq.read_table(tmp_path / ROUNDS).to_pylist()
-    assert rows == tabulate_rounds(run).to_pylist()
+    assert rows == tabulate_federated_rounds(run).to_pylist()
     assert [(row["arm"], row["stage"], row["task"], row["round"]) for row in rows] == [
         (MAIN, EDGE, "objects", number) for number in (1, 2)
     ]

@@ -30,7 +30,7 @@ from flcav.runs.extras.groups.members import (
     Unreadable,
     answer_requests,
     read_loss,
-    read_request,
+    read_position,
     take_requests,
 )
 
@@ -59,7 +59,7 @@ def test_a_check_is_by_the_loss_on_what_is_held_back(limit: float, asks: bool) -
 def test_messages_of_a_member() -> None:
     own = member(1.0)
     request = own.answer(REQUEST, {SCENE: np.array([1])})[MESSAGE].tobytes()
-    assert (read_request(request).tolist(), read_loss(request)) == ([10.0, -3.0, 1.0], 3.25)
+    assert (read_position(request).tolist(), read_loss(request)) == ([10.0, -3.0, 1.0], 3.25)
     better = {"weight": np.array([[2.0]], np.float32), "bias": np.array([1.0], np.float32)}  # errs by 1
     assert read_loss(own.answer(SCORE, better)[MESSAGE].tobytes()) == 1.0
     offer = Offer.read(own.answer(OFFER, {})[MESSAGE].tobytes())

@@ -36,7 +36,7 @@ from flcav.runs.arms import PlanRule
 from flcav.runs.recipe import FixedPlan, PlanLimits, load_run_recipe
 from flcav.runs.results.plans import TaskPlan
 from flcav.runs.spread import read_spreads
-from flcav.runs.tables import HistoryPoint, append_records, load_history, parse_history
+from flcav.runs.tables import HistoryPoint, append_records, load_known_history, parse_history
 from flcav.runs.training.updates import model_mb
 
 RECIPES = Path(__file__).parents[3] / "recipes/runs"
@@ -266,7 +266,7 @@ def plan_recipe(name: str, wireless: float = 1, wireline: float = 1, rule: PlanR
     groups = tuple(recipe.vehicles(region) for region in recipe.with_role("federate"))
     sizes = MessageSizes(sample_mb=0.448, model_mb=model_mb(OBJECTS, own.network))  # a sweep: as in docs/runs.md
     candidates = pool.scenes * pool.spins * pool.cavs
-    request = PlanRequest("objects", own.weight, sizes, candidates, load_history("objects"), None, own.train_s)
+    request = PlanRequest("objects", own.weight, sizes, candidates, load_known_history("objects"), None, own.train_s)
     settings = PlanSettings(
         budgets_mb=LinkMegabytes(wireless * recipe.budgets_mb.wireless, wireline * recipe.budgets_mb.wireline),
         headroom=recipe.headroom,
@@ -295,7 +295,7 @@ def test_doubling_up_to_a_recipe_s_budget_is_worth_more_than_trainings_differ_an
 def test_plans_of_the_comparison_of_plans_stay_within_what_the_history_covers() -> None:
     limits, covered = (
         load_run_recipe(RECIPES / "allocation.yaml").limits,
-        load_history("objects").resources.max(axis=0),
+        load_known_history("objects").resources.max(axis=0),
     )
     assert (limits.edge_rounds[1], limits.cloud_rounds[1]) == (None, None)  # rounds: the history's
     assert limits.samples[1] == covered[0]
@@ -324,7 +324,7 @@ def test_runs_of_the_package_s_histories_are_predicted_from_the_others(
     before: tuple[float, float],
     pretrained: tuple[float, float],
 ) -> None:
-    found = hold_out_runs(load_history(task), partial(fit, model="best", group_samples=(4, 3)))
+    found = hold_out_runs(load_known_history(task), partial(fit, model="best", group_samples=(4, 3)))
     assert (found.runs, found.points) == (runs, points)
     assert (found.mean_error, found.rank_correlation) == pytest.approx(agreement, abs=5e-4)
     assert (found.between_runs, found.within_runs) == pytest.approx(noise, abs=5e-5)
@@ -363,7 +363,7 @@ def test_a_models_size_is_what_flower_sends() -> None:
 
 @pytest.mark.parametrize("name", ["objects", "signs", "weather"])
 def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
-    known = load_history(name)
+    known = load_known_history(name)
     assert len(known.accuracy) >= 6
     problem = make_plan((PlanRequest(name, 1.0, SIZES, 400, known, None),), frame(), "joint")[1]
     assert problem is not None
@@ -377,7 +377,7 @@ def test_a_history_of_the_package_falls_with_every_resource(name: str) -> None:
 @pytest.mark.parametrize(("name", "costs"), [("objects", False), ("signs", True), ("weather", False)])
 def test_curves_say_what_the_first_cloud_round_did_in_the_histories(name: str, costs: bool) -> None:
     """The mean over runs of what the first cloud round changed, and what all six did, against the curve's."""
-    known = load_history(name)
+    known = load_known_history(name)
     runs, (_, edge, cloud) = np.array(known.runs), known.resources.T
 
     def change(cloud_rounds: int) -> float:

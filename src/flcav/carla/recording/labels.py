@@ -27,7 +27,7 @@ PEOPLE = (SEMANTICS["pedestrian"],)
 
 
 class LidarSweep(NamedTuple):
-    """The sweep of a LiDAR, and that of the semantic LiDAR with the same pose."""
+    """The sweep of a LiDAR, and what the semantic one beside it met."""
 
     lidar: Lidar
     world_from_sensor: Array  # (4, 4) [m]
@@ -48,7 +48,7 @@ def annotate_bodies(
     state: State,
     own: int | None,
     within: NDArray[np.bool_],
-    sweeps: Mapping[str, LidarSweep],
+    sweeps: Mapping[str, LabelledSweep],
     sights: Mapping[str, CameraSight],
 ) -> tuple[Annotations, dict[str, NDArray[np.uint16]]]:
     """Return the annotations of M bodies, and the instance images (H, W) of the cameras, by name.
@@ -94,7 +94,7 @@ def enter_box(origin: Array, directions: Array, half: Array) -> tuple[NDArray[np
     return (near <= far) & (far > 0), np.maximum(near, 0.0)
 
 
-def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) -> NDArray[np.int64]:
+def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LabelledSweep) -> NDArray[np.int64]:
     """Count (M,) a LiDAR's points on bodies: a point belongs to the actor of the nearest point of the semantic LiDAR.
 
     A parked vehicle is not an actor of CARLA: points of a vehicle class in its box count.
@@ -112,7 +112,7 @@ def _count_returns(boxes: Boxes, numbers: NDArray[np.int64], sweep: LidarSweep) 
     return counts
 
 
-def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[LidarSweep]) -> Array:
+def _hide_from_lidars(boxes: Boxes, numbers: NDArray[np.int64], sweeps: list[LabelledSweep]) -> Array:
     """Return the share (M,) of the rays towards boxes that end before them, over all LiDARs; 1 where none arrives."""
     visible, hidden, rays = np.zeros((3, len(boxes)), np.int64)
     for sweep in sweeps:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.carla.frames import MapFrame
-from flcav.carla.recording.labels import CameraSight, LidarSweep, annotate_bodies
+from flcav.carla.recording.labels import CameraSight, LabelledSweep, annotate_bodies
 from flcav.carla.recording.sensors import (
     Feed,
     depth_name,
@@ -199,7 +199,7 @@ class CarlaSource(DividedSource):
 
         carrier = [row for row, body in enumerate(state.bodies) if body.number == agent.number]
         sweeps = {
-            name: LidarSweep(
+            name: LabelledSweep(
                 mounted.settings,
                 world_from_agent @ mounts[name],
                 _drop_carrier(read_lidar_points(take(name)), state.boxes[carrier], world_from_agent @ mounts[name]),

@@ -17,7 +17,7 @@ from flcav.carla.server.actors import NOTHING, Counters, ServedActor, describe_p
 from flcav.carla.server.blueprints import CallRefused, Quality, list_blueprints
 from flcav.carla.server.episode import Episode
 from flcav.carla.server.maps import Maps
-from flcav.carla.server.scenery import find_boxes, list_objects, project_ray
+from flcav.carla.server.scenery import find_boxes, list_scenery, project_ray
 from flcav.carla.server.wire import BoundingBox, Transform, Vector
 from flcav.config import InputError, shorten
 from flcav.world.commands import FreezeLights
@@ -476,7 +476,7 @@ class Calls:
 
     def get_environment_objects(self, tag: int) -> wire.Packed:
         """Return the town's objects with a semantic tag."""
-        return list_objects(self.episode, tag)
+        return list_scenery(self.episode, tag)
 
     def enable_environment_objects(self, numbers: wire.Packed, on: bool) -> None:
         """Show objects of the town; hiding them is refused."""
@@ -485,7 +485,7 @@ class Calls:
 
     def get_names_of_all_objects(self) -> wire.Packed:
         """Return the names of the town's objects."""
-        return [row[3] for row in list_objects(self.episode, 0xFF)]
+        return [row[3] for row in list_scenery(self.episode, 0xFF)]
 
     def project_point(self, location: Vector, direction: Vector, distance: float) -> wire.Packed:
         """Return the first hit of a ray up to `distance` [m], as an optional labelled point."""

@@ -23,7 +23,7 @@ def find_boxes(episode: "Episode", tag: int) -> list[BoundingBox]:
     return [box for number, box, _ in _list_things(episode) if tag in (number, ANY)]
 
 
-def list_objects(episode: "Episode", tag: int) -> list[list[Any]]:
+def list_scenery(episode: "Episode", tag: int) -> list[list[Any]]:
     """Return the town's objects with a semantic tag, as rows: transform, box, id, name and tag."""
     return [
         [[box.location, box.rotation], box, row, name, number]

@@ -7,7 +7,7 @@ import typer
 
 from flcav.cli.domains.sampling import ODD
 from flcav.cli.options import Device, check_finite
-from flcav.cli.tables import numbers, read_table
+from flcav.cli.tables import numbers, read_input_table
 from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -245,7 +245,7 @@ def tasks(
     load_town(pretrain)
     found = []
     if errors is not None:
-        table = read_table(errors, ("x", "y", "scene"), ("scene",))
+        table = read_input_table(errors, ("x", "y", "scene"), ("scene",))
         places = numbers(table, ("x", "y"), errors).tolist()
         found = [(str(scene), *place) for scene, place in zip(table["scene"].to_pylist(), places, strict=True)]
     scenarios = [each for folder in data for each in generate_tasks(folder, found)]

@@ -82,7 +82,7 @@ def fit(
     ),
 ) -> Answer:  # fmt: skip
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
-    from flcav.cli.tables import read_table
+    from flcav.cli.tables import read_input_table
     from flcav.config import InputError
     from flcav.optimization.allocation.problem_file import collect_fitted_fields
     from flcav.optimization.curves import fitting
@@ -100,7 +100,7 @@ def fit(
     def fit_curve(points: "History") -> "CurveFit":
         return fitting.fit(points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
 
-    for task, points in parse_histories(read_table(history, ()).to_pydict(), str(history), unnamed).items():
+    for task, points in parse_histories(read_input_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
             found = fit_curve(points)
             checked = hold_out_runs(points, fit_curve, k) if held_out else None

@@ -10,7 +10,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from flcav.cli.tables import numbers, read_table
+from flcav.cli.tables import numbers, read_input_table
 from flcav.config import InputError, shorten
 from flcav.dataset.store import Dataset
 from flcav.optimization.placement.instance import find_covered
@@ -131,7 +131,7 @@ def build_candidates(given: Given, visible: csr_array | None) -> Candidates:
 
 
 def _read(path: Path, needed: Sequence[str], known: Sequence[str]) -> pa.Table:
-    table = read_table(path, needed, NAMES)
+    table = read_input_table(path, needed, NAMES)
     if unknown := [name for name in table.column_names if name not in known]:
         raise InputError(f"{path}: unknown column '{unknown[0]}'; known are {', '.join(known)}")
     return table

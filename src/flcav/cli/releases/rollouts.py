@@ -165,7 +165,7 @@ def deliver(
     from flcav.network.ledger import Ledger, LinkMegabytes
     from flcav.network.radio.recorded import link_scene
     from flcav.releases.candidate import WEIGHTS
-    from flcav.releases.rollout.simulated_fleet import deliver as deliver_release
+    from flcav.releases.rollout.simulated_fleet import deliver_release
 
     described = describe_candidate(candidate)
     settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)

@@ -1,12 +1,11 @@
 """The grid of a deployed federation: its nodes are vehicles of a fleet, reached through Flower's SuperLink.
 
-Where the SuperLink was killed, Flower gives the run up; then the server begins another one, and asks those again whose
-answers have not come. A vehicle whose node came back, or that may have lost a message, is asked again, and so is one
-that has been silent for long. Since vehicles keep their last answer, the weights are those of a federation that nothing
-happened to.
+If the SuperLink is killed, Flower aborts the run; the server then starts another one, and repeats the requests without
+an answer. It also repeats a request whose vehicle came back, may have lost a message, or has been silent for long.
+Since vehicles keep their last answer, the weights are the same as without disturbances.
 
-Where training has a time limit, so have answers: a vehicle that hangs, and cannot keep the limit itself, is given up.
-One whose certificate is no longer in force is neither asked nor waited for.
+Where training has a time limit, answers have one, too: the server gives up on a vehicle that hangs, and so cannot
+enforce the limit itself. It neither asks nor awaits a vehicle whose certificate is no longer in force.
 """
 
 import contextlib
@@ -32,22 +31,22 @@ from flcav.fleet.traffic import read_traffic
 from flcav.interface.wording import make_printable
 from flcav.network.ledger import BudgetExceeded
 
-STARTING_S = 120.0  # for a SuperLink to come back
-REJOIN_S = 180.0  # that a vehicle is waited for which the network lost
-ALLOWANCE_S, SLOWEST_MBPS = 60.0, 1.0  # beyond the time to train: for polls and a fork; of the way there and back
-LOOK_S = 0.5  # between looks at the registry
-LONGEST = 500  # characters of a vehicle's words
-BUSY_S = 0.1  # that a look waits for a registry which another process holds
-AGAIN_S = 150.0  # after which a vehicle that has not answered is asked again, then after twice as long, and so on
-POLL_S, PAUSE_S = 0.2, 1.0  # between looks for answers; before a vehicle that was not there is asked again
-RAISED = 2  # Flower's error code of an app that raised an exception, whose words are the reason
+STARTING_S = 120.0  # timeout of a SuperLink's return [s]
+REJOIN_S = 180.0  # timeout of a vehicle that the network lost [s]
+ALLOWANCE_S, SLOWEST_MBPS = 60.0, 1.0  # beyond the time to train: polls and a fork [s]; slowest link [Mbit/s]
+LOOK_S = 0.5  # between queries of the registry [s]
+LONGEST = 500  # characters shown of a vehicle's error
+BUSY_S = 0.1  # timeout of a query of a registry locked by another process [s]
+AGAIN_S = 150.0  # before a request without an answer is repeated; doubled each time [s]
+POLL_S, PAUSE_S = 0.2, 1.0  # between queries of answers; before an absent vehicle is asked again [s]
+RAISED = 2  # Flower's error code of an app that raised an exception, with its message as the reason
 FULL = re.compile(rf"\[Errno (?:{errno.ENOSPC}|{errno.EDQUOT}|{errno.EFBIG})\] ([A-Z][A-Za-z ]*)")
-TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of messages and nodes that are not available, and of a crashed app
-SPARE_BYTES, CLIENT_BYTES = 1 << 16, 512  # of the largest answer, beside arrays; of what it has for each client
+TRANSPORT = (3, 4, 5, 8)  # Flower's error codes of unavailable messages and nodes, and of a crashed app
+SPARE_BYTES, CLIENT_BYTES = 1 << 16, 512  # of the largest answer: besides arrays; per client
 
 
 class DeployedGrid(LinkGrid):
-    """Grid of deployed vehicles, which begins another run where Flower has given the one before up."""
+    """A grid of deployed vehicles, which starts another run when Flower aborts one."""
 
     def __init__(
         self,
@@ -58,18 +57,19 @@ class DeployedGrid(LinkGrid):
         account: Account,
         limit_s: float | None = None,
     ) -> None:
-        """Reach nodes of the fleet in `folder` with the clients' `names`, which are `vehicles` of its registry.
+        """Connect to nodes of the fleet in `folder`, given the clients' `names` and the registered `vehicles` by node.
 
-        limit_s: time that a vehicle may train in a round; None: any.
+        limit_s: time limit of training in a round [s]; None: none.
         """
         self._folder, self._link, self.names, self._vehicles, self._account = folder, link, names, vehicles, account
-        self._limit_s, self.authority = limit_s, load_certificate(folder)
-        self._largest = 0  # request to train so far [bytes]
+        self._limit_s = limit_s
+        self.authority = load_certificate(folder)
+        self._largest = 0  # largest request to train so far [bytes]
         self._rounds: tuple[RoundProgress, ...] = ()
-        self._waits: dict[str, str] = {}  # by client why it is waited for
-        self._gone: dict[str, str] = {}  # by client why it is out of the federation
-        self._silent: set[int] = set()  # nodes that were given up, and have not answered since
-        self._look = 0.0  # when the registry is asked next
+        self._waits: dict[str, str] = {}  # reason of waiting, by client
+        self._gone: dict[str, str] = {}  # reason of exclusion from the federation, by client
+        self._silent: set[int] = set()  # nodes that were given up and have not answered since
+        self._look = 0.0  # time of the next query of the registry [s]
         self._begin()
 
     def _begin(self) -> None:
@@ -79,7 +79,7 @@ class DeployedGrid(LinkGrid):
         self._grid: Grid = self._run.grid
 
     def _renew(self) -> None:
-        """Begin another run, as soon as the SuperLink lets us."""
+        """Start another run as soon as the SuperLink is available."""
         self._run.end(failed=True)
         end = time.monotonic() + STARTING_S
         while True:
@@ -91,17 +91,20 @@ class DeployedGrid(LinkGrid):
                 time.sleep(PAUSE_S)
 
     def follow(self, record: RoundRecord) -> None:
-        """Write a round that has ended to the fleet's folder, where `flcav fleet status` reads it."""
+        """Write a completed round to the fleet's folder, for `flcav fleet status`."""
         about = time.time(), len(record.clients), record.failed, record.loss, record.epsilon, record.empty
-        self._rounds, self._waits = (*self._rounds, RoundProgress(record.round, *about)), {}
+        self._rounds = (*self._rounds, RoundProgress(record.round, *about))
+        self._waits = {}
         self._tell()
 
     def _tell(self) -> None:
         account, link = self._account, self._account.link
         used, left = account.ledger.used_mb(link), account.ledger.left_mb(link)
-        told = FederationProgress(account.stage, account.task, link, used, left, self._rounds, self._waits, self._gone)
-        with contextlib.suppress(OSError):  # the federation goes on where the disk of its display is full
-            told.save(self._folder)
+        progress = FederationProgress(
+            account.stage, account.task, link, used, left, self._rounds, self._waits, self._gone
+        )
+        with contextlib.suppress(OSError):  # a full disk must not end the federation
+            progress.save(self._folder)
 
     def _wait_for(self, exchange: "_Exchange", node: int, reason: str) -> None:
         """Ask a node again later, and report why."""
@@ -116,23 +119,28 @@ class DeployedGrid(LinkGrid):
         self._run.end(failed)
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies in the order of the messages, as errors those that are over their grants.
+        """Yield the replies in the order of the messages; those beyond their grants become errors.
 
-        Who says that it kept an answer for its size comes last: `BudgetExceeded` is raised where that can be, since an
-        answer of another client was larger than the grant or, where none came, the largest that there can be is.
+        Nodes that claim to have withheld an answer for its size come last. `BudgetExceeded` is raised if the claim is
+        plausible: another client's answer was larger than the grant or, if there is none, the largest possible one is.
+        timeout: of all replies together [s].
         """
         asked = {message.metadata.dst_node_id: message for message in messages}
-        exchange, kept, largest = _Exchange(self._count_losses()), list[int](), 0
+        exchange = _Exchange(self._count_losses())
+        kept = list[int]()
+        largest = 0
+        # one answer per node; those that arrive before their turn wait here
         answers: dict[int, Message] = {}
         end = time.monotonic() + (timeout or float("inf"))
-        late_s, self._look = self._limit_answers(asked.values()), 0.0
+        late_s = self._limit_answers(asked.values())
+        self._look = 0.0
         for node, message in asked.items():
             while node not in answers:
                 self._strike(asked, answers)
                 try:
-                    due = [own for own in asked if own not in answers and exchange.is_due(own)]
+                    due = [number for number in asked if number not in answers and exchange.is_due(number)]
                     if due:
-                        self._push(exchange, {own: asked[own] for own in due})
+                        self._push(exchange, {number: asked[number] for number in due})
                     self._pull(exchange, asked, answers)
                     self._give_up(exchange, late_s, asked, answers)
                 except SuperLinkLost:
@@ -140,34 +148,35 @@ class DeployedGrid(LinkGrid):
                     exchange = _Exchange(self._count_losses(), exchange.granted)
                 if node not in answers:
                     if time.monotonic() > end:
-                        yield from self._judge(exchange, {own: asked[own] for own in kept}, largest)
+                        yield from self._judge(exchange, {number: asked[number] for number in kept}, largest)
                         return
                     exchange.notice(self._count_losses())
                     time.sleep(POLL_S)
             reply = answers.pop(node)
-            answers[node] = message  # answered; only its place is looked at
+            answers[node] = message  # marks the node as answered
             if reply.has_error() and reply.error.code == OVER_BUDGET:
                 kept.append(node)
                 continue
             if reply.has_content():
                 size = wire_bytes(reply.content)
                 if size > exchange.granted[node]:
-                    told = f"an answer of {size} bytes, where {exchange.granted[node]} were granted"
-                    reply = Message(Error(RAISED, told), reply_to=message)
+                    excess = f"an answer of {size} bytes, where {exchange.granted[node]} were granted"
+                    reply = Message(Error(RAISED, excess), reply_to=message)
                 else:
                     largest = max(largest, size)
             yield reply
-        yield from self._judge(exchange, {own: asked[own] for own in kept}, largest)
+        yield from self._judge(exchange, {number: asked[number] for number in kept}, largest)
 
     def _judge(self, exchange: "_Exchange", kept: Mapping[int, Message], largest: int) -> Iterator[Message]:
-        """Yield an error for each node that says it kept its answer, or raise `BudgetExceeded` where that can be.
+        """Yield an error per node that claims to have withheld its answer; raise `BudgetExceeded` if that is plausible.
 
-        kept: what these nodes were asked. largest: bytes of the answers that came.
+        kept: requests to these nodes, by node. largest: size of the largest answer received [bytes].
         """
         for node, message in kept.items():
             granted = exchange.granted[node]
             if granted < (largest or self._most_bytes):
-                name, link = self.names[node], self._account.link
+                name = self.names[node]
+                link = self._account.link
                 raise BudgetExceeded(
                     f"{name}: an answer of more than the {granted} bytes that are left on the {link} uplink"
                 )
@@ -175,15 +184,15 @@ class DeployedGrid(LinkGrid):
 
     @property
     def _most_bytes(self) -> int:
-        """Return more than the bytes of any answer to a request to train so far.
+        """Return an upper bound on the size of an answer to a request to train so far [bytes].
 
-        That is weights, up to twice as much for numbers of 16 bits in 32, twice that for coordinates or a strategy's
-        arrays beside them, and what secure aggregation has for each client.
+        It is the weights, times two for 16-bit numbers masked in 32 bits, times two for coordinates or a strategy's
+        further arrays, plus the entries of secure aggregation per client.
         """
         return 4 * self._largest + CLIENT_BYTES * len(self.names) + SPARE_BYTES
 
     def _limit_answers(self, messages: Iterable[Message]) -> float:
-        """Return the time that answers may take: to train, the allowance, and the way of request and answer [s]."""
+        """Return the timeout of answers: training, allowance, and transmission of request and answer [s]."""
         if self._limit_s is None:
             return float("inf")
         contents = {id(message.content): message.content for message in messages}.values()  # many share one
@@ -191,20 +200,21 @@ class DeployedGrid(LinkGrid):
         return self._limit_s + ALLOWANCE_S + 2 * 8 * size_mb / SLOWEST_MBPS
 
     def _strike(self, asked: Mapping[int, Message], answers: dict[int, Message]) -> None:
-        """Answer for the nodes whose certificate is no longer in force, twice a second at most."""
+        """Add errors for the nodes whose certificate is no longer in force; look at most every `LOOK_S`."""
         if time.monotonic() < self._look:
             return
         self._look = time.monotonic() + LOOK_S
         try:
             with contextlib.closing(open_registry(self._folder, BUSY_S)) as registry:
-                found = {node: registry.find(own.fingerprint) for node, own in self._vehicles.items()}
-        except (InputError, OSError):  # another process holds it, or it is damaged: its own users say so
+                found = {node: registry.find(vehicle.fingerprint) for node, vehicle in self._vehicles.items()}
+        except (InputError, OSError):  # locked by another process, or damaged, which others report
             return
-        for node, own in found.items():
-            state = "not registered" if own is None else own.describe_state()
+        for node, vehicle in found.items():
+            state = "not registered" if vehicle is None else vehicle.describe_state()
             if state == "registered":
                 continue
-            name, why = self.names[node], f"the certificate of {self._vehicles[node].name} is {state}"
+            name = self.names[node]
+            why = f"the certificate of {self._vehicles[node].name} is {state}"
             if node in asked and node not in answers:
                 answers[node] = Message(Error(LOST_BY_NETWORK, why), reply_to=asked[node])
             if name not in self._gone:
@@ -215,20 +225,23 @@ class DeployedGrid(LinkGrid):
     def _give_up(
         self, exchange: "_Exchange", late_s: float, asked: Mapping[int, Message], answers: dict[int, Message]
     ) -> None:
-        """Answer for the nodes that have not answered in time."""
+        """Add errors for the nodes without an answer in time."""
         for node, message in asked.items():
             if node not in answers and exchange.waited_s(node) > late_s:
                 self._silent.add(node)
                 answers[node] = Message(Error(RAISED, f"it had not answered after {late_s:.0f} s"), reply_to=message)
 
     def _push(self, exchange: "_Exchange", due: Mapping[int, Message]) -> None:
-        """Send requests to nodes, with the bytes that their answers may have."""
-        left, sent = min(max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6)), 2**62), []
+        """Send requests to nodes, with the granted sizes of their answers."""
+        left = min(max(0, int(self._account.ledger.left_mb(self._account.link) * 1e6)), 2**62)
+        sent = []
         for node, message in due.items():
-            content, trains = {**message.content}, message.metadata.message_type == MessageType.TRAIN
+            content = {**message.content}
+            trains = message.metadata.message_type == MessageType.TRAIN
             if trains:
                 self._largest = max(self._largest, wire_bytes(message.content))
             most = min(left, self._most_bytes) if trains else left if GRANT in content else 2**62
+            # a repeated request keeps its first grant: the vehicle then sends the same answer
             granted = exchange.granted.setdefault(node, most)
             if trains or GRANT in content:
                 content[GRANT] = ConfigRecord({GRANTED: granted})
@@ -237,7 +250,7 @@ class DeployedGrid(LinkGrid):
             exchange.sent(node, identifier)
 
     def _pull(self, exchange: "_Exchange", asked: Mapping[int, Message], answers: dict[int, Message]) -> None:
-        """Add the answers that have come; a node that was not available is asked again later."""
+        """Add the answers that have arrived; an unavailable node is asked again later."""
         if not exchange.nodes:
             return
         for reply in self._grid.pull_messages([*exchange.nodes]):
@@ -254,14 +267,14 @@ class DeployedGrid(LinkGrid):
                 answers[node] = _in_plain_words(reply, asked[node])
 
     def _count_losses(self) -> dict[int, int]:
-        """Return how often each node may have lost what it was asked: it came in anew, or the SuperLink failed it."""
+        """Return by node how often a request may have been lost: activations, and losses at the SuperLink."""
         found = read_traffic(self._folder).vehicles
-        there = {node: found[own.name] for node, own in self._vehicles.items() if own.name in found}
-        return {node: own.activations + own.lost for node, own in there.items()}
+        there = {node: found[seen.name] for node, seen in self._vehicles.items() if seen.name in found}
+        return {node: seen.activations + seen.lost for node, seen in there.items()}
 
 
 def _in_plain_words(reply: Message, message: Message) -> Message:
-    """Return a reply; its error is the app's, whatever code a vehicle gives it, in words fit for a terminal."""
+    """Return a reply; an error gets an app's code, whatever the vehicle sent, and a printable reason."""
     if not reply.has_error():
         return reply
     code = OVER_BUDGET if reply.error.code == OVER_BUDGET else RAISED
@@ -269,7 +282,7 @@ def _in_plain_words(reply: Message, message: Message) -> Message:
 
 
 def _excuse(reply: Message) -> str | None:
-    """Return why a vehicle could not answer, where that may pass: it was not there, or its disk is full."""
+    """Return the reason of a transient failure to answer: the vehicle was absent, or its disk is full; else None."""
     if not reply.has_error():
         return None
     if reply.error.code in TRANSPORT:
@@ -280,16 +293,16 @@ def _excuse(reply: Message) -> str | None:
 
 
 class _Exchange:
-    """Who was asked in a run, by which message, and who is to be asked again when."""
+    """The state of an exchange in a run: requests sent, and when to repeat them."""
 
     def __init__(self, losses: Mapping[int, int], granted: Mapping[int, int] = {}) -> None:
-        self.granted = dict(granted)  # bytes of an answer, by node
-        self.nodes: dict[str, int] = {}  # of the messages that are out, by their ids
+        self.granted = dict(granted)  # size of an answer by node [bytes]
+        self.nodes: dict[str, int] = {}  # by id of the outstanding message
         self._losses = dict(losses)
-        self._due: dict[int, float] = {}  # of nodes that were asked: when they are to be asked again
-        self._patience: dict[int, float] = {}  # with nodes that were asked, until they are asked again [s]
-        self._lost: dict[int, float] = {}  # since when nodes are not available
-        self._begun: dict[int, float] = {}  # when nodes were asked first
+        self._due: dict[int, float] = {}  # time at which to repeat a request, by node [s]
+        self._patience: dict[int, float] = {}  # interval of the next repetition, by node [s]
+        self._lost: dict[int, float] = {}  # time since which a node is unavailable [s]
+        self._begun: dict[int, float] = {}  # time of the first request, by node [s]
 
     def is_due(self, node: int) -> bool:
         return time.monotonic() >= self._due.get(node, 0.0)
@@ -298,7 +311,8 @@ class _Exchange:
         return node in self._lost and time.monotonic() > self._lost[node] + REJOIN_S
 
     def sent(self, node: int, identifier: str) -> None:
-        self.nodes[identifier], self._due[node] = node, time.monotonic() + self._patience.get(node, AGAIN_S)
+        self.nodes[identifier] = node
+        self._due[node] = time.monotonic() + self._patience.get(node, AGAIN_S)
         self._patience[node] = 2 * self._patience.get(node, AGAIN_S)
         self._begun.setdefault(node, time.monotonic())
 
@@ -310,7 +324,7 @@ class _Exchange:
         self._due[node] = time.monotonic() + PAUSE_S
 
     def notice(self, losses: Mapping[int, int]) -> None:
-        """Note that nodes have lost something: they are asked again, and give the same answer."""
+        """Note losses at nodes: their requests are repeated, and the answers will be the same."""
         for node, count in losses.items():
             if count > self._losses.get(node, count) and node in self._due:
                 self._due[node] = time.monotonic() + PAUSE_S

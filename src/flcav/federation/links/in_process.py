@@ -1,8 +1,8 @@
 """A Flower grid within one process: a message reaches the client app by a function call, without sockets or daemons.
 
-Uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run record, the id of a
-message, and the serialised form of a record and of an array. Those of a deployment are in `fleet.superlink`. A training
-in this process cannot be interrupted: a client that exceeds its time limit is left behind in a thread (`limit_time`).
+It uses private parts of Flower (pinned to 1.42): the process-wide task identity, the empty run record, the id of a
+message, and the serialisation of records and arrays. Those of a deployment are in `fleet.superlink`. A training in this
+process cannot be interrupted: a client that exceeds its time limit keeps running in a thread (`limit_time`).
 """
 
 import contextlib
@@ -56,10 +56,11 @@ UNMETERED = "messages of a federation go by send_and_receive"
 def wire_bytes(content: RecordDict) -> int:
     """Return the size of a message's content in Flower's serialisation [bytes].
 
-    Arrays are counted by the rules of Protocol Buffers, since serialising a large network takes longer than a local
-    step. A field is its tag, its length and its content; empty ones are left out, but for records.
+    Sizes of arrays are computed from the encoding of Protocol Buffers, since serialising a large network takes longer
+    than a local step. A field consists of tag, length and content; empty fields are left out, except records.
     """
-    others, total = RecordDict(), 0
+    others = RecordDict()
+    total = 0
     for key, record in content.items():
         if not isinstance(record, ArrayRecord):
             others[key] = record
@@ -70,6 +71,7 @@ def wire_bytes(content: RecordDict) -> int:
 
 
 def _array_bytes(array: Array) -> int:
+    # in Protocol Buffers an empty bytes field takes no space, not even its tag
     head = ProtoArray(dtype=array.dtype, shape=array.shape, stype=array.stype).ByteSize()
     return head + (_nested(len(array.data)) if array.data else 0)
 
@@ -79,14 +81,14 @@ def _text(text: str) -> int:
 
 
 def _nested(length: int) -> int:
-    """Return the bytes of a field of this length: its tag, its length in groups of seven bits, and itself."""
+    """Return the size of a field with content of this length [bytes]: tag, length as a varint, and content."""
     return 1 + max(1, -(-length.bit_length() // 7)) + length
 
 
 def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool = False) -> int:
     """Return the size of a client's update with these weights in Flower's serialisation [bytes].
 
-    `exchanging`: with an array beside each that is learned, as a strategy's clients send them that `Exchanges` arrays.
+    exchanging: with a further array per learned one, as clients of a strategy in `Exchanges` send them.
     """
     sent, _ = encode_update(LocalUpdate(weights, 0, 0.0), weights, Rules(upload=upload), {}, 0)
     records = {ARRAYS: to_array_record(sent.weights), METRICS: MetricRecord({SAMPLES: 0, LOSS: 0.0})}
@@ -98,7 +100,7 @@ def update_bytes(weights: Weights, upload: Upload = WHOLE, *, exchanging: bool =
 
 @contextlib.contextmanager
 def keep_identity() -> Iterator[None]:
-    """Restore Flower's process-wide identity in the end: that of an outer federation."""
+    """Restore Flower's process-wide identity, that of an outer federation, at the end."""
     names = ("_run_id", "_node_id", "_task_id")
     before = {name: getattr(TaskIdentity, name) for name in names}
     try:
@@ -110,14 +112,14 @@ def keep_identity() -> Iterator[None]:
 
 @contextlib.contextmanager
 def _server_identity() -> Iterator[None]:
-    """Give messages created inside the server's identity."""
+    """Give messages created in the context the server's identity."""
     with keep_identity():
         TaskIdentity.run_id, TaskIdentity.node_id, TaskIdentity.task_id = RUN_ID, SERVER_NODE, 1
         yield
 
 
 class LinkGrid(Grid):
-    """Flower grid whose nodes are a federation's clients, and whose messages all go by `send_and_receive`."""
+    """A Flower grid whose nodes are a federation's clients, and whose messages all go by `send_and_receive`."""
 
     names: Mapping[int, str]  # of the clients, by node
     _flower_run = Run.create_empty(RUN_ID)
@@ -142,17 +144,17 @@ class LinkGrid(Grid):
         return self._flower_run
 
     def read_states(self, keys: Iterable[str]) -> ClientStates:
-        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        """Return the client states with these keys, by client and key."""
         wanted = tuple(keys)
         found: ClientStates = {}
         for reply in self.send_and_receive(Message(RecordDict(), node, MessageType.QUERY) for node in self.names):
             if reply.has_content():
-                own = {key: read_arrays(reply.content, key) for key in wanted if key in reply.content}
-                found |= {self.names[reply.metadata.src_node_id]: own} if own else {}
+                state = {key: read_arrays(reply.content, key) for key in wanted if key in reply.content}
+                found |= {self.names[reply.metadata.src_node_id]: state} if state else {}
         return {name: found[name] for name in self.names.values() if name in found}
 
     def push_messages(self, messages: Iterable[Message]) -> Iterable[str]:
-        """Raise NotImplementedError: a message whose answer is fetched later would pass ledger and outages by."""
+        """Raise NotImplementedError: messages with replies fetched later would bypass ledger and outages."""
         raise NotImplementedError(UNMETERED)
 
     def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]:
@@ -161,9 +163,9 @@ class LinkGrid(Grid):
 
 
 class EmbeddedGrid(LinkGrid):
-    """Flower grid whose nodes are in this process; a context manager.
+    """A Flower grid whose nodes are in this process; a context manager.
 
-    A node exists while it answers, and what it keeps for later rounds beyond that.
+    Between messages only the states of nodes exist.
     """
 
     def __init__(
@@ -173,17 +175,17 @@ class EmbeddedGrid(LinkGrid):
         states: Mapping[str, Mapping[str, Weights]] = {},
         at_once: int = 1,
     ) -> None:
-        """Register a node for each of `names`; its config has its place among them, as in Flower's simulation.
+        """Register a node per name; its config has its index among them, as in Flower's simulation.
 
-        `states` are the arrays that nodes have kept from earlier rounds, by node and record. `at_once` nodes answer at
-        the same time, each in a thread; replies come in the order of the messages all the same.
+        states: client states from earlier rounds, by client and key. at_once: number of nodes that answer at the same
+        time, in threads; replies come in the order of the messages all the same.
         """
         self._app, self._at_once = app, at_once
         self.names = dict(enumerate(names, FIRST_NODE))
         nodes = {name: node for node, name in self.names.items()}
         self._states = {
-            nodes[name]: RecordDict({key: to_array_record(arrays) for key, arrays in own.items()})
-            for name, own in states.items()
+            nodes[name]: RecordDict({key: to_array_record(arrays) for key, arrays in state.items()})
+            for name, state in states.items()
             if name in nodes
         }
         self._sent = 0
@@ -197,7 +199,7 @@ class EmbeddedGrid(LinkGrid):
         self._identity.__exit__(None, None, None)
 
     def read_states(self, keys: Iterable[str]) -> ClientStates:
-        """Return the arrays that clients keep between rounds under these records, by client and record."""
+        """Return the client states with these keys, by client and key."""
         found: ClientStates = {}
         for node, state in sorted(self._states.items()):
             for key in keys:
@@ -206,13 +208,15 @@ class EmbeddedGrid(LinkGrid):
         return found
 
     def _number(self, message: Message) -> None:
+        # numbered in order, so that equal runs have equal messages
         self._sent += 1
         message.metadata.__dict__["_message_id"] = f"{RUN_ID}-{self._sent}"
 
     def _deliver(self, message: Message) -> Message:
-        """Return a node's reply; an exception in the client app is an error reply, but `BudgetExceeded` is raised."""
+        """Return a node's reply; an exception in the client app becomes an error reply, except `BudgetExceeded`."""
         node = message.metadata.dst_node_id
-        shared = message.content  # by all nodes: a change by one client app must not reach the next
+        # the client app gets shallow copies: the arrays themselves are immutable bytes
+        shared = message.content  # by all nodes: changes by one client app must not reach the next
         message.content = RecordDict({key: _copied(record) for key, record in shared.items()})
         config: UserConfig = {PARTITION: node - FIRST_NODE, "num-partitions": len(self.names)}
         context = Context(RUN_ID, node, config, self._states.pop(node, None) or RecordDict(), {})
@@ -228,11 +232,12 @@ class EmbeddedGrid(LinkGrid):
                 self._states[node] = context.state
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies in the order of the messages, as soon as each is there; raises what a node raises.
+        """Yield the replies in the order of the messages, as soon as they are available; raises what a node raises.
 
-        At most `at_once` messages are under way, or answered and not taken yet.
+        At most `at_once` messages are in flight, or answered and not yet consumed. timeout: not
+        applied in this process, where `limit_time` limits a training.
         """
-        if self._at_once == 1:  # in this thread: others have thread counts of their own
+        if self._at_once == 1:  # in this thread: other threads have other thread counts
             for message in messages:
                 self._number(message)
                 yield self._deliver(message)
@@ -258,18 +263,18 @@ def _copied(record):
 
 ResultT = TypeVar("ResultT")
 
-_busy: dict[int, threading.Thread] = {}  # by identity of a client, which its thread holds: what was left behind
+_busy: dict[int, threading.Thread] = {}  # late trainings by id() of the client, which its thread keeps alive
 
 
 class ClientLate(OSError):
-    """A client did not end its training within its time."""
+    """A client exceeded its time to train."""
 
     def __init__(self, limit_s: float | None) -> None:
         super().__init__(f"it had not trained after {limit_s:g} s")
 
 
 class NamedClients(Mapping[str, Trainable]):
-    """Clients by name, each of which `find` returns when it is asked for."""
+    """Clients by name, looked up by `find` when they are needed."""
 
     def __init__(self, names: Iterable[str], find: Callable[[str], Trainable]) -> None:
         self._names, self._find = dict.fromkeys(names), find
@@ -287,11 +292,10 @@ class NamedClients(Mapping[str, Trainable]):
 
 
 def limit_time(clients: Mapping[str, Trainable], limit_s: float | None) -> Mapping[str, Trainable]:
-    """Return clients that train in a thread each, and raise `ClientLate` after `limit_s` of wall time; None: as long
-    as they take.
+    """Return clients that train in threads, and raise `ClientLate` after `limit_s` [s] of wall time; None: no limit.
 
-    A training that is left behind goes on until it ends, or the program does; until then its client refuses another
-    one, so that no client trains twice at a time. What it returns is lost.
+    A late training continues until it or the program ends; until then its client refuses another one, so that no client
+    trains twice at a time. Its result is lost.
     """
     return clients if limit_s is None else NamedClients(clients, lambda name: _Timed(clients[name], limit_s))
 

@@ -1,7 +1,7 @@
-"""Links of a federation's server to its clients, by runtime: this process, client processes, Ray, or a deployed fleet.
+"""Links from a federation's server to its clients, by runtime: this process, client processes, Ray, or a fleet.
 
-What crosses a link is lost where the network loses it, held to the budget where it leaves, and entered in the ledger.
-Questions outside training go over it, too; the caller enters the answers that count in the ledger.
+A link applies the outages of the network, checks the budget before a message leaves, and enters it in the ledger.
+Questions outside training use it, too; the caller enters the counted answers in the ledger.
 """
 
 import contextlib
@@ -34,29 +34,29 @@ if TYPE_CHECKING:
     from flcav.federation.links.topics import RosTopics
 
 RUNTIMES = "embedded", "ray", "flower"
-NOTHING: Weights = {}  # comes with a question
-UNREADABLE = "an answer that cannot be read"  # why one is missing
+NOTHING: Weights = {}  # arrays of a question without any
+UNREADABLE = "an answer that cannot be read"  # reason of a missing answer
 # where clients train, and how messages reach them
 Runtime = Union[ClientProcesses, "RaySimulation", "Deployment", "RegionalDeployment", "PartlyDeployed", "RosTopics"]
 
 
 @dataclass(frozen=True)
 class Replies:
-    """What clients answered to a question."""
+    """The answers of clients to a question."""
 
     answers: Mapping[str, Weights]  # by client
-    missing: Mapping[str, str]  # by client why it did not answer
+    missing: Mapping[str, str]  # reason by client without an answer
 
 
 class Ask(Protocol):
-    """A way to ask clients."""
+    """A function that asks clients a question."""
 
     def __call__(
         self, question: str, clients: Sequence[str], arrays: Weights = NOTHING, *, counted: bool = True
     ) -> Replies:
-        """Return the replies of `clients`, in their order, to a question that these `arrays` come with.
+        """Return the replies of `clients`, in their order, to a question with `arrays`.
 
-        A deployed client keeps an answer that is `counted` where it is over the budget: `BudgetExceeded`.
+        A deployed client withholds a `counted` answer over the budget, which raises `BudgetExceeded`.
         """
         ...
 
@@ -68,9 +68,9 @@ class Link:
     grid: Grid
     names: Mapping[int, str]  # of the clients, by node
     ask: Ask
-    read_states: ReadStates  # of what clients keep between rounds
-    follow: Callable[[RoundRecord], None] = lambda _: None  # called with the record of each round that has ended
-    authority: x509.Certificate | None = None  # that has certified the clients; None: they are not certified
+    read_states: ReadStates  # reads the client states
+    follow: Callable[[RoundRecord], None] = lambda _: None  # called with the record of every completed round
+    authority: x509.Certificate | None = None  # of the clients' certificates; None: they are not certified
 
 
 @contextlib.contextmanager
@@ -81,25 +81,28 @@ def open_link(
     agreed: ClientAgreement,
     states: ClientStates,
 ) -> Iterator[Link]:
-    """Yield the link to `clients`, on which `account` counts and loses messages.
+    """Yield the link to `clients`, whose messages are metered and lost by `account`.
 
     Args:
         clients: by name.
         runtime: where they train; None: in this process.
-        account: ledger of the messages, and the clients that the network loses.
+        account: ledger and outages of the link.
         agreed: strategy, rules and secrets of the federation.
-        states: what clients have kept from earlier rounds.
+        states: client states from earlier rounds.
     """
     make_app = partial(client_app, **vars(agreed))
     rules = agreed.rules
-    limit_s, names, far = rules.limits.train_s, [*clients], False
+    limit_s = rules.limits.train_s
+    names = [*clients]
+    far = False
     if runtime is None:
         opened = EmbeddedGrid(make_app(limit_time(clients, limit_s)), names, states)
     elif isinstance(runtime, ClientProcesses):
         opened = EmbeddedGrid(make_app(train_remotely(clients, runtime, limit_s)), names, states, runtime.count)
     elif runtime.deployed is True:
         check_deployable(rules)
-        opened, far = runtime.open(clients, agreed, states, account), True
+        opened = runtime.open(clients, agreed, states, account)
+        far = True
     else:
         opened = runtime.open(clients, lambda each: make_app(limit_time(each, limit_s), simulated=True), states)
     with opened as inner:
@@ -110,10 +113,10 @@ def open_link(
 
 
 def check_deployable(rules: Rules) -> None:
-    """Raise `InputError` where deployed clients cannot keep to rules.
+    """Raise `InputError` where deployed clients cannot follow the rules.
 
-    The state of an optimiser tells of the gradients on a vehicle's data. To resume, the server's checkpoint would need
-    it, and it is not to leave the vehicle.
+    The state of an optimiser reveals gradients on a vehicle's data, so that it must not leave the vehicle; but the
+    server's checkpoint would need it to resume.
     """
     if rules.keep_optimiser:
         raise InputError(
@@ -126,9 +129,9 @@ def check_deployable(rules: Rules) -> None:
 def open_questions(
     clients: Mapping[str, Trainable], deployed: "RegionalDeployment | PartlyDeployed | None", account: Account
 ) -> Iterator[Ask]:
-    """Yield a way to ask clients outside the rounds of a federation: in this process, or `deployed`.
+    """Yield a function that asks clients outside the rounds of a federation, in this process or `deployed`.
 
-    By the budget of `account` deployed clients are granted bytes.
+    The answers of deployed clients are limited by the budget of `account`.
     """
     if deployed is None or not clients:
         yield partial(_ask_here, clients)
@@ -138,14 +141,14 @@ def open_questions(
 
 
 def _ask_here(
-    own: Mapping[str, Trainable],
+    local: Mapping[str, Trainable],
     question: str,
     clients: Sequence[str],
     arrays: Weights = NOTHING,
     *,
     counted: bool = True,
 ) -> Replies:
-    return Replies({name: answer_question(own[name], question, arrays) for name in clients}, {})
+    return Replies({name: answer_question(local[name], question, arrays) for name in clients}, {})
 
 
 def _ask_there(
@@ -157,10 +160,11 @@ def _ask_there(
     *,
     counted: bool = True,
 ) -> Replies:
-    nodes, records = {name: node for node, name in names.items()}, {ASK: ConfigRecord({ASK: question})}
+    nodes = {name: node for node, name in names.items()}
+    records = {ASK: ConfigRecord({ASK: question})}
     content = RecordDict({**records, **({ARRAYS: to_array_record(arrays)} if arrays else {})})
     if counted:
-        content[GRANT] = ConfigRecord()  # filled in as it leaves
+        content[GRANT] = ConfigRecord()  # the grid fills it in when it sends the request
     messages = [Message(content, nodes[name], f"{MessageType.QUERY}.{ASK}") for name in clients]
     answers, missing = dict[str, Weights](), dict[str, str]()
     for event in list_events(clients, grid.send_and_receive(messages, timeout=ANSWER_S), names):
@@ -176,12 +180,12 @@ def _ask_there(
 
 @contextlib.contextmanager
 def open_client_processes(clients: Mapping[str, Trainable], count: int) -> Iterator[ClientProcesses | None]:
-    """Yield `count` processes for `clients`; None, for this one, where one is enough or they cannot be pickled."""
+    """Yield `count` client processes; None, for this process, where `count` is 1 or `clients` cannot be pickled."""
     try:
-        own = ClientProcesses(clients, count) if count > 1 else None
+        opened = ClientProcesses(clients, count) if count > 1 else None
     except InputError:
-        own = None
-    with own or contextlib.nullcontext() as processes:
+        opened = None
+    with opened or contextlib.nullcontext() as processes:
         yield processes
 
 
@@ -193,12 +197,12 @@ def open_runtime(
     fleet: Path | None = None,
     vehicles: Mapping[str, int] = {},
 ) -> Iterator[Runtime | None]:
-    """Yield what `federate` takes as its `runtime` for clients of one region, or for those of each of several.
+    """Yield the `runtime` of `federate` for the clients of one or of several regions.
 
-    embedded: messages within this process, and clients in `count` processes where these are several. ray: Flower's
-    simulation with `count` actors. flower: vehicles of the `fleet` that is up in this folder, where each region of
-    `vehicles` has so many (see `RegionalDeployment`), or of one that is brought up on this machine for as long. Raises
-    `InputError` for another name.
+    embedded: messages within this process, and clients in `count` processes if these are several. ray: Flower's
+    simulation with `count` actors. flower: vehicles of the running fleet in the folder `fleet`, with their number per
+    region in `vehicles` (see `RegionalDeployment`), or of a temporary fleet on this machine. Raises `InputError` for
+    another name.
     """
     match name:
         case "embedded":
@@ -219,7 +223,7 @@ def open_runtime(
 def open_deployment(
     clients: Collection[str], fleet: Path | None, vehicles: Mapping[str, int]
 ) -> Iterator["RegionalDeployment"]:
-    """Yield the vehicles of a deployed `fleet` for clients, or of one that is brought up, see `open_runtime`."""
+    """Yield the vehicles of a deployed or a temporary fleet for clients, see `open_runtime`."""
     from flcav.federation.links.flower import RegionalDeployment, region_of, start_fleet
 
     if fleet is not None:

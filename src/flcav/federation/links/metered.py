@@ -1,4 +1,4 @@
-"""The metered link: a Flower grid around another one, with the ledger, the budget and the outages of the network."""
+"""The metered link: a Flower grid around another one, which applies ledger, budget and outages of the network."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -10,8 +10,8 @@ from flcav.federation.links.in_process import LinkGrid, wire_bytes
 from flcav.federation.wire import ARRAYS, CONFIG, LOST, LOST_BY_NETWORK
 from flcav.network.ledger import Direction, Ledger, LedgerEntry, Link, LinkMegabytes
 
-UNDISCLOSED = "undisclosed"  # in the place of a client's name
-UNLIMITED_MB = 1e12  # budget of a federation whose bytes nobody limits
+UNDISCLOSED = "undisclosed"  # in place of a client's name
+UNLIMITED_MB = 1e12  # budget of a federation without one [MB]
 
 
 @dataclass(frozen=True)
@@ -19,23 +19,23 @@ class Outage:
     """A client that the network loses in a round."""
 
     reason: str  # e.g. "out of coverage"
-    sent_bytes: int | None = None  # of its update, until it broke off; None: it was not there when the round began
+    sent_bytes: int | None = None  # of its update before the interruption; None: absent when the round began
 
 
 @dataclass(frozen=True)
 class Account:
-    """The ledger, stage, task and link that messages are entered under, and what the link loses."""
+    """The account of a link: its ledger, the stage, task and link of its entries, and its outages."""
 
     ledger: Ledger
     stage: str  # of training, as in the ledger's entries
     task: str  # its name
     link: Link  # wireless or wireline
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by round and client
-    within: frozenset[str] = frozenset()  # clients in the server itself, whose messages cross no link
-    concealed: bool = False  # whether it stays secret who was drawn: entries have a client's region alone
+    within: frozenset[str] = frozenset()  # clients in the server's process, whose messages cross no link
+    concealed: bool = False  # whether the draw of clients is secret: entries then only name a client's region
 
     def find_away(self, round_: int) -> dict[str, str]:
-        """Return the clients that are away when a round begins and take no part in it, each with the reason."""
+        """Return the clients that are absent when a round begins and take no part in it, with the reason."""
         lost = self.outages.items()
         return {name: each.reason for (number, name), each in lost if number == round_ and each.sent_bytes is None}
 
@@ -53,14 +53,13 @@ def open_account() -> Account:
 
 
 class MeteredGrid(LinkGrid):
-    """Grid that meters another one, holds its nodes to the budget, and loses those that the network loses.
+    """A grid that meters the messages of another one, enforces the budget, and applies the network's outages.
 
     Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget is
-    neither handed on nor entered: `BudgetExceeded` is raised in its stead. The nodes which `account.outages` has lost
-    in a round are answered for, with the reason as an error. Nothing reaches a node that is not there; the bytes of an
-    update that broke off are entered as far as they came; what comes before training, such as keys, arrives. A node
-    whose update will break off gets a note of it with the message, in the place of the acknowledgement that it would
-    miss later.
+    neither passed on nor entered: `BudgetExceeded` is raised instead. Nodes in `account.outages` of a round are
+    replaced by an error with the reason. No message reaches an absent node; of an interrupted update, the transmitted
+    bytes are entered; replies before training, such as keys, arrive. A node whose update will be interrupted is told so
+    with the request, which stands for the acknowledgement that it would miss later.
     """
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:
@@ -68,14 +67,14 @@ class MeteredGrid(LinkGrid):
         self._grid, self._account, self.names = grid, account, names
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterator[Message]:
-        """Yield the replies as they arrive, then the errors of nodes that are not there.
+        """Yield the replies as they arrive, then the errors of absent nodes.
 
-        A message is entered when it is sent or, while another one has no reply yet, with its own reply: so the entries
-        do not depend on how many are under way. Nothing is sent before the first reply is asked for. The first reply
-        over a budget ends the exchange: raises `BudgetExceeded`.
+        A message is entered when it is sent or, while another reply is outstanding, together with its reply, so that
+        the order of entries does not depend on the number of messages in flight. Nothing is sent before the first reply
+        is requested. The first reply over a budget ends the exchange: raises `BudgetExceeded`. timeout: [s].
         """
         asked: dict[int, Message] = {}
-        waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages that are not entered, by node
+        waiting: dict[int, tuple[int, int]] = {}  # round and bytes of messages not entered yet, by node
         open_: set[int] = set()  # nodes that have not answered
         away: list[Message] = []
 
@@ -104,7 +103,9 @@ class MeteredGrid(LinkGrid):
             yield from map(self._fail, away)
 
         for reply in arrived():
-            node, number, size = reply.metadata.src_node_id, 0, 0
+            node = reply.metadata.src_node_id
+            number = 0
+            size = 0
             counts = reply.has_content() and self.names[node] not in self._account.within
             if counts:
                 number, size = _round(asked[node]), wire_bytes(reply.content)
@@ -124,21 +125,22 @@ class MeteredGrid(LinkGrid):
             self._account.ledger.enter(self._account.describe(direction, round_, name, size))
 
     def _find_outage(self, message: Message) -> Outage | None:
-        """Return the outage of the node that a message is to in the message's round."""
+        """Return the outage of a message's receiver in its round."""
         return self._account.outages.get((_round(message), self.names[message.metadata.dst_node_id]))
 
     def _fail(self, message: Message) -> Message:
-        """Return an error in the place of the answer to a message, with the reason of the outage."""
+        """Return an error in place of the reply to a message, with the reason of the outage."""
         outage = self._find_outage(message)
         assert outage is not None
         return Message(Error(code=LOST_BY_NETWORK, reason=outage.reason), reply_to=message)
 
     def _cut(self, reply: Message, message: Message) -> Message:
-        """Return a reply as it arrives: an error where it is an update and breaks off."""
+        """Return a reply or, for an interrupted update, an error."""
         outage = self._find_outage(message)
         if outage is None or not reply.has_content() or ARRAYS not in reply.content.array_records:
             return reply
-        account, size = self._account, min(outage.sent_bytes or 0, wire_bytes(reply.content))
+        account = self._account
+        size = min(outage.sent_bytes or 0, wire_bytes(reply.content))
         name = self.names[message.metadata.dst_node_id]
         account.ledger.enter(account.describe("up", _round(message), name, size))
         return self._fail(message)

@@ -1,8 +1,8 @@
-"""Client processes: several clients train at the same time, each in a process of one thread.
+"""Client processes: several clients train at the same time, in processes of one thread.
 
-A process trains one client after another and has all of them, so that a client goes to whichever process is free. What
-a client returns does not depend on the process, nor on how many there are. Arrays pass through memory that two
-processes share: a pipe would copy them six times, in pieces.
+A process trains one client after another and holds all of them, so that a client can use any free process. Its update
+does not depend on the process, nor on their number. Arrays pass through memory shared by two processes: a pipe would
+copy them six times, in pieces.
 """
 
 import contextlib
@@ -26,22 +26,21 @@ from flcav.machine.threads import keep_freed_memory, use_threads
 
 @dataclass(frozen=True)
 class Parcel:
-    """A pickled value whose arrays are in a block, if they are not in the pickle."""
+    """A pickled value whose arrays are in a shared block, if they are not in the pickle."""
 
     pickled: bytes
-    sizes: tuple[int, ...] = ()  # of the arrays, one after another from the beginning of the block [bytes]
+    sizes: tuple[int, ...] = ()  # of the arrays, stored consecutively from the start of the block [bytes]
 
 
 class SharedBlock:
-    """A block of memory for one value at a time, written by one of two processes and read by the other.
+    """A block of shared memory for one value at a time, written by one of two processes and read by the other.
 
-    It has a name in no folder, so that none is left behind by processes that are killed. It reaches the other process
-    as an argument of its start. Values that it has no room for are pickled whole; where the system has no such memory,
-    all are.
+    It is anonymous, so that killed processes leave nothing behind, and is passed to the other process as an argument of
+    its start. Values that do not fit are pickled whole, as are all where the system has no such memory.
     """
 
     def __init__(self, size: int) -> None:
-        """Reserve `size` bytes; memory is taken when it is first written to."""
+        """Reserve `size` bytes; the system allocates them when they are first written."""
         self._file: int | None = None
         self._memory: mmap.mmap | bytearray = bytearray()
         if size and hasattr(os, "memfd_create"):  # Linux
@@ -53,13 +52,14 @@ class SharedBlock:
         return _attach, (None if self._file is None else DupFd(self._file), len(self._memory))
 
     def close(self) -> None:
-        """Give the memory back, once the other process has ended, too."""
+        """Release the memory, once the other process has ended, too."""
         if self._file is not None:
             os.close(self._file)
             self._file, self._memory = None, bytearray()
 
     def write(self, value: object) -> Parcel:
-        """Write a value, over the one before; return what else the reader needs."""
+        """Write a value over the previous one; return what the reader needs besides."""
+        # protocol 5 keeps arrays out of the pickle, so that they are copied once, into shared memory
         buffers: list[pickle.PickleBuffer] = []
         pickled = pickle.dumps(value, protocol=5, buffer_callback=buffers.append)
         arrays = [buffer.raw() for buffer in buffers]
@@ -74,7 +74,8 @@ class SharedBlock:
 
     def read(self, parcel: Parcel) -> Any:
         """Return the value, with copies of its arrays."""
-        arrays, start = [], 0
+        arrays = []
+        start = 0
         with memoryview(self._memory) as memory:
             for size in parcel.sizes:
                 arrays.append(bytearray(memory[start : start + size]))
@@ -93,7 +94,7 @@ def _attach(file: Any, size: int) -> SharedBlock:
 
 
 _clients: Mapping[str, Trainable] = {}  # in a client process
-_block = SharedBlock(0)  # in a client process: shared with the one that started it
+_block = SharedBlock(0)  # in a client process: shared with its parent
 
 
 class ClientKilled(RuntimeError):
@@ -101,13 +102,13 @@ class ClientKilled(RuntimeError):
 
 
 class ClientProcesses:
-    """`count` processes in which `clients` train; a context manager, whose end is theirs.
+    """A pool of `count` processes in which `clients` train; a context manager, whose exit ends them.
 
-    They start when they are first needed. One that is killed loses the client that it was training, and is replaced.
+    A process starts when it is first needed. If one is killed, the client that it trained fails, and it is replaced.
     """
 
     def __init__(self, clients: Mapping[str, Trainable], count: int) -> None:
-        """Hand `clients` to each process, by pickling; raises `InputError` where they cannot be."""
+        """Pickle `clients` for the processes; raises `InputError` where that is impossible."""
         try:
             self._pickled = pickle.dumps(clients)
         except (pickle.PicklingError, AttributeError, TypeError) as error:
@@ -117,10 +118,10 @@ class ClientProcesses:
         self._all: list[_Process] = []
 
     def renew(self, clients: Mapping[str, Trainable]) -> None:
-        """Hand the processes the clients as they are now; no client may be training."""
+        """Send the processes the clients in their present state; no client may be training."""
         self._pickled = pickle.dumps(clients)
         for each in self._all:
-            with contextlib.suppress(BrokenProcessPool):  # its next training says so
+            with contextlib.suppress(BrokenProcessPool):  # its next training raises the error
                 each.renew(self._pickled)
 
     def __enter__(self) -> "ClientProcesses":
@@ -139,10 +140,10 @@ class ClientProcesses:
         return [pid for each in self._all for pid in each.pids]
 
     def _train(self, name: str, weights: Weights, how: Mapping[str, Any], limit_s: float | None) -> Update:
-        """Return what the client's `train` does in the first free process; raises what it raises.
+        """Return the update of a client's `train` in the first free process; raises what `train` raises.
 
-        May be called from several threads. Raises `ClientKilled` where the process ends before, `ClientLate` where it
-        was ended as it had not trained within `limit_s`.
+        May be called from several threads. Raises `ClientKilled` where the process died, `ClientLate` where it was
+        ended after `limit_s` [s].
         """
         process = self._free.get()
         try:
@@ -160,11 +161,11 @@ class ClientProcesses:
 
 
 class _Process:
-    """A client process, which starts with its first training, and the memory that arrays go there and back in."""
+    """A client process, which starts with its first training, and the memory it shares with this one."""
 
     def __init__(self, clients: bytes) -> None:
         self._clients = clients
-        self._pool: ProcessPoolExecutor | None = None  # of one process: where it breaks, it is known whose fault it was
+        self._pool: ProcessPoolExecutor | None = None  # of one process, so that it is known which client broke it
         self._block = SharedBlock(0)
 
     @property
@@ -175,10 +176,10 @@ class _Process:
         if self._pool is None:
             self._block = SharedBlock(
                 2 * sum(array.nbytes for array in weights.values())
-            )  # some send arrays beside them
+            )  # room for the further arrays of a strategy
             given = self._clients, self._block
             self._pool = ProcessPoolExecutor(1, mp_context=start_server(), initializer=_start, initargs=given)
-            self._pool.submit(os.getpid).result()  # the time to start is not the client's
+            self._pool.submit(os.getpid).result()  # its start does not count as training
         trained = self._pool.submit(_train_here, self._block.write((name, weights, how)))
         if not wait([trained], limit_s).done:
             raise ClientLate(limit_s)
@@ -200,9 +201,9 @@ class _Process:
 def train_remotely(
     clients: Mapping[str, Trainable], processes: ClientProcesses, limit_s: float | None = None
 ) -> Mapping[str, Trainable]:
-    """Return `clients` as they are reached from this process: they train in `processes`, which have them, too.
+    """Return proxies of `clients` that train in `processes`, which hold the same clients.
 
-    limit_s: time that one may train; None: any.
+    limit_s: time limit of a training [s]; None: none.
     """
     return NamedClients(clients, lambda name: _Remote(name, processes, clients, limit_s))
 

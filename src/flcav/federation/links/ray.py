@@ -1,7 +1,7 @@
 """Flower's simulation runtime: the clients of a federation train in actors of a Ray cluster.
 
-Flower pickles its client app for every message. So the clients are put into Ray's object store once, and the app that
-is pickled has a reference to them.
+Flower pickles its client app for every message. The clients are therefore put into Ray's object store once, and the
+pickled app only has a reference to them.
 """
 
 import contextlib
@@ -24,11 +24,11 @@ from flcav.federation.trainable import Arrays, Trainable
 from flcav.federation.wire import METRICS, to_array_record
 from flcav.machine.ray_engine import ray_session
 
-STARTING_S = 120.0  # for the nodes to be there
+STARTING_S = 120.0  # timeout of the nodes' start [s]
 
 
 class RaySimulation:
-    """`count` Ray actors of one thread each, in which clients train."""
+    """A runtime of `count` Ray actors with one thread each, in which clients train."""
 
     deployed: Literal[False] = False
 
@@ -44,11 +44,12 @@ class RaySimulation:
     ) -> Iterator["SimulatedGrid"]:
         """Yield the grid of a simulation, whose nodes run `make_app` of the clients.
 
-        Flower runs its server app until the context ends. `states` are the arrays that clients have kept from earlier
-        rounds. Raises `InputError` where Ray is not installed.
+        Flower runs its server app until the context ends. states: client states from earlier rounds. Raises
+        `InputError` where Ray is not installed.
         """
         ready, ended = SimpleQueue[SimulatedGrid | BaseException](), threading.Event()
-        server, names = ServerApp(), [*clients]
+        server = ServerApp()
+        names = [*clients]
 
         @server.main()
         def main(grid: Grid, context: Context) -> None:
@@ -82,13 +83,13 @@ class RaySimulation:
 
 
 class SimulatedGrid(LinkGrid):
-    """The grid of a simulation, which knows its clients' names by node."""
+    """The grid of a simulation, with its clients' names by node."""
 
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
         self._grid, self.names = grid, names
 
     def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Iterable[Message]:
-        """Return the replies of the simulation's nodes."""
+        """Return the replies of the simulation's nodes, at most those within `timeout` [s]."""
         return self._grid.send_and_receive(messages, timeout=timeout)
 
 
@@ -104,12 +105,13 @@ def _fetch_client(stored: Any, name: str) -> Trainable:
 
 
 def _introduce(grid: Grid, names: list[str], states: Mapping[str, Mapping[str, Arrays]]) -> dict[int, str]:
-    """Return the clients' names by node in the order of `names`, and hand each node what its client has kept."""
+    """Return the clients' names by node in the order of `names`, and send the nodes their clients' states."""
     end = time.monotonic() + STARTING_S
     while len(nodes := [*grid.get_node_ids()]) < len(names):
         if time.monotonic() > end:
             raise OSError(f"Flower's simulation: {len(nodes)} of {len(names)} nodes are there after {STARTING_S:.0f} s")
         time.sleep(0.05)
+    # Flower assigns partitions to nodes in an order of its choice, so every node is asked for its index
     partition: dict[int, int] = {}
     for reply in grid.send_and_receive(_query(nodes, {})):
         partition[int(reply.content.metric_records[METRICS][PARTITION])] = reply.metadata.src_node_id  # type: ignore[arg-type]
@@ -124,7 +126,9 @@ def _introduce(grid: Grid, names: list[str], states: Mapping[str, Mapping[str, A
 def _query(nodes: Iterable[int], kept: Mapping[int, Mapping[str, Arrays]]) -> list[Message]:
     return [
         Message(
-            RecordDict({key: to_array_record(own) for key, own in kept.get(node, {}).items()}), node, MessageType.QUERY
+            RecordDict({key: to_array_record(arrays) for key, arrays in kept.get(node, {}).items()}),
+            node,
+            MessageType.QUERY,
         )
         for node in nodes
     ]

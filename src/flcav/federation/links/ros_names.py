@@ -6,7 +6,7 @@ ROS_NAMESPACE = r"^(/[A-Za-z_][A-Za-z0-9_]*)+$"  # such as /flcav/weather
 
 
 def join_names(namespace: str, *parts: str) -> str:
-    """Return a ROS name below a namespace; what no name may have is an underscore in it.
+    """Return a ROS name below a namespace; invalid characters become underscores.
 
     >>> join_names("/flcav", "cloud-fl-weather", "1st")
     '/flcav/cloud_fl_weather/_1st'

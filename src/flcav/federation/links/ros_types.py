@@ -1,4 +1,4 @@
-"""`std_msgs/msg/UInt8MultiArray` as DDS has it, by the mapping of ROS 2's interfaces to IDL (design.ros2.org)."""
+"""`std_msgs/msg/UInt8MultiArray` as a DDS type, by the mapping of ROS 2 interfaces to IDL (design.ros2.org)."""
 
 from dataclasses import dataclass
 from typing import Any

@@ -1,9 +1,9 @@
-"""ROS 2 topics as the wireline between edge servers and the cloud: messages of stage III, as DDS carries them.
+"""ROS 2 topics as the wireline between edge servers and the cloud: messages of stage III over DDS.
 
-What the cloud sends to an edge server is published on a topic of that server, and its reply on another one, as
+A request of the cloud to an edge server is published on a topic of that server, and its reply on another one, as
 `std_msgs/msg/UInt8MultiArray` with ROS 2's names, types, type hash and quality of service on the wire (the mapping of
 `rmw_cyclonedds_cpp`: topic `/a` is `rt/a`, type `pkg/msg/T` is `pkg::msg::dds_::T_`). The data of an array are a Flower
-message's records as Flower serialises them; the label of its one dimension says what they are. Clients train in this
+message's records as Flower serialises them; the label of its single dimension is their type. Clients train in this
 process. Messages may be kept in a ROS 2 bag: MCAP with the profile of ROS 2, and its metadata.yaml (rosbag2, version
 9). Needs the extra `ros`.
 """
@@ -45,9 +45,9 @@ string label
 uint32 size
 uint32 stride
 """
-STEP_NS = 1_000_000  # between messages: they are numbered, since a simulated exchange has no time of its own
+STEP_NS = 1_000_000  # between messages, which get consecutive times, since a simulated exchange has no clock
 UNIT = {"sec": 0, "nsec": 0}
-QUALITY = [  # reliable, volatile, the last ten: the default of ROS 2
+QUALITY = [  # ROS 2's default: reliable, volatile, keep the last ten
     {
         "history": "keep_last",
         "depth": 10,
@@ -63,13 +63,13 @@ QUALITY = [  # reliable, volatile, the last ten: the default of ROS 2
 
 
 class BagWriter:
-    """A ROS 2 bag that is being written: a folder with one MCAP file; a context manager.
+    """A writer of a ROS 2 bag, a folder with one MCAP file; a context manager.
 
-    The same messages give the same bytes. The metadata, without which no bag is read, are written at the end.
+    The same messages give the same bytes. The metadata, without which a bag cannot be read, are written at the end.
     """
 
     def __init__(self, folder: Path, kind: str, type_hash: str) -> None:
-        """Write to a new folder messages of the ROS type `kind`, which is to be that of `DEFINITION`."""
+        """Write messages of the ROS type `kind`, whose definition is `DEFINITION`, to a new folder."""
         self._folder, self._kind, self._hash = folder, kind, type_hash
         self._file = f"{folder.name}_0.mcap"
         self._channels: dict[str, int] = {}
@@ -84,7 +84,7 @@ class BagWriter:
         return self
 
     def write(self, topic: str, cdr: bytes) -> None:
-        """Write a message with its encapsulation header."""
+        """Write a CDR message, which includes its encapsulation header."""
         if topic not in self._channels:
             about = {"offered_qos_profiles": yaml.safe_dump(QUALITY), "topic_type_hash": self._hash}
             self._channels[topic] = self._writer.register_channel(topic, "cdr", self._schema, metadata=about)
@@ -137,17 +137,17 @@ class BagWriter:
 
 
 TYPE, HASH = "std_msgs/msg/UInt8MultiArray", "RIHS01_5687e861b8d307a5e48b7515467ae7a5fc2daf805bd0ce6d8e9e604bade9f385"
-RECORDS, FAILED = "flwr.RecordDict", "error"  # labels of the dimension: what the data are
+RECORDS, FAILED = "flwr.RecordDict", "error"  # labels of the dimension: type of the data
 DISCOVERY_S, DELIVERY_S = 20.0, 120.0
-MOST_BYTES = 2**31  # of a message's data
+MOST_BYTES = 2**31  # bound on a message's data
 
 
 @dataclass(frozen=True)
 class RosTopics:
-    """Topics below a namespace, in a DDS domain, by which a server and its clients exchange messages.
+    """The topics of a federation below a namespace in a DDS domain, by which server and clients exchange messages.
 
-    Each client has the topics NAMESPACE/CLIENT/down, from the server, and NAMESPACE/CLIENT/up. Two federations at once
-    in one domain need namespaces of their own. Raises `InputError` for what is no ROS name.
+    Every client has the topics NAMESPACE/CLIENT/down, from the server, and NAMESPACE/CLIENT/up. Simultaneous
+    federations in one domain need different namespaces. Raises `InputError` for invalid ROS names.
     """
 
     deployed: ClassVar[Literal[False]] = False
@@ -165,14 +165,14 @@ class RosTopics:
 
     @property
     def number(self) -> int:
-        """Return the number of the DDS domain; raises `InputError` where the environment has none."""
+        """Return the number of the DDS domain; raises `InputError` where the environment's is invalid."""
         given = os.environ.get("ROS_DOMAIN_ID", "0") if self.domain is None else str(self.domain)
         if not given.isascii() or not given.isdigit():
             raise InputError(f"ROS_DOMAIN_ID '{given}': a number is wanted")
         return int(given)
 
     def name(self, client: str, way: str) -> str:
-        """Return the ROS name of a client's topic, `way` being down or up."""
+        """Return the ROS name of a client's topic; `way` is down or up."""
         return join_names(self.namespace, client, way)
 
     @contextlib.contextmanager
@@ -184,8 +184,8 @@ class RosTopics:
     ) -> Iterator["TopicGrid"]:
         """Yield the grid of the clients.
 
-        Raises `InputError` where the extra is not installed or two clients have one topic, OSError where DDS cannot be
-        opened or an end does not see the other one.
+        Raises `InputError` where the extra is not installed or two clients have the same topic, OSError where DDS fails
+        or the two ends of a topic do not discover each other.
         """
         names = [*clients]
         if len({self.name(name, "down") for name in names}) < len(names):
@@ -200,10 +200,10 @@ class RosTopics:
 
 
 class Topic:
-    """A topic with one writer and one reader, of two participants of a domain, as in two processes."""
+    """A topic with one writer and one reader, which belong to two participants of a domain, as in two processes."""
 
     def __init__(self, name: str, from_: Any, to: Any) -> None:
-        """Open both ends of the topic with a ROS name; raises OSError where they do not find each other.
+        """Open both ends of the topic with a ROS name; raises OSError where they do not discover each other.
 
         Args:
             name: of the topic.
@@ -217,12 +217,13 @@ class Topic:
 
         from flcav.federation.links.ros_types import UInt8MultiArray_
 
-        self.name, self._kind = name, UInt8MultiArray_
+        self.name = name
+        self._kind = UInt8MultiArray_
         quality = Qos(
             Policy.Reliability.Reliable(max_blocking_time=int(DELIVERY_S * 1e9)),
             Policy.Durability.Volatile,
             Policy.History.KeepLast(10),
-            Policy.DataRepresentation(use_cdrv0_representation=True),
+            Policy.DataRepresentation(use_cdrv0_representation=True),  # XCDR1, which ROS 2 uses
             Policy.Userdata(f"typehash={HASH};".encode()),
         )
         self._reader = DataReader(to, DdsTopic(to, f"rt{name}", UInt8MultiArray_), qos=quality)
@@ -234,7 +235,7 @@ class Topic:
             time.sleep(0.01)
 
     def carry(self, label: str, data: bytes, bag: BagWriter | None) -> tuple[str, bytes]:
-        """Publish an array, and return its label and data as the reader has them; raises OSError as DDS fails."""
+        """Publish an array, and return the label and data that the reader received; raises OSError where DDS fails."""
         from cyclonedds.core import DDSException
         from cyclonedds.util import duration
 
@@ -255,21 +256,21 @@ class Topic:
 
 @contextlib.contextmanager
 def _open_wires(topics: RosTopics, clients: Sequence[str]) -> Iterator[dict[str, tuple[Topic, Topic]]]:
-    """Yield each client's topics, down and up; the server is one participant of the domain, each client another."""
+    """Yield the topics down and up by client; the server and every client are participants of the domain."""
     try:
         from cyclonedds.core import DDSException
         from cyclonedds.domain import DomainParticipant
     except ImportError:
-        told = f"pip install 'flcav[ros]', or {format_install_command('ros')}"
-        raise InputError(f"parameters on ROS 2 topics need the extra 'ros': {told}") from None
+        command = f"pip install 'flcav[ros]', or {format_install_command('ros')}"
+        raise InputError(f"parameters on ROS 2 topics need the extra 'ros': {command}") from None
     found: dict[str, tuple[Topic, Topic]] = {}
     try:
         server = DomainParticipant(topics.number)
         for name in clients:
-            own = DomainParticipant(topics.number)
+            participant = DomainParticipant(topics.number)
             found[name] = (
-                Topic(topics.name(name, "down"), server, own),
-                Topic(topics.name(name, "up"), own, server),
+                Topic(topics.name(name, "down"), server, participant),
+                Topic(topics.name(name, "up"), participant, server),
             )
     except DDSException as error:
         raise OSError(f"DDS domain {topics.number}: {error}") from None
@@ -277,7 +278,7 @@ def _open_wires(topics: RosTopics, clients: Sequence[str]) -> Iterator[dict[str,
 
 
 class TopicGrid(EmbeddedGrid):
-    """Flower grid whose messages and replies go by topics; the nodes are in this process."""
+    """A Flower grid whose messages and replies use topics; the nodes are in this process."""
 
     def __init__(
         self,
@@ -287,12 +288,12 @@ class TopicGrid(EmbeddedGrid):
         wires: Mapping[str, tuple[Topic, Topic]],
         bag: BagWriter | None,
     ) -> None:
-        """Register a node for each of `names`, with its topics, down and up."""
+        """Register a node per name, with its topics, down and up."""
         super().__init__(app, names, states)
         self._wires, self._bag = wires, bag
 
     def _deliver(self, message: Message) -> Message:
-        """Return a node's reply to a message, after both went by their topics."""
+        """Return a node's reply to a message, both sent by their topics."""
         down, up = self._wires[self.names[message.metadata.dst_node_id]]
         sent = message.content
         _, data = down.carry(RECORDS, pack_records(sent), self._bag)

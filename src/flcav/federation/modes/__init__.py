@@ -1,1 +1,1 @@
-"""Modes of a round: how the server gets the updates of those who take part."""
+"""Modes of a round: how the server collects the updates of its clients."""

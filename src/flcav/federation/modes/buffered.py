@@ -1,7 +1,7 @@
 """Rounds of buffered asynchronous aggregation: a round is a buffer, filled by clients in the order of a clock.
 
-Who is how fast does not depend on what is learned. So a clock comes first (`flcav.network.clock.buffers`), and its
-buffers say which version of the weights each update began with; here clients train on those versions. The same
+The timing of clients does not depend on what they learn. The clock therefore runs first (`flcav.network.clock.buffers`)
+and determines the version of the weights that each update starts from; clients then train on those versions. The same
 clock and seed give the same bytes.
 """
 
@@ -29,31 +29,31 @@ Work = Callable[[int], LocalWork]  # local training of a round, by its number
 
 @dataclass(frozen=True)
 class BrokenUpdate:
-    """An update that broke off on the network."""
+    """An update whose transmission was interrupted."""
 
     client: str
     reason: str  # e.g. "out of coverage"
-    down_bytes: int  # as far as the weights and the update came
+    down_bytes: int  # transmitted before the interruption
     up_bytes: int
 
 
 @dataclass(frozen=True)
 class FilledBuffer:
-    """A round of buffered aggregation: whose updates fill the buffer, and what broke off while it filled."""
+    """A round of buffered aggregation: the updates in the buffer, and those interrupted while it was filled."""
 
-    versions: Mapping[str, int]  # that each update began with, by client: weights after so many rounds
+    versions: Mapping[str, int]  # version that the update starts from, by client: number of rounds before it
     broken: tuple[BrokenUpdate, ...] = ()
 
 
 @dataclass(frozen=True)
 class Buffers:
-    """The rounds of a federation by a clock, and how often clients took part in federations before it."""
+    """The buffered rounds of a federation, by a clock, and participations in previous federations."""
 
     rounds: tuple[FilledBuffer, ...]
     before: Mapping[str, int] = field(default_factory=dict)  # by client
 
     def participations(self, rounds: int) -> int:
-        """Return how many updates the client began to send that sent most, in the first `rounds` rounds and before."""
+        """Return the most updates that one client began to send, in the first `rounds` rounds and before."""
         times = Counter(self.before)
         for each in self.rounds[:rounds]:
             times.update([*each.versions])
@@ -61,35 +61,37 @@ class Buffers:
         return max(times.values(), default=0)
 
     def epsilon(self, privacy: Privacy, rounds: int) -> float:
-        """Return epsilon after so many rounds, of the client that sent most."""
+        """Return epsilon of the client with most updates, after `rounds` rounds."""
         return account_epsilon(privacy, Selection(), ["one"], self.participations(rounds))
 
     @property
     def least_before(self) -> int:
-        """Return the least number of updates that a client sent in federations before; 0 where none is known."""
+        """Return the least number of updates of a client in previous federations; 0 where none is known."""
         return min(self.before.values(), default=0)
 
 
 def afford_buffers(buffers: Buffers, privacy: Privacy | None) -> int:
-    """Return how many of the first rounds the privacy budget affords, without one all.
+    """Return the number of rounds that the privacy budget affords; without a budget all.
 
-    Raises `InputError` where it is 0 of some, and clients took part in no federation before.
+    Raises `InputError` where not even one of the first federation is affordable.
     """
     if privacy is None or privacy.epsilon is None or not buffers.rounds:
         return len(buffers.rounds)
     spent = (buffers.epsilon(privacy, number) for number in range(1, len(buffers.rounds) + 1))
     afforded = next((number for number, each in enumerate(spent) if each > privacy.epsilon), len(buffers.rounds))
     if not afforded and not buffers.before:
-        told = f"{buffers.epsilon(privacy, 1):.4g} at delta = {privacy.delta:g}"
-        raise InputError(f"privacy: a first buffer comes to epsilon = {told}, above the budget of {privacy.epsilon:g}")
+        epsilon = f"{buffers.epsilon(privacy, 1):.4g} at delta = {privacy.delta:g}"
+        raise InputError(
+            f"privacy: a first buffer comes to epsilon = {epsilon}, above the budget of {privacy.epsilon:g}"
+        )
     return afforded
 
 
 def fill_in_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
-    """Return `rounds` rounds, and some more, of clients that are equally fast, and whose messages take no time.
+    """Return the buffers of clients that are equally fast, and whose messages take no time.
 
-    All that train are ready at once and fill buffers in their order; who is in a full buffer begins with its version.
-    The further rounds are those in which everybody who trains at the end is ready.
+    All training clients finish at the same time and fill buffers in their order; those in a full buffer start again
+    from its version. After `rounds` rounds there are further ones, until all clients in training have finished.
     """
     ready: list[tuple[str, int]] = [(name, 0) for name in clients]
     waiting: list[tuple[str, int]] = []
@@ -104,47 +106,50 @@ def fill_in_turns(clients: Sequence[str], size: int, rounds: int) -> Buffers:
 
 
 def count_participations(records: Sequence[tuple[Sequence[str], Sequence[str]]]) -> dict[str, int]:
-    """Return by client in how many rounds it took part or failed; records: of each, its clients, and those that did."""
+    """Return the number of rounds with each client; records: per round, clients that took part and that failed."""
     return dict(Counter(name for clients, failed in records for name in {*clients, *failed}))
 
 
 @dataclass(frozen=True)
 class Buffering:
-    """Buffered rounds of a server: the strategy, the clock's rounds, and the ledger."""
+    """The server's buffered rounds: strategy, rounds of the clock, and ledger."""
 
     strategy: FedBuff
     buffers: Buffers
     account: Account
 
     def attend(self, number: int, clients: Sequence[str]) -> Attendance:
-        """Return who takes part in a round, in the order of all clients."""
+        """Return the attendance of a round, in the order of all clients."""
         chosen = [name for name in clients if name in self.buffers.rounds[number - 1].versions]
         return Attendance(chosen, chosen)
 
     def keep_version(self, number: int, start: Weights, kept: Arrays) -> Arrays:
-        """Return the versions that updates from round `number` on began with: `start`, and of those `kept` before."""
+        """Return the versions that updates from round `number` on start from, out of `start` and those `kept`."""
         needed = {version for later in self.buffers.rounds[number - 1 :] for version in later.versions.values()}
-        own = {_key(number - 1, name): np.asarray(array) for name, array in start.items()}
-        return {key: array for key, array in (kept | own).items() if int(key.partition("|")[0]) in needed}
+        current = {_key(number - 1, name): np.asarray(array) for name, array in start.items()}
+        return {key: array for key, array in (kept | current).items() if int(key.partition("|")[0]) in needed}
 
     def enter_broken(self, number: int, here: Attendance) -> None:
-        """Enter what was sent of updates that broke off."""
+        """Enter the transmitted parts of interrupted updates in the ledger."""
         for each in self.buffers.rounds[number - 1].broken:
             sizes: tuple[tuple[Direction, int], ...] = (("down", each.down_bytes), ("up", each.up_bytes))
             for direction, size in sizes:
                 self.account.ledger.enter(self.account.describe(direction, number, each.client, size))
-            if each.client not in here.chosen:  # others came through at another attempt
+            if each.client not in here.chosen:  # others succeeded at another attempt
                 here.failed[each.client] = each.reason
                 here.lost.add(each.client)
 
 
 def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: Arrays, work: Work) -> Intake:
-    """Return the updates of a round that count, rebased on the weights that it begins with.
+    """Return the accepted updates of a round, rebased on its initial weights.
 
-    Clients are sent the version that they began with, of those `kept`, and the local `work` of the round after it.
-    Where an update would exceed a budget, it and those after it are not sent, and the round's record says so.
+    Clients get the version that they start from, out of those `kept`, and the local `work` of the round that follows
+    it. An update that would exceed a budget, and those after it, are not sent, which the round's record reports.
     """
-    here, rules, number, strategy = round_.here, round_.rules, round_.work.round, buffering.strategy
+    here = round_.here
+    rules = round_.rules
+    number = round_.work.round
+    strategy = buffering.strategy
     buffer = buffering.buffers.rounds[number - 1]
     begun = {
         version: {name: kept[_key(version, name)] for name in round_.start} for version in buffer.versions.values()
@@ -154,6 +159,7 @@ def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: A
     requests = {}
     for name in here.chosen:
         version = buffer.versions[name]
+        # trained as in the round after its version, but answered in this round, once per client
         local = replace(work(version + 1), round=number)
         requests[name] = RecordDict({ARRAYS: arrays[version], CONFIG: local.record()})
     updates = Intake(strategy if rules.privacy is None else None)
@@ -173,5 +179,5 @@ def collect(exchange: Exchange, round_: OpenRound, buffering: Buffering, kept: A
 
 
 def _key(version: int, name: str) -> str:
-    """Return the key of an array of a version in the server's state."""
+    """Return the key in the server's state of an array of a version."""
     return f"{version}|{name}"

@@ -1,4 +1,4 @@
-"""Rounds of drawn clients, whose updates are weighted by the inverse of their probability: the mean is unbiased."""
+"""Rounds of sampled clients, with updates weighted by inverse probability, so that their mean is unbiased."""
 
 from functools import partial
 
@@ -11,21 +11,22 @@ from flcav.federation.wire import ASK, CONFIG, COUNT, NORM, SEND
 
 
 def collect(exchange: Exchange, round_: OpenRound) -> Intake:
-    """Return the updates that count of those who are drawn, and their Horvitz-Thompson mean.
+    """Return the accepted updates of the sampled clients, and their Horvitz-Thompson mean.
 
-    Under importance selection all clients train and report the norm of their update, and those that are drawn by it are
-    asked to send that update. Under other unbiased selections all first report their number of samples, and those who
-    are chosen then train. Where fewer take part than the rules want nobody is asked for an update.
+    Under importance selection all clients train and report the norm of their update; clients are sampled by it and then
+    send that update. Under other unbiased selections all clients report their number of samples before the chosen ones
+    train. No update is requested where fewer clients take part than the rules need.
     """
     here, rules, work = round_.here, round_.rules, round_.work
-    unbiased, local = rules.selection.unbiased, RecordDict({CONFIG: work.record()})
+    unbiased = rules.selection.unbiased
+    local = RecordDict({CONFIG: work.record()})
     first = RecordDict({**local}) if unbiased else round_.training()
     first[ASK] = ConfigRecord({ASK: COUNT if unbiased else NORM})
-    asked = dict.fromkeys(here.asked if unbiased else here.chosen, first)
-    reports = dict(exchange.ask(here, asked, lambda _, content: read_norm(content, rules)))  # norm, number of samples
+    requests = dict.fromkeys(here.asked if unbiased else here.chosen, first)
+    reports = dict(exchange.ask(here, requests, lambda _, content: read_norm(content, rules)))  # norm and samples
     total = max(sum(samples for _, samples in reports.values()), 1)
     shares = {name: samples / total for name, (_, samples) in reports.items()}
-    norms: dict[str, float] = {}  # which the updates that are sent later may not exceed
+    norms: dict[str, float] = {}  # upper bounds of the updates sent later
     if unbiased:
         probability = rules.selection.inclusion_probability(len(here.asked))
         drawn = {name: probability for name in here.chosen if name in shares}

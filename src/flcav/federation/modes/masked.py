@@ -1,4 +1,4 @@
-"""Masked rounds: secure aggregation as the server conducts it: keys and shares, masked updates, the sum of these."""
+"""Rounds under secure aggregation, on the server: keys and shares, masked updates, and their unmasked sum."""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -20,18 +20,20 @@ AnswerT = TypeVar("AnswerT")
 
 
 def collect(exchange: Exchange, round_: OpenRound, authority: x509.Certificate | None = None) -> Intake:
-    """Agree on masks, and return the masked updates, whose average is of their sum alone.
+    """Let clients agree on masks, and return the masked updates, of which only the sum is ever unmasked.
 
-    Where shares that one client sealed for another do not open, the round begins again without the liars. Where too few
-    are left, nobody is asked to train, and the attendance has a shortage.
+    Where shares that one client sealed for another do not open, the round restarts without the liars. Where too few
+    clients are left, none is asked to train, and the attendance notes a shortage.
 
-    authority: that has certified the clients; None: their keys are not signed.
+    authority: certificate of the clients' authority; None: their keys are not signed.
     """
     here, secure = round_.here, round_.rules.secure
     assert secure is not None
     if not here.count(round_.rules):
         return Intake()
-    local, training, clients = round_.work.record(), round_.training(), here.chosen
+    local = round_.work.record()
+    training = round_.training()
+    clients = here.chosen
 
     def exchange_step(
         asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
@@ -66,9 +68,9 @@ def _read(round_: OpenRound, total: SecureSum, name: str, content: RecordDict) -
 
 
 def _unmask(round_: OpenRound, total: SecureSum, updates: Mapping[str, LocalUpdate]) -> Weights:
-    """Return start + (sum of the clients' changes) / their number; the sum is all that is unmasked.
+    """Return start + (sum of the clients' changes) / their number; only the sum is unmasked.
 
-    Raises `TooFewClients`, and `SumLost` where wrong shares leave no way to the sum.
+    Raises `TooFewClients`, and `SumLost` where wrong shares make the sum unrecoverable.
     """
     secure = round_.rules.secure
     assert secure is not None

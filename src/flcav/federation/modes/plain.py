@@ -1,4 +1,4 @@
-"""Plain rounds: those who take part train and send their updates, which a strategy combines."""
+"""Plain rounds: clients train and send their updates, which a strategy combines."""
 
 import contextlib
 from collections.abc import Iterator
@@ -12,10 +12,10 @@ from flcav.federation.strategies.strategy import find_weigher
 
 
 def collect(exchange: Exchange, round_: OpenRound, strategy: Strategy) -> Intake:
-    """Return the updates that count of those who are chosen, or their running mean where `strategy` needs no more.
+    """Return the accepted updates of the chosen clients, or their running mean where that is enough for `strategy`.
 
-    Where fewer take part than the rules want nobody is asked. Central noise is for every update, clipped. Raises
-    `InputError` where the strategy cannot average what clients sent, `NoShares` where it gives none a weight.
+    No client is asked where fewer take part than the rules need. Central noise needs every update, to clip it. Raises
+    `InputError` where the strategy cannot average the updates, `NoShares` where all their weights are 0.
     """
     here = round_.here
     if not here.count(round_.rules):
@@ -30,7 +30,7 @@ def collect(exchange: Exchange, round_: OpenRound, strategy: Strategy) -> Intake
 
 @contextlib.contextmanager
 def refusing(strategy: Strategy, number: int) -> Iterator[None]:
-    """Raise `InputError` where a strategy cannot combine the updates of a round; `NoShares` as it is."""
+    """Turn the ValueError of a strategy that cannot combine a round's updates into `InputError`; pass on `NoShares`."""
     try:
         yield
     except NoShares:

@@ -1,4 +1,4 @@
-"""Messages of secure aggregation: the client's answers, and the server's side of a round."""
+"""Messages of secure aggregation: the client's replies, and the server's side of a round."""
 
 import base64
 import json
@@ -27,34 +27,34 @@ from flcav.federation.secure.primitives import SHARE_BYTES, Vector, add_vectors,
 from flcav.federation.trainable import Weights
 
 SURVIVORS, DROPPED, THRESHOLD = "survivors", "dropped", "threshold"  # entries of the server's messages
-SECRETS = "secrets"  # record of a node's state: the client's own part of a round
+SECRETS = "secrets"  # record of a node's state: the `SecureClient` of a round
 
 AnswerT = TypeVar("AnswerT")
 
 
 class ExchangeStep(Protocol):
-    """Messages of one step: what each client is asked, and what is read of each usable answer."""
+    """The exchange of one step of the protocol: requests to clients, and their parsed replies."""
 
     def __call__(
         self, asks: Mapping[str, ConfigRecord], read: Callable[[str, RecordDict], AnswerT]
     ) -> dict[str, AnswerT]:
-        """Return by client, of those with a usable answer, what `read` makes of its name and its answer."""
+        """Return `read`(name, reply) by client, for clients with a valid reply."""
         ...
 
 
 class TooFewClients(OSError):
     """Fewer clients are left than secure aggregation needs."""
 
-    reached: Weights | None = None  # after the last round that came to an end; of `federate`
+    reached: Weights | None = None  # weights after the last completed round; set by `federate`
 
 
 def answer_secretly(
     message: Message, context: Context, name: str, how: SecureAggregation, round_: int, identity: Identity | None = None
 ) -> Message:
-    """Return a client's answer to the server's request for keys, shares, or shares of others.
+    """Return a client's reply to the server's request for keys, for shares, or to unmask.
 
-    identity: by which a client signs its keys of the round, and accepts those of certified peers alone; None: it has no
-    authority. Raises ValueError for a request that would reveal more than `how` and the protocol do.
+    identity: with which the client signs its keys of the round; it then only accepts keys of certified peers; None: it
+    has no authority. Raises ValueError for a request that would reveal more than `how` and the protocol allow.
     """
     asked = message.content.config_records[wire.ASK]
     if asked[wire.ASK] == wire.KEYS:
@@ -64,7 +64,8 @@ def answer_secretly(
             record[wire.CERTIFICATES], record[wire.SIGNATURES] = identity.sign(name, round_, client.keys)
     elif asked[wire.ASK] == wire.SHARES:
         client = _recall(context)
-        peers, threshold = _peers(asked), _number(asked[THRESHOLD])
+        peers = _peers(asked)
+        threshold = _number(asked[THRESHOLD])
         if identity is not None:
             check_certified(identity.authority, round_, _signed(asked, peers))
         if threshold < (needed := how.needed(len(peers), certified=identity is not None)):
@@ -80,10 +81,7 @@ def answer_secretly(
 
 
 def complain(message: Message, context: Context) -> Message | None:
-    """Return a client's answer to a request for its masked update where others' shares do not open; else None.
-
-    The shares are those that the server passed on with the request.
-    """
+    """Return a client's complaint about shares in the request that do not open; None if all open."""
     client = _recall(context)
     odd = client.take(_named(message.content.config_records[wire.ASK]))
     _keep(context, client)
@@ -91,26 +89,26 @@ def complain(message: Message, context: Context) -> Message | None:
 
 
 def mask_update(context: Context, update: Vector) -> Vector:
-    """Return a client's update with its masks, after its shares of others' secrets have opened."""
+    """Return a client's masked update, after it has opened the shares of its peers."""
     return _recall(context).mask(update)
 
 
 class SecureSum:
-    """The server's side of one round: what it has to ask for, and the sum in the end."""
+    """The server's side of secure aggregation in one round: its requests, and the unmasked sum."""
 
     def __init__(
         self, exchange: ExchangeStep, threshold: int, round_: int, authority: x509.Certificate | None = None
     ) -> None:
-        """Ask clients by `exchange`; `threshold` of them have to be left at every step.
+        """Talk to clients by `exchange`; `threshold` of them must be left at every step.
 
-        authority: that has certified who signs keys of the round; None: keys are not signed.
+        authority: certificate of the clients' authority; None: keys of the round are not signed.
         """
         self._exchange, self._threshold, self._round, self._authority = exchange, threshold, round_, authority
         self._keys: dict[str, PublicKeys] = {}
         self._peers: list[str] = []
 
     def agree(self, chosen: list[str]) -> dict[str, ConfigRecord]:
-        """Exchange keys and shares among the chosen clients; return what each that is left is asked when it trains.
+        """Exchange keys and shares among the chosen clients; return the request for a masked update, by client left.
 
         Raises `TooFewClients`.
         """
@@ -157,13 +155,13 @@ class SecureSum:
 
     @property
     def peers(self) -> list[str]:
-        """Return the clients that mask their updates in common; their number fixes the step of their integers."""
+        """Return the clients that share masks; their number determines the step of the fixed-point numbers."""
         return self._peers
 
     def finish(self, masked: Mapping[str, Vector]) -> tuple[Vector, dict[str, str]]:
-        """Return the sum of the updates of those clients who sent theirs, `masked`, and who revealed wrong shares, how.
+        """Return the sum of the `masked` updates, by client, and the clients that revealed wrong shares, with reasons.
 
-        Raises `TooFewClients`, and `SumLost` where wrong shares leave no way to the sum.
+        Raises `TooFewClients`, and `SumLost` where wrong shares make the sum unrecoverable.
         """
         survivors = [*masked]
         dropped = [name for name in self._peers if name not in masked]
@@ -175,6 +173,7 @@ class SecureSum:
         )
         self._check(len(shares), "helped to unmask the sum")
         about = add_vectors(masked.values()), self._keys, survivors, dropped
+        # wrong shares are only searched for where the sum does not come out: that takes much longer
         try:
             return unmask_sum(*about, shares), {}
         except OverflowError:
@@ -233,9 +232,9 @@ def _number(value: Any) -> int:
 
 
 def read_keys(content: RecordDict) -> SignedKeys:
-    """Return a client's public keys of a round, with a certificate and a signature that are not checked here.
+    """Return a client's public keys of a round, with certificate and signature, which are not verified here.
 
-    Where the client has no authority these are empty. Raises `ReplyRefused`.
+    Both are empty where the client has no authority. Raises `ReplyRefused`.
     """
     found = PublicKeys(*(read_entry(content, kind) for kind in (wire.CIPHERS, wire.MASKS)))
     if not (is_public_key(found.cipher) and is_public_key(found.mask)):
@@ -247,7 +246,7 @@ def read_keys(content: RecordDict) -> SignedKeys:
 
 
 def read_shares(content: RecordDict, owners: Sequence[str], size: int) -> dict[str, bytes]:
-    """Return the shares of `size` bytes that a client sends, one for each name of `owners`; raises `ReplyRefused`."""
+    """Return the shares of `size` bytes in a reply, one per name in `owners`; raises `ReplyRefused`."""
     names, shares = read_entry(content, wire.NAMES), read_entry(content, wire.SHARES)
     if not isinstance(names, list) or not isinstance(shares, list) or len(names) != len(shares):
         raise ReplyRefused(f"no shares by name, but {shorten(names)}")

@@ -1,15 +1,16 @@
 """Clients and server of secure aggregation (Bonawitz et al., "Practical Secure Aggregation", CCS 2017, figure 4).
 
-The server is honest but curious: it follows the protocol and reads all that it gets. Four exchanges make a round.
-Keys: clients send public keys. Shares: each sends, sealed for every other client, shares of its seed and of its private
-key of masks. Masked: each trains, and sends its update plus the mask of its seed plus masks that it has in common with
-every other client, which cancel in the sum. Unmask: those who are left send their shares of the seeds of clients who
-sent an update, and of the keys of clients who did not, so that no client's both masks can be taken off.
+The server is honest but curious: it follows the protocol, and reads everything it receives. A round has four exchanges.
+Keys: clients send public keys. Shares: every client sends, sealed for every peer, a share of its seed and of its
+private mask key. Masked: every client trains, and sends its update plus the self-mask of its seed plus a pairwise mask
+per peer; pairwise masks cancel in the sum. Unmask: the surviving clients send their shares of the seeds of clients that
+sent an update, and of the mask keys of clients that did not. The server thus never removes both kinds of masks of one
+client.
 
-On a fleet a client signs its public keys of a round with the key that the fleet's authority has certified, since a
-server that puts keys of its own in the place of clients' could take off the masks that it then has in common with them.
-So clients share secrets with certified vehicles alone. A signature of an older round does no harm: masks are added for
-those whose shares open, which they have sealed for the keys of this round.
+On a fleet a client signs its public keys of a round with its key certified by the fleet's authority: a server that
+replaced the keys of clients by keys it knows could remove the pairwise masks. Clients therefore share secrets only with
+certified vehicles. A replayed signature of an older round does no harm: masks are added only for peers whose shares
+open, and these are sealed for the keys of this round.
 """
 
 import contextlib
@@ -43,7 +44,7 @@ from flcav.federation.secure.primitives import (
     unseal,
 )
 
-SEALED_BYTES = 2 * SHARE_BYTES + 16  # of the shares of both secrets, and their authentication
+SEALED_BYTES = 2 * SHARE_BYTES + 16  # shares of both secrets, and the authentication tag
 
 
 class SumLost(OSError):
@@ -54,23 +55,23 @@ class SumLost(OSError):
 class PublicKeys:
     """Public keys of a client for one round."""
 
-    cipher: bytes  # that others seal its shares by
-    mask: bytes  # that it has masks in common with others by
+    cipher: bytes  # for sealing shares to the client
+    mask: bytes  # for agreeing on pairwise masks
 
 
 @dataclass
 class SecureClient:
-    """A client during one round; it does not reveal both of a client's masks, and reveals once."""
+    """A client during one round, which reveals shares once, and never both shares of one client."""
 
     name: str
-    cipher: bytes  # private key that others' shares are sealed for
-    private: bytes  # private key of the masks in common with others
-    seed: bytes  # of its own mask
+    cipher: bytes  # private key for opening sealed shares
+    private: bytes  # private key of the pairwise masks
+    seed: bytes  # of the self-mask
     keys: PublicKeys
     peers: dict[str, PublicKeys] = field(default_factory=dict)  # of all clients of the round
-    threshold: int = 0  # of shares
+    threshold: int = 0  # shares that determine a secret
     own_shares: bytes = b""
-    opened: dict[str, bytes] = field(default_factory=dict)  # by other client, its shares for this one
+    opened: dict[str, bytes] = field(default_factory=dict)  # shares for this client, by peer
     revealed: bool = False
 
     @classmethod
@@ -80,27 +81,27 @@ class SecureClient:
         return cls(name, cipher, private, secrets.token_bytes(32), PublicKeys(cipher_public, mask_public))
 
     def share(self, peers: Mapping[str, PublicKeys], threshold: int) -> dict[str, bytes]:
-        """Return by name of every other client, sealed for it, a share of this one's seed and of its key of masks.
+        """Return the sealed shares of this client's seed and mask key, by peer.
 
-        peers: public keys of all clients of the round, this one included. Raises ValueError where its own are
-        others, and where `threshold` is not more than half of them: two halves could then reveal both of a client's
-        masks.
+        peers: public keys of all clients of the round, including this one. Raises ValueError where this client's keys
+        differ, and where `threshold` is not more than half of the clients: two disjoint groups of survivors could then
+        reveal both secrets of a client.
         """
         if peers[self.name] != self.keys:
             raise ValueError("another public key in the place of this client's own")
         if not len(peers) / 2 < threshold <= len(peers):
             raise ValueError(f"a threshold of {threshold} of {len(peers)} clients: more than half of them is wanted")
-        self.peers, self.threshold = dict(peers), threshold
+        self.peers = dict(peers)
+        self.threshold = threshold
         parts = (split_secret(secret, threshold, len(peers)) for secret in (self.seed, self.private))
         both = {name: seed + key for name, seed, key in zip(peers, *parts, strict=True)}
         self.own_shares = both.pop(self.name)
         return {name: seal(self._sealing_key(self.name, name), shares) for name, shares in both.items()}
 
     def take(self, sealed: Mapping[str, bytes]) -> list[str]:
-        """Open and keep the shares of those who take part in the masks; return the names of those whose do not open.
+        """Open and keep the shares of the peers; return the names of those whose shares do not open.
 
-        sealed: by name of the other clients, the shares that they sealed for this one. Raises ValueError where they are
-        too few.
+        sealed: shares for this client, by peer. Raises ValueError where there are too few.
         """
         if len(sealed) + 1 < self.threshold:
             raise ValueError(f"{len(sealed) + 1} clients are left, and {self.threshold} are needed")
@@ -111,20 +112,20 @@ class SecureClient:
         return [name for name in sealed if name not in self.opened]
 
     def mask(self, update: Vector) -> Vector:
-        """Return the update with its masks: its own, and those in common with the clients whose shares it has."""
-        total = update + expand(self.seed, len(update))  # its own mask, whose seed is shared with all others
+        """Return the masked update (coordinates,): plus the self-mask, plus or minus pairwise masks, modulo 2^32."""
+        total = update + expand(self.seed, len(update))  # self-mask, whose seed is secret-shared
         for name in self.opened:
             common = agree(self.private, self.peers[name].mask, "mask")
-            total = add_mask(total, common, self.name < name)  # of each pair one adds and one subtracts it
+            total = add_mask(total, common, self.name < name)  # one of a pair adds it, the other subtracts it
         return total
 
     def reveal(self, survivors: Sequence[str], dropped: Sequence[str]) -> dict[str, bytes]:
-        """Return this client's shares: of the survivors' seeds, and of the keys of masks of those who dropped out.
+        """Return this client's shares of the survivors' seeds, and of the mask keys of clients that dropped out.
 
-        A server that tells clients different lists takes off all masks of one which has them in common with `threshold`
-        - 1 others, where it gets `threshold` shares of each of their keys. A client reveals shares of no more keys than
-        there are clients beyond the threshold. Raises ValueError where this would reveal both of a client, where it was
-        done before, or with too few survivors.
+        A server that sends clients different lists could remove all masks of a client with `threshold` - 1 peers if it
+        got `threshold` shares of all their mask keys. A client therefore reveals shares of at most as many mask keys as
+        there are clients beyond the threshold: the survivors are at least `threshold`. Raises ValueError where both
+        shares of a client would be revealed, at a second call, or with too few survivors.
         """
         if self.revealed or set(survivors) & set(dropped) or len(set(survivors)) < self.threshold:
             raise ValueError("shares are revealed once, one of each client, to a server that has enough updates")
@@ -155,21 +156,20 @@ def unmask_sum(
     dropped: Sequence[str],
     shares: Mapping[str, Mapping[str, bytes]],
 ) -> Vector:
-    """Return the sum of the survivors' updates, from the sum of what they sent.
+    """Return the sum of the survivors' updates (coordinates,), given the sum of their masked updates.
 
-    keys: public keys of all clients that shares were made for, in that order. dropped: clients in whose masks the
-    survivors took part and who sent no update. shares: by survivor what it revealed, of `threshold` or more of them.
-    Raises OverflowError where these do not fit together, `SumLost` where one who dropped out shared a key that is not
-    its own.
+    keys: public keys of all clients that took part in the secret sharing, in that order. dropped: clients with pairwise
+    masks in the sum that sent no update. shares: revealed shares by survivor, of at least `threshold` survivors. Raises
+    OverflowError where the shares are inconsistent, `SumLost` where a client that dropped out had shared a wrong key.
     """
     places = {name: place for place, name in enumerate(keys)}
 
     def joined(name: str) -> bytes:
         return join_shares({places[holder]: revealed[name] for holder, revealed in shares.items()})
 
-    for name in survivors:
+    for name in survivors:  # their pairwise masks cancel, and their self-masks are left
         total = add_mask(total, joined(name), plus=False)
-    for name in dropped:  # the masks that survivors have in common with it have no counterpart in the sum
+    for name in dropped:  # its pairwise masks with survivors have no counterpart in the sum
         private = joined(name)
         if public_key(private) != keys[name].mask:
             raise SumLost(f"{name} dropped out, and had shared a key that is not its own")
@@ -182,10 +182,10 @@ def unmask_sum(
 def find_liars(
     keys: Mapping[str, PublicKeys], shares: Mapping[str, Mapping[str, bytes]], threshold: int
 ) -> dict[str, str]:
-    """Return who reveals shares that do not fit those of the others, with the reason; arguments as of `unmask_sum`.
+    """Return the clients whose revealed shares are inconsistent, with the reason; arguments as for `unmask_sum`.
 
-    A client that dealt inconsistent shares cannot be distinguished from those that it dealt wrong ones. Raises
-    `SumLost` where no `threshold` shares of a secret fit, or fewer clients than that are left.
+    A client that distributed inconsistent shares cannot be distinguished from the receivers of the wrong ones. Raises
+    `SumLost` where no `threshold` shares of a secret are consistent, or fewer clients than that are left.
     """
     places = {name: place for place, name in enumerate(keys)}
     liars: dict[str, str] = {}
@@ -205,10 +205,10 @@ def find_liars(
 
 
 def settle_complaints(complaints: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """Return the fewest clients whose lies explain all complaints, with the reason: those in most of them.
+    """Return a small set of clients that explains all complaints, with reasons: greedily those in most of them.
 
-    complaints: by client who, as it says, sealed shares for it that do not open. Where one client complains about one
-    other, it cannot be told which of the two lies, and both are returned.
+    complaints: by client, the peers whose sealed shares it says do not open. If one client complains about one other,
+    either may be lying, and both are returned.
     """
     pairs = [(accuser, accused) for accuser, several in complaints.items() for accused in several]
     liars: dict[str, str] = {}
@@ -241,9 +241,9 @@ class Identity:
 
 
 def find_vehicle(authority: x509.Certificate, round_: int, name: str, signed: SignedKeys) -> str:
-    """Return the vehicle, certified by the authority, that has signed a client's public keys of a round.
+    """Return the certified vehicle that signed a client's public keys of a round.
 
-    Raises ValueError where none has.
+    Raises ValueError where there is none.
     """
     try:
         return _verify(authority, round_, name, *signed)
@@ -253,7 +253,7 @@ def find_vehicle(authority: x509.Certificate, round_: int, name: str, signed: Si
 
 
 def check_certified(authority: x509.Certificate, round_: int, clients: Mapping[str, SignedKeys]) -> None:
-    """Raise ValueError where the keys of a round are not signed by certified vehicles, another one for each client."""
+    """Raise ValueError unless the keys of a round are signed by certified vehicles, a different one per client."""
     vehicles: dict[str, str] = {}
     for name, signed in clients.items():
         try:

@@ -1,8 +1,8 @@
 """Primitives of secure aggregation: masks, and Shamir's secret sharing.
 
-Masks: key agreement (X25519), expansion of seeds (SHAKE256), sealed shares, fixed point. Updates are vectors of
-integers modulo 2^32, so that masks cancel exactly and leave no trace in the sum. Shares are of 32-byte secrets over a
-prime field (Shamir, Communications of the ACM 22(11), 1979).
+Masks: key agreement (X25519), expansion of seeds (SHAKE256), sealing of shares, fixed-point numbers. Updates are
+vectors of integers modulo 2^32, in which masks cancel exactly and a masked update is uniformly distributed. Secrets of
+32 bytes are shared over a prime field (Shamir, Communications of the ACM 22(11), 1979).
 """
 
 import hashlib
@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from flcav.statistics.streams import stream
 
 LARGEST_SUM = 2**31 - 1
-NONCE = bytes(12)  # every key seals one message
-Vector = NDArray[np.uint32]
+NONCE = bytes(12)  # constant, since a key seals a single message
+Vector = NDArray[np.uint32]  # (coordinates,)
 
 
 def draw_keys() -> tuple[bytes, bytes]:
@@ -43,9 +43,9 @@ def agree(private: bytes, public: bytes, purpose: str) -> bytes:
 
 
 def is_public_key(data: object) -> bool:
-    """Return whether it is an X25519 public key that secrets can be agreed on with: of 32 bytes, and of no small order.
+    """Return whether data are a usable X25519 public key: 32 bytes, and a point of no small order.
 
-    With a point of small order every secret would be 0 (RFC 7748, section 6.1).
+    With a point of small order every shared secret would be 0 (RFC 7748, section 6.1).
     """
     try:
         agree(bytes(range(32)), data, "trial")  # type: ignore[arg-type]: whatever a client sent
@@ -55,12 +55,12 @@ def is_public_key(data: object) -> bool:
 
 
 def seal(key: bytes, data: bytes) -> bytes:
-    """Return data encrypted and authenticated (ChaCha20-Poly1305) by a key that is used once."""
+    """Return data encrypted and authenticated (ChaCha20-Poly1305) with a key that is used once."""
     return ChaCha20Poly1305(key).encrypt(NONCE, data, None)
 
 
 def unseal(key: bytes, sealed: bytes) -> bytes:
-    """Return what was sealed; raises cryptography's `InvalidTag` where it was changed, or by another key."""
+    """Return the sealed data; raises cryptography's `InvalidTag` where they were changed or sealed with another key."""
     return ChaCha20Poly1305(key).decrypt(NONCE, sealed, None)
 
 
@@ -75,31 +75,32 @@ def add_vectors(vectors: Iterable[Vector]) -> Vector:
 
 
 def to_integers(values: NDArray[np.float64], largest: float, clients: int) -> Vector:
-    """Return values in fixed point, modulo 2^32; beyond +-largest they are cut off.
+    """Return values (coordinates,) as fixed-point numbers modulo 2^32, clipped to +-largest.
 
-    The step is fine enough, and no finer, that the sum of `clients` vectors does not overflow. Raises ValueError for
-    values that are not finite.
+    The step is the finest at which the sum of `clients` vectors cannot overflow. Raises ValueError for values that are
+    not finite.
     """
     if not np.isfinite(values).all():
         raise ValueError("an update with values that are not finite cannot be masked")
+    # signed 32-bit range over the number of clients: the sum of all vectors cannot wrap around
     limit = LARGEST_SUM // clients
     return np.rint(np.clip(values / largest, -1.0, 1.0) * limit).astype(np.int64).astype(np.uint32)
 
 
 def to_values(total: Vector, largest: float, clients: int) -> NDArray[np.float64]:
-    """Return the sum of the values of which `total` is the sum in fixed point: the inverse of `to_integers`."""
+    """Return the sum of values (coordinates,) whose fixed-point sum is `total`: the inverse of `to_integers`."""
     return total.astype(np.int32).astype(np.float64) * (largest / (LARGEST_SUM // clients))
 
 
 PRIME = 2**521 - 1  # a Mersenne prime above any secret
 SECRET_BYTES, SHARE_BYTES = 32, 66
-MOST_TRIED = 256  # sets of shares
+MOST_TRIED = 256  # subsets of shares in the search for wrong ones
 
 
 def split_secret(secret: bytes, threshold: int, shares: int) -> list[bytes]:
-    """Return `shares` shares of a secret, of which any `threshold` determine it and fewer reveal nothing.
+    """Return `shares` shares of a secret; any `threshold` of them determine it, and fewer reveal nothing.
 
-    The share of place i (from 0) is the value at i + 1 of a random polynomial of degree threshold - 1 whose value at 0
+    The share at index i (from 0) is the value at i + 1 of a random polynomial of degree threshold - 1 whose value at 0
     is the secret.
     """
     polynomial = [int.from_bytes(secret), *(secrets.randbelow(PRIME) for _ in range(threshold - 1))]
@@ -114,20 +115,21 @@ def split_secret(secret: bytes, threshold: int, shares: int) -> list[bytes]:
 
 
 def join_shares(shares: Mapping[int, bytes]) -> bytes:
-    """Return the secret of `threshold` or more shares by place, by Lagrange interpolation at 0.
+    """Return the secret of `threshold` or more shares by index, by Lagrange interpolation at 0.
 
-    Raises OverflowError where the shares are not of one secret: a wrong one makes a random element of the field, which
-    is of 32 bytes with a probability of 2^-265.
+    Raises OverflowError where the shares are inconsistent: a wrong share gives a random element of the field of 521
+    bits, which fits in 32 bytes with a probability of 2^-265.
     """
     return _interpolate(shares, 0).to_bytes(SECRET_BYTES)
 
 
 def find_wrong_shares(shares: Mapping[int, bytes], threshold: int) -> set[int]:
-    """Return the places of the shares that do not fit the others, of which `threshold` or more determine the secret.
+    """Return the indices of the wrong shares, if at least `threshold` others are consistent.
 
-    Sets of `threshold` shares are tried, all of them where they are few, until one makes a secret. Of a majority as
-    threshold and e wrong shares about one set of 2^e does. Raises ValueError where none of those tried makes a secret.
+    Subsets of `threshold` shares are tried, all where there are few, until one gives a secret of 32 bytes. With e wrong
+    shares and a threshold of half, about one subset in 2^e does. Raises ValueError where none of those tried does.
     """
+    # the order of trials is no secret, so a fixed seed keeps the result reproducible
     every = math.comb(len(shares), threshold)
     rng = stream(0, "shares")
     tried = (
@@ -144,6 +146,7 @@ def find_wrong_shares(shares: Mapping[int, bytes], threshold: int) -> set[int]:
 
 def _interpolate(shares: Mapping[int, bytes], x: int) -> int:
     """Return the value at x of the polynomial through the shares."""
+    # Lagrange basis polynomials at x; the share at index i has the abscissa i + 1
     total = 0
     for place, share in shares.items():
         above, below = 1, 1

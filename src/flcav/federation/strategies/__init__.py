@@ -1,4 +1,4 @@
-"""Strategies by name: how clients' updates are combined, and how clients correct their training; or a user's own."""
+"""Strategies by name: aggregation of the clients' updates, and corrections of their training; or a user's strategy."""
 
 from collections.abc import Mapping
 from dataclasses import fields, is_dataclass
@@ -34,7 +34,7 @@ Spec = str | Mapping[str, Mapping[str, Json]]  # a name, or a name with settings
 
 
 def strategy_named(spec: Spec) -> Strategy:
-    """Return a strategy by its name: one of `STRATEGIES`, or a user's own, `module:NAME`.
+    """Return a strategy by its name: one of `STRATEGIES`, or a user's strategy, `module:NAME`.
 
     Settings that `spec` does not give are the strategy's defaults. Raises `InputError` for an unknown name, where the
     user's module cannot be imported or has no strategy of that name, where the strategy is no dataclass, for a setting
@@ -64,9 +64,9 @@ def strategy_named(spec: Spec) -> Strategy:
 
 
 def exchanges_more(spec: Spec) -> bool:
-    """Return whether clients of one of `STRATEGIES` send an array beside each of the weights, as SCAFFOLD's do.
+    """Return whether clients of one of `STRATEGIES` send a further array with every learned one, as SCAFFOLD's do.
 
-    A user's own strategy is not imported to find out.
+    A user's strategy is not imported to find out.
     """
     name = spec if isinstance(spec, str) else next(iter(spec), "")
     return name in STRATEGIES and issubclass(STRATEGIES[name], Exchanges)
@@ -79,15 +79,15 @@ def sends_outputs(spec: Spec) -> bool:
 
 
 def fills_buffers(spec: Spec) -> bool:
-    """Return whether rounds of one of `STRATEGIES` are buffers that fill by a clock; see `exchanges_more`."""
+    """Return whether rounds of one of `STRATEGIES` are buffers filled by a clock; see `exchanges_more`."""
     name = spec if isinstance(spec, str) else next(iter(spec), "")
     return name in STRATEGIES and issubclass(STRATEGIES[name], FedBuff)
 
 
 def of_servers(strategy: Strategy) -> Strategy:
-    """Return the strategy among edge servers, which federate with the cloud, where vehicles have `strategy`.
+    """Return the strategy among edge servers in the cloud's rounds, where `strategy` is that among vehicles.
 
-    It is the same one, unless it is about vehicles alone: edge servers take no local steps whose gradients could be
-    corrected, share no samples, and the cloud waits for all of them. Then it is FedAvg.
+    It is the same one, or FedAvg where the strategy only suits vehicles: edge servers take no local steps whose
+    gradients could be corrected, share no samples, and the cloud waits for all of them.
     """
     return FEDAVG if isinstance(strategy, Corrects | FedMD | FedBuff) else strategy

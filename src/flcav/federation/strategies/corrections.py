@@ -42,6 +42,7 @@ class Scaffold:
         self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
     ) -> tuple[Weights, Weights]:
         """Return the weights after a round, and the server's variate c <- c + sum_i (change of c_i) / clients."""
+        # divided by the number of all clients, not only of those in the round
         variate = {
             name: state.get(name, np.zeros_like(start[name]))
             + (np.sum([update.extra[name] for update in updates], axis=0, dtype=np.float64) / clients).astype(

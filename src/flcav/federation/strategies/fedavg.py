@@ -12,33 +12,34 @@ from flcav.federation.trainable import Update, Weights, learned_names
 NO_MEAN = "clients cannot be averaged by shares of {}: they must be 0 or more, not all 0"
 Floats = NDArray[np.float64]
 
-BLOCK = 1 << 15  # numbers that are added at a time: their products stay in the cache
+BLOCK = 1 << 15  # numbers added at a time, so that their products stay in the cache
 
 
 class NoShares(ValueError):
-    """No client has a share in a mean."""
+    """All shares of a mean are 0."""
 
 
 def round_mean(mean: Floats, low: NDArray[np.number], high: NDArray[np.number]) -> NDArray[np.number]:
-    """Return a mean or median of integers rounded to the nearest, in their type; it lies between `low` and `high`.
+    """Return a mean or median of integers, rounded to the nearest integer of their dtype.
 
-    `low` and `high` are the least and the largest of the integers, so that what all have alike stays exact.
+    `low` and `high` are the smallest and the largest of the integers. The result is clipped to them, so that a value
+    that all clients share stays exact even beyond the precision of float64.
     """
-    with np.errstate(invalid="ignore"):  # of those outside the type, for which the ends stand
+    with np.errstate(invalid="ignore"):  # values outside the dtype are replaced by the ends
         inside = np.rint(mean).astype(low.dtype)
     return np.where(mean >= high, high, np.where(mean <= low, low, inside))
 
 
 class RunningMean:
-    """Weighted mean of arrays by name, sum_i share_i w_i / sum_i share_i, to which clients are added one by one.
+    """Running weighted mean of arrays by name, sum_i share_i w_i / sum_i share_i, over clients added one by one.
 
-    Its memory is that of one client in float64, however many there are. Means of integers are rounded, see
+    It takes the memory of a single client's arrays in float64. Means of integers are rounded, see
     `round_mean`.
     """
 
     def __init__(self) -> None:
         self._form: dict[str, tuple[tuple[int, ...], np.dtype]] = {}  # of the first client
-        self._ends: dict[str, tuple[NDArray[np.number], NDArray[np.number]]] = {}  # of integers, least and largest
+        self._ends: dict[str, tuple[NDArray[np.number], NDArray[np.number]]] = {}  # smallest and largest integers
         self._sums: dict[str, NDArray[np.float64]] = {}
         self._shares: list[float] = []
         self._products = np.empty(BLOCK)
@@ -61,6 +62,7 @@ class RunningMean:
             if not np.issubdtype(array.dtype, np.floating):
                 low, high = self._ends.get(name, (array, array))
                 self._ends[name] = np.minimum(low, array), np.maximum(high, array)
+        # block by block, so that no second array of the network's size is needed
         for name, total in self._sums.items():
             values, sums = weights[name].reshape(-1), total.reshape(-1)
             for start in range(0, values.size, BLOCK):
@@ -70,7 +72,7 @@ class RunningMean:
                 )
 
     def mean(self) -> dict[str, NDArray[np.number]]:
-        """Return the mean, in the first client's types; raises `NoShares` where all shares are 0."""
+        """Return the mean, in the first client's dtypes; raises `NoShares` where all shares are 0."""
         whole = float(np.sum(self._shares))
         if not whole:
             raise NoShares(NO_MEAN.format(self._shares))
@@ -94,7 +96,7 @@ def average(weights: Sequence[Weights], shares: Sequence[float]) -> dict[str, ND
 
 
 def average_inversely(start: Weights, updates: Mapping[str, Update], weights: Mapping[str, float]) -> Weights:
-    """Return start + sum_i weights_i (w_i - start) of learned arrays; of all others the mean of the updates.
+    """Return start + sum_i weights_i (w_i - start) for learned arrays, and the mean of the updates for all others.
 
     With weights_i = share_i / probability_i it is the unbiased (Horvitz-Thompson) estimate of the mean of all clients.
     """

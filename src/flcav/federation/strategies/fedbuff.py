@@ -1,7 +1,7 @@
 """FedBuff: buffered asynchronous aggregation (Nguyen et al., AISTATS 2022, algorithm 1, arXiv 2106.06639).
 
-Clients train at their own pace. The server combines updates as soon as a number of them has arrived, its buffer, into
-the next version of its weights; an update that began with an older version counts less.
+Clients train asynchronously. The server combines updates as soon as a given number has arrived, its buffer, into the
+next version of its weights; an update that started from an older version has a lower weight.
 """
 
 from collections.abc import Sequence
@@ -50,9 +50,12 @@ class FedBuff:
         """
         if staleness == 0:
             return update
-        factor, learned, moved = self.discount(staleness), {*learned_names(start)}, dict(update.weights)
+        factor = self.discount(staleness)
+        learned = {*learned_names(start)}
+        moved = dict(update.weights)
         for name, array in update.weights.items():
             if np.issubdtype(array.dtype, np.floating):
+                # a variance is moved towards the client's, a convex combination that stays positive
                 first = begun[name] if name in learned else start[name]
                 change = array.astype(np.float64) - first
                 moved[name] = (start[name] + factor * change).astype(array.dtype)

@@ -18,9 +18,9 @@ from flcav.federation.trainable import Update, Weights
 class FedMD:
     """FedMD: clients send class probabilities on shared samples instead of weights, and the server averages them.
 
-    Arrays of a round are these probabilities. Every client keeps a network of its own, which first takes `steps` local
-    steps towards the mean and then those on the client's samples; the server's network takes the former alone. All
-    clients count the same.
+    Arrays of a round are these probabilities. Every client keeps a private network, which first takes `steps` local
+    steps towards the mean and then those on the client's samples; the server's network only takes the former. All
+    clients have equal weights.
     """
 
     frames: Annotated[int, Field(ge=1, le=10**6)] = 64  # at most so many are shared, of those uploaded in stage I

@@ -1,4 +1,4 @@
-"""Server optimisers: the mean change of a round is the gradient of a step on the server.
+"""Server optimisers, which use the mean change of a round as the gradient of a step on the server.
 
 FedAdam and FedYogi (Reddi et al., "Adaptive Federated Optimization", ICLR 2021, algorithm 2), and FedAvgM, whose server
 has momentum (Hsu, Qi and Brown, arXiv 1909.06335, 2019, section 4.3).
@@ -15,7 +15,7 @@ from pydantic import Field
 from flcav.federation.strategies.fedavg import FedAvg, Floats
 from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
 
-FIRST, SECOND = "first/", "second/"  # moments, before the name of the array
+FIRST, SECOND = "first/", "second/"  # prefixes of the moments' names
 
 Rate = Annotated[float, Field(gt=0, le=1e3)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
@@ -32,8 +32,8 @@ def step_adaptively(
 ) -> tuple[Weights, Weights]:
     """Return the weights after a round of an adaptive server optimiser, and its moments (algorithm 2, lines 10-15).
 
-    m <- beta1 m + (1 - beta1) change; v <- second(v, change^2); start <- start + rate m / (sqrt(v) + tau). At first m
-    is 0 and v is tau^2; there is no correction of their bias, as in the paper.
+    m <- beta1 m + (1 - beta1) change; v <- second(v, change^2); start <- start + rate m / (sqrt(v) + tau). Initially m
+    is 0 and v is tau^2; there is no bias correction, as in the paper.
     """
     moments: dict[str, Floats] = {}
 

@@ -1,12 +1,12 @@
-"""Robust aggregation, which withstands arbitrary updates of a minority: median, trimmed mean, Krum, and mixing first.
+"""Byzantine-robust aggregation: median, trimmed mean, Krum, each optionally after nearest-neighbour mixing.
 
 Median and trimmed mean are coordinate-wise (Yin et al., ICML 2018, options I and II). Krum keeps the updates that are
-nearest to others (Blanchard et al., NeurIPS 2017, section 4); its distances are of what is learned, and statistics of
-batch normalisation, of another scale, are the median of all updates, so that they are nobody's choice. Where clients
-have unlike data, honest updates lie far apart, and a rule that keeps few of them is easily led. Nearest-neighbour
-mixing (Allouah et al., "Fixing by Mixing", AISTATS 2023, algorithm 2) first draws each towards those near it: y_i is
-the mean of the n - f updates nearest to x_i, itself among them, of n of which f are Byzantine. It mixes what is
-learned alone.
+nearest to others (Blanchard et al., NeurIPS 2017, section 4). Its distances are those of learned arrays; statistics of
+batch normalisation have another scale and are the median of all updates, so that no single client chooses them. Where
+the clients' data are heterogeneous, honest updates lie far apart, and a rule that keeps few of them is easily misled.
+Nearest-neighbour mixing (Allouah et al., "Fixing by Mixing", AISTATS 2023, algorithm 2) therefore first replaces every
+update x_i by y_i, the mean of the n - f updates nearest to x_i, including x_i, where f of n are Byzantine. Only learned
+arrays are mixed.
 """
 
 import math
@@ -22,22 +22,24 @@ from flcav.config import InputError
 from flcav.federation.strategies.fedavg import average, round_mean
 from flcav.federation.trainable import LocalUpdate, Update, Weights, learned_names
 
-Mixing = Annotated[int, Field(ge=0, le=10**6)]  # Byzantine clients that mixing is to withstand; 0: nothing is mixed
+Mixing = Annotated[int, Field(ge=0, le=10**6)]  # Byzantine clients that mixing withstands; 0: no mixing
 
 
 def mix_neighbours(updates: Sequence[Update], mixing: Mixing) -> Sequence[Update]:
-    """Return each update with the mean of its n - `mixing` nearest for what it learned; the same ones for 0.
+    """Return the updates after nearest-neighbour mixing: means over the n - `mixing` nearest; unchanged for 0.
 
-    Of equally near updates the first count. Samples do not.
+    Ties go to the first updates. Numbers of samples are not used.
     """
     if not mixing:
         return updates
     names = learned_names(updates[0].weights)
     flat = flatten_updates(updates, names)
     mixed = []
-    for own, update in zip(flat, updates, strict=True):
-        near = np.argsort(((flat - own) ** 2).sum(axis=1), kind="stable")[: len(updates) - mixing]
-        mean, start, weights = flat[np.sort(near)].mean(axis=0), 0, dict(update.weights)
+    for row, update in zip(flat, updates, strict=True):
+        near = np.argsort(((flat - row) ** 2).sum(axis=1), kind="stable")[: len(updates) - mixing]
+        mean = flat[np.sort(near)].mean(axis=0)
+        start = 0
+        weights = dict(update.weights)
         for name in names:
             array = update.weights[name]
             weights[name] = mean[start : start + array.size].reshape(array.shape).astype(array.dtype)
@@ -47,13 +49,13 @@ def mix_neighbours(updates: Sequence[Update], mixing: Mixing) -> Sequence[Update
 
 
 def check_mixing(mixing: Mixing, clients: int) -> None:
-    """Raise `InputError` unless fewer than half of the clients are to be withstood."""
+    """Raise `InputError` unless the Byzantine clients are fewer than half of all."""
     if mixing and clients <= 2 * mixing:
         raise InputError(f"mixing: {2 * mixing + 1} clients or more are wanted for {mixing}, and there are {clients}")
 
 
 def flatten_updates(updates: Sequence[Update], names: Sequence[str]) -> NDArray[np.float64]:
-    """Return the arrays `names` of each update, one after another (updates, coordinates)."""
+    """Return the arrays `names` of the updates as rows (updates, coordinates)."""
     return np.stack(
         [np.concatenate([update.weights[name].astype(np.float64).ravel() for name in names]) for update in updates]
     )
@@ -62,10 +64,10 @@ def flatten_updates(updates: Sequence[Update], names: Sequence[str]) -> NDArray[
 def combine_coordinates(
     models: Sequence[Weights], combined: Callable[[NDArray[np.float64]], NDArray[np.float64]]
 ) -> dict[str, NDArray[np.number]]:
-    """Return `combined` of each array of all clients, stacked (clients, ...); of integers rounded, see `round_mean`."""
+    """Return `combined` of the stacked arrays (clients, ...), name by name; integers are rounded, see `round_mean`."""
     found: dict[str, NDArray[np.number]] = {}
     for name, array in models[0].items():
-        stacked = np.stack([own[name] for own in models])
+        stacked = np.stack([model[name] for model in models])
         values = np.asarray(combined(stacked.astype(np.float64)))
         floating = np.issubdtype(array.dtype, np.floating)
         found[name] = (
@@ -90,7 +92,7 @@ class Median:
         return take_median([update.weights for update in mix_neighbours(updates, self.mixing)])
 
     def check_clients(self, clients: int) -> None:
-        """Raise as `check_mixing` does; otherwise accept any number of clients: the median of two is their mean."""
+        """Raise as `check_mixing` does; otherwise any number of clients is fine: the median of two is their mean."""
         check_mixing(self.mixing, clients)
 
 
@@ -111,13 +113,13 @@ class TrimmedMean:
         return combine_coordinates([update.weights for update in mix_neighbours(updates, self.mixing)], trimmed)
 
     def check_clients(self, clients: int) -> None:
-        """Raise `InputError` where the fraction of so few clients is less than one of them, and as `check_mixing`."""
+        """Raise `InputError` where the fraction is less than one client, and as `check_mixing` does."""
         check_mixing(self.mixing, clients)
         if self.fraction and self._count_out(clients) == 0:
             raise InputError(f"trimmed-mean: a fraction of {self.fraction:g} of {clients} clients leaves nobody out")
 
     def _count_out(self, clients: int) -> int:
-        """Return how many are left out at either end; of 100 clients .29 are 29, though .29 * 100 is 28.999..."""
+        """Return the number left out at either end; .29 of 100 clients is 29, although .29 * 100 is 28.999..."""
         return math.floor(round(self.fraction * clients, 9))
 
 
@@ -134,7 +136,7 @@ class Krum:
     mixing: Mixing = 0  # see `mix_neighbours`
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
-        """Return what the chosen update has learned, or the mean of the chosen ones, and the median of all else.
+        """Return the learned arrays of the chosen update, or the mean of several, and the median of all other arrays.
 
         Raises as `check_clients` does.
         """
@@ -142,15 +144,16 @@ class Krum:
         names = learned_names(start)
         mixed = mix_neighbours(updates, self.mixing)
         flat = flatten_updates(mixed, names)
+        # the smallest distance of a row is that to itself, 0, and is left out
         near = len(updates) - self.byzantine - 2
-        scores = [np.sort(((flat - own) ** 2).sum(axis=1))[1 : near + 1].sum() for own in flat]
+        scores = [np.sort(((flat - row) ** 2).sum(axis=1))[1 : near + 1].sum() for row in flat]
         chosen = [mixed[i] for i in np.sort(np.argsort(scores, kind="stable")[: self.kept])]
         mean = average([update.weights for update in chosen], [1.0] * len(chosen))
         rest = [name for name in start if name not in names]
         return {**mean, **take_median([{name: update.weights[name] for name in rest} for update in updates])}
 
     def check_clients(self, clients: int) -> None:
-        """Raise `InputError` unless clients > 2 byzantine + 2, as the paper's guarantee asks, and `kept` <= clients.
+        """Raise `InputError` unless clients > 2 byzantine + 2, as the paper's theorem requires, and `kept` <= clients.
 
         Raises as `check_mixing` does, too.
         """

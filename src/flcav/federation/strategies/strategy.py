@@ -1,4 +1,4 @@
-"""The interfaces of a strategy: aggregation, and where it has them, state between rounds and a part on the clients."""
+"""The interfaces of a strategy: aggregation and, optionally, state between rounds and a part on the clients."""
 
 from collections.abc import Sequence
 from typing import Protocol, runtime_checkable
@@ -11,12 +11,12 @@ class Strategy(Protocol):
     """Aggregation of the clients' updates into the weights of the next round.
 
     A strategy is a frozen dataclass: its fields are its settings, JSON values with defaults. It draws no random
-    numbers. State between rounds is handed to it and returned by it (`Stateful`), so that a resumed federation ends as
-    an uninterrupted one.
+    numbers. State between rounds is passed to it and returned by it (`Stateful`), so that a resumed federation ends
+    with the same weights as an uninterrupted one.
     """
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
-        """Return the weights at the end of a round that began with `start`, from all clients' updates in node order.
+        """Return the weights after a round that started from `start`, given all updates in node order.
 
         Names, shapes and types of the arrays must be those of `start`.
         """
@@ -27,24 +27,24 @@ class Strategy(Protocol):
 class Stateful(Protocol):
     """A strategy with state between rounds: finite arrays by name, which the server keeps and which are checkpointed.
 
-    Rounds call `step` in place of `combine`, which such a strategy has as well. Keep nothing on `self`: it is in no
+    Rounds call `step` in place of `combine`, which such a strategy has as well. Store nothing on `self`: it is in no
     checkpoint, and outlives the federation.
     """
 
     def step(
         self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
     ) -> tuple[Weights, Weights]:
-        """Return what `combine` does, and the state after the round; `state` is empty before the first one.
+        """Return the weights as `combine` does, and the state after the round; `state` is empty before the first one.
 
-        `clients` is the number of clients of the federation, whether they take part in the round or not.
+        `clients` is the number of all clients of the federation, including those not in this round.
         """
         ...
 
 
 class Averages(Protocol):
-    """A strategy that sees no more of the updates than their weighted mean, so that one at a time is in memory.
+    """A strategy that needs only the weighted mean of the updates, so that a single one is in memory at a time.
 
-    It is then given one update: the mean of the weights, and the sums of the samples and of the extra arrays.
+    It then receives one update: the mean of the weights, and the sums of the samples and of the further arrays.
     """
 
     def weigh(self, update: Update) -> float:
@@ -53,7 +53,7 @@ class Averages(Protocol):
 
 
 def find_weigher(strategy: Strategy) -> Averages | None:
-    """Return the strategy where it `Averages`, None where it needs every update.
+    """Return the strategy if it is one of `Averages`, None if it needs every update.
 
     A class that overrides `combine` without `weigh` needs every update.
     """
@@ -66,33 +66,33 @@ class Corrects(Protocol):
     """A strategy whose clients correct the gradients of their local steps."""
 
     def correct(self, sent: Weights, own: Weights) -> Correction:
-        """Return a client's correction in a round, from what the server sent and from the client's own state.
+        """Return a client's correction in a round, given the server's further arrays `sent` and the client's state.
 
-        Both are empty unless the strategy `Exchanges` arrays.
+        Both are empty unless the strategy is one of `Exchanges`.
         """
         ...
 
 
 @runtime_checkable
 class Exchanges(Protocol):
-    """A strategy that exchanges further arrays beside the weights, and whose clients have state between rounds."""
+    """A strategy that exchanges arrays in addition to the weights, and whose clients have state between rounds."""
 
     def send(self, state: Weights) -> Weights:
-        """Return what the server sends to clients beside the weights, from its state."""
+        """Return the arrays that the server sends in addition to the weights, from its state."""
         ...
 
     def report(self, update: LocalUpdate, sent: Weights, own: Weights) -> tuple[Weights, Weights]:
-        """Return what a client sends beside its update, and its state after the round; `own` is empty at first.
+        """Return a client's arrays in addition to its update, and its state after the round; `own` is empty at first.
 
-        The server asks the same of its own weights, with a gradient of zeros: names, shapes and types of the arrays
-        that it then gets are those that clients are held to.
+        The server calls it for its weights with a gradient of zeros, too, to know the names, shapes and dtypes that it
+        then requires of all clients.
         """
         ...
 
 
 @runtime_checkable
 class Robust(Protocol):
-    """A strategy that compares the updates with each other, and so needs each of them as it was sent."""
+    """A strategy that compares the updates with each other, and therefore needs all of them unaltered."""
 
     def check_clients(self, clients: int) -> None:
         """Raise `InputError` where the strategy cannot combine the updates of so few clients."""
@@ -100,7 +100,7 @@ class Robust(Protocol):
 
 
 def needs_known_number(strategy: Strategy) -> bool:
-    """Return whether the strategy cannot combine the updates of every number of clients."""
+    """Return whether the strategy cannot combine the updates of an arbitrary number of clients."""
     try:
         if isinstance(strategy, Robust):
             strategy.check_clients(1)

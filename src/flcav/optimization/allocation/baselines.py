@@ -25,7 +25,7 @@ from flcav.optimization.solvers.branches import solve_branches
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
 from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, price_once
 from flcav.optimization.solvers.rounding import trim
-from flcav.optimization.solvers.separable import relax
+from flcav.optimization.solvers.separable import solve_two_budgets
 from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
 
 GAP = 1e-4  # relative optimality gap
@@ -147,7 +147,7 @@ def _round_down(branch: Problem) -> tuple[float, Array]:
     """Return the rounded optimum of a branch, with its weighted error."""
     made = build_instance(branch)
     if made.effective is None and len(made.budget) == 2:
-        x = relax(made.separable).x
+        x = solve_two_budgets(made.separable).x
     else:
         program = Program(list_terms(made), made.low, made.high, made.cost, made.budget, list_drifts(made))
         starts = [made.low + (made.high - made.low) * share for share in np.linspace(0, 1, 6) ** 3]

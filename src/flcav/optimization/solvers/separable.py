@@ -5,7 +5,8 @@
 At multipliers lambda >= 0, x_j is the point at which its marginal gain equals its price p_j = sum_l cost_jl lambda_l,
 or a bound (water-filling). For a single power it is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method finds
 it, starting from the largest of the single powers' points. The dual function is concave in the two multipliers, and its
-gradient is the overspend. All steps are vectorised over the quantities. `relax` is for two budgets, all else for any.
+gradient is the overspend. All steps are vectorised over the quantities. Only `solve_two_budgets` is limited to two
+budgets.
 """
 
 from dataclasses import dataclass
@@ -130,7 +131,7 @@ def room(problem: Separable) -> Array:
         return np.floor(np.min(np.where(problem.cost > 0, left / problem.cost, np.inf), axis=1))
 
 
-def relax(problem: Separable) -> ContinuousOptimum:
+def solve_two_budgets(problem: Separable) -> ContinuousOptimum:
     """Return the continuous optimum under two budgets, by an active-set search over those that bind.
 
     The sets are tried in this order: none, the scarcer budget, both, the other one.

@@ -20,7 +20,7 @@ from flcav.optimization.solvers.cutting_planes import Line, Program, Term, outer
 from flcav.optimization.solvers.effective import EffectiveTasks
 from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
-from flcav.optimization.solvers.separable import newton_step, relax
+from flcav.optimization.solvers.separable import newton_step, solve_two_budgets
 
 CORRECTIONS = 6  # Newton steps of the multipliers over whole quantities; dual points tried
 PLANES = 60  # most cutting planes of the dual
@@ -180,7 +180,7 @@ def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]
         yield from _planes(instance, gap)
         return
     problem = instance.separable
-    relaxed = relax(problem)
+    relaxed = solve_two_budgets(problem)
     multipliers = relaxed.multipliers
     yield multipliers, relaxed.bound
     binding = [int(link) for link in np.flatnonzero(multipliers > 0)]

@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from flcav.optimization.verification.record import NEAR, Verification, exact, judge, near
+from flcav.optimization.verification.record import NEAR, Verification, exact, judge_claims, near
 from flcav.optimization.verification.tasks import (
     QUANTITIES,
     STAGES,
     Array,
     Data,
     VerifiedTask,
-    drift_part,
+    compute_drift,
     error,
     held_samples,
     least_cost,
@@ -64,7 +64,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     trusted = [CURVES] + [FLEET] * any(each["uplink_mbps"] or each["vehicle_train_s"] for each in problem["tasks"])
     if kind == "area":
         claims["that there is no bound"] = lower is None and plan["gap"] is None and plan["status"] == "feasible"
-        return judge(value, spent, None, claims, trusted)
+        return judge_claims(value, spent, None, claims, trusted)
     branches = [own for own in list_branches(asked) if np.all(least_cost(own) <= budgets)]
     proven = [_prove(kind, own, each, budgets, k) for own, each in zip(branches, duals)]
     bound = min([*proven, value]) if len(branches) == len(duals) else 0.0
@@ -75,7 +75,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     claims["the gap"] = abs(plan["gap"] - ((value - lower) / lower if lower > 0 else value > 0)) <= NEAR
     claims["the status"] = plan["status"] == ("optimal" if plan["gap"] <= optimal else "feasible")
     trusted += [SEARCH.format(lower)] * (lower > bound * (1 + 2 * NEAR))
-    return judge(value, spent, bound, claims, trusted)
+    return judge_claims(value, spent, bound, claims, trusted)
 
 
 def _prove(kind: str, tasks: Sequence[VerifiedTask], dual: Data, budgets: Array, k: int) -> float:
@@ -108,7 +108,7 @@ def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: A
         else:
             y, z = _pair(ranges)
             powers: Powers = [(weight * curve["a"], curve["b"], curve["alpha"], held_samples(curve, y, z, k))]
-            rounds = weight * drift_part(curve, z) + prices[1] * y + prices[2] * z
+            rounds = weight * compute_drift(curve, z) + prices[1] * y + prices[2] * z
             paid += float(np.min(_bound_convex(powers, prices[0], *ranges[0]) + rounds))
         least.append(paid * SUMS)
     return nextafter(fsum((*least, -nextafter(float(multipliers @ budgets), inf))), -inf)

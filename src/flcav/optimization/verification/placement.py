@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry.arrays import Array
-from flcav.optimization.verification.record import Verification, exact, judge
+from flcav.optimization.verification.record import Verification, exact, judge_claims
 
 NOTHING = Fraction(1, 10**300)  # in place of 0, to divide by
 ROUNDING = 1e-14  # relative to the sum: of floats that bounds are stated with
@@ -100,7 +100,7 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
         )
         claims["whether it is optimal"] = placed["optimal"] == (upper <= float(value))
         trusted += [SEARCH.format(upper)] * (not proven)
-        return judge(float(value), [cost], most, claims, trusted)
+        return judge_claims(float(value), [cost], most, claims, trusted)
     target, told = exact(asked.cover) * sum(decimals, Fraction(0)), inf if least is None else least
     by_dual = max(float((target - spare) / max(price, NOTHING)) if target > spare else 0.0, 0.0)
     fewest = max(by_dual, float(target / max(densest, NOTHING)))
@@ -111,7 +111,7 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
     claims["whether it is optimal"] = placed["optimal"] == (told >= placed["cost"])
     claims["the upper bound"] = upper >= float(value)
     trusted += [SEARCH.format(told)] * (not proven) + [UPPER.format(upper)] * (not _at_most(most, upper))
-    return judge(float(cost), [cost], min(fewest, float(cost)), claims, trusted)
+    return judge_claims(float(cost), [cost], min(fewest, float(cost)), claims, trusted)
 
 
 def _sum_up(values: Iterable[float]) -> Fraction:

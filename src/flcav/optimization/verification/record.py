@@ -32,7 +32,7 @@ class Verification:
         ]
 
 
-def judge(
+def judge_claims(
     objective: float, cost: Iterable[Fraction], bound: float | None, claims: Mapping[str, bool], trusted: Sequence[str]
 ) -> Verification:
     """Return the verification in which the `claims` that are not true are the faults."""

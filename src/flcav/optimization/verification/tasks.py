@@ -122,7 +122,7 @@ def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
         parts = [own["a"] * np.asarray(each + own["x0"], float) ** -own["b"] for own, each in powers if own["a"] > 0]
         return curve["floor"] + curve["merge"] * (z > 0) + sum(parts)
     effective = curve["alpha"] * x + held_samples(curve, y, z, k)
-    return curve["floor"] + drift_part(curve, z) + curve["a"] * np.asarray(effective, float) ** -curve["b"]
+    return curve["floor"] + compute_drift(curve, z) + curve["a"] * np.asarray(effective, float) ** -curve["b"]
 
 
 def held_samples(curve: Data, y: Any, z: Any, k: int) -> Any:
@@ -133,7 +133,7 @@ def held_samples(curve: Data, y: Any, z: Any, k: int) -> Any:
     return curve["beta"] * ((own - left) * t / (t + 1) + later * z / (z + 1))
 
 
-def drift_part(curve: Data, z: Any) -> Any:
+def compute_drift(curve: Data, z: Any) -> Any:
     """Return the part of the error that averaging over regions costs or brings."""
     drift = curve.get("drift", 0.0)
     return drift * z / (z + 1) if drift > 0 else -drift / (z + 1)

@@ -1,1 +1,1 @@
-"""The image repository of the provider and the director repository of the customer (TUF, Uptane)."""
+"""The provider's image repository and the customer's director repository (TUF, Uptane)."""

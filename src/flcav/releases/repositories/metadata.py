@@ -1,8 +1,8 @@
-"""Metadata of a party's repository: The Update Framework's roles, read, written, and signed by the online key.
+"""Metadata of a party's repository: reads, writes and online signatures of The Update Framework's roles.
 
 Root and targets are signed by n of the party's m keys, snapshot and timestamp by its online key (TUF specification
-1.0.34, sections 4 and 6). The customer's targets carry a `Directive`: which vehicles install a release, as Uptane's
-director repository says it.
+1.0.34, sections 4 and 6). The customer's targets contain a `Directive` on which vehicles install a release, as those of
+Uptane's director repository.
 """
 
 import hashlib
@@ -27,7 +27,7 @@ Name = Annotated[str, Field(min_length=1, max_length=200)]  # of a vehicle
 
 
 class Directive(Config):
-    """Instruction of the director repository on one release; it is signed as a part of its targets metadata."""
+    """The director's instruction on one release, signed as part of its targets metadata."""
 
     document: ClassVar[str | None] = None
 
@@ -38,18 +38,18 @@ class Directive(Config):
 
     @property
     def share(self) -> float:
-        """Return the share of the fleet that installs it, drawn by the vehicles' names, in [0, 1]."""
+        """Return the share of the fleet that installs the release, in [0, 1], chosen by hashes of names."""
         return self.share_ppm / MILLION
 
 
 def place_in_queue(vehicle: str, task: str, release: int) -> float:
-    """Return the place of a vehicle in the queue for a release, in [0, 1): uniform, and always the same."""
+    """Return a vehicle's place in the queue for a release, in [0, 1): a uniform, deterministic hash."""
     digest = hashlib.sha256(f"{task}/{release}/{vehicle}".encode()).digest()
     return int.from_bytes(digest[:8], "big") / WHOLE
 
 
 def is_assigned(vehicle: str, task: str, directive: Directive) -> bool:
-    """Return whether a vehicle installs the release: by name, or by its place below the share; never a revoked one.
+    """Return whether a vehicle installs the release: by name, or if its place is below the share; never if revoked.
 
     A larger share includes the vehicles of a smaller one.
     """
@@ -59,7 +59,7 @@ def is_assigned(vehicle: str, task: str, directive: Directive) -> bool:
 
 
 Party = Literal["provider", "customer"]
-LIFETIME = {  # of metadata, from its signature on
+LIFETIME = {  # of metadata, from the signature
     "root": timedelta(days=365),
     "targets": timedelta(days=90),
     "snapshot": timedelta(days=7),
@@ -70,7 +70,10 @@ PARTY = "flcav-party"  # key of the party's name among a root's fields
 
 
 def read_root(out: Path) -> bytes:
-    """Return the first root metadata of a party's repository, which its vehicles are delivered with."""
+    """Return the first root metadata of a party's repository, which vehicles are delivered with.
+
+    Raises `InputError` where `out` is no party's repository.
+    """
     path = out / "repository" / "metadata" / "1.root.json"
     if not path.is_file():
         raise InputError(f"{out}: no repository of a party, since it has no repository/metadata/1.root.json")
@@ -78,7 +81,7 @@ def read_root(out: Path) -> bytes:
 
 
 def read_party(out: Path) -> Party:
-    """Return whose repository it is."""
+    """Return the party that a repository belongs to; raises `InputError` if it names none."""
     party = load_root(out).signed.unrecognized_fields.get(PARTY)
     if party not in ("provider", "customer"):
         raise InputError(f"{out}: a repository of nobody: neither the provider's nor the customer's")
@@ -88,7 +91,7 @@ def read_party(out: Path) -> Party:
 def load_root(out: Path) -> "Metadata[Root]":
     """Return the repository's latest root.
 
-    Raises `InputError` where `out` is none of a party, and for keys that `root_keys` refuses.
+    Raises `InputError` where `out` is no party's repository, and for keys that `root_keys` refuses.
     """
     read_root(out)
     metadata = out / "repository" / "metadata"
@@ -98,7 +101,7 @@ def load_root(out: Path) -> "Metadata[Root]":
 
 
 def latest_version(metadata: Path, role: str) -> int:
-    """Return the highest version of a role's files in a folder of metadata; 0 without any."""
+    """Return the highest version of a role's files in a folder of metadata; 0 if there are none."""
     numbers = (path.name.partition(".")[0] for path in metadata.glob(f"*.{role}.json"))
     return max((int(number) for number in numbers if number.isdecimal()), default=0)
 
@@ -115,7 +118,7 @@ def load_snapshot(out: Path) -> "Metadata[Snapshot]":
 
 
 def load_targets(out: Path) -> "Metadata[Targets]":
-    """Return the repository's current targets metadata; raises `InputError` where its snapshot names none."""
+    """Return the repository's current targets metadata; raises `InputError` if its snapshot names none."""
     named = load_snapshot(out).signed.meta.get("targets.json")
     if named is None:
         raise InputError(f"{out}: its snapshot names no targets")
@@ -123,7 +126,7 @@ def load_targets(out: Path) -> "Metadata[Targets]":
 
 
 def read_released(out: Path, task: str, release: int) -> Candidate:
-    """Return the description of a release in the provider's repository; raises `InputError` where it is not there."""
+    """Return the description of a release in the provider's repository; raises `InputError` if it is missing."""
     name = target_names(task, release)[1]
     target = load_targets(out).signed.targets.get(name)
     path = Path(name) if target is None else Path(name).with_name(f"{target.hashes['sha256']}.{CANDIDATE}")
@@ -134,13 +137,13 @@ def read_released(out: Path, task: str, release: int) -> Candidate:
 
 
 def read_weights(out: Path, task: str, release: int) -> str | None:
-    """Return the SHA-256 of a release's weights by a party's current targets; None where they name no such release."""
+    """Return the SHA-256 of a release's weights in a party's current targets; None if they lack the release."""
     target = load_targets(out).signed.targets.get(target_names(task, release)[0])
     return None if target is None else target.hashes.get("sha256")
 
 
 def load_metadata(path: Path) -> "Metadata":
-    """Return the metadata in a file, of the role that its name says; raises `InputError` for any other file."""
+    """Return the metadata in a file, with the role in its name; raises `InputError` for any other file."""
     from tuf.api.exceptions import RepositoryError
     from tuf.api.metadata import Metadata
 
@@ -160,7 +163,7 @@ def write_metadata(metadata: "Metadata", path: Path) -> None:
 
 
 def read_directives(targets: Mapping[str, "TargetFile"]) -> dict[str, Directive]:
-    """Return the directives in a director's targets by task; raises `InputError` where one is malformed."""
+    """Return the directives in a director's targets, by task; raises `InputError` if one is malformed."""
     found = {}
     for name, file in targets.items():
         task, _, rest = name.partition("/")
@@ -174,16 +177,16 @@ def read_directives(targets: Mapping[str, "TargetFile"]) -> dict[str, Directive]
 
 
 def list_releases(targets: Mapping[str, "TargetFile"], task: str) -> list[int]:
-    """Return the numbers of the releases of a task, rising."""
+    """Return the numbers of a task's releases, increasing."""
     parts = [name.split("/") for name in targets]
     return sorted({int(part[1]) for part in parts if len(part) == 3 and part[0] == task and part[1].isdecimal()})
 
 
 def root_keys(root: "Root", role: str = "targets") -> list[PublicKey]:
-    """Return the keys of a role by a root.
+    """Return the keys of a role in a root.
 
-    Raises `InputError` for a key of another curve than P-256, and for one that the root has under two names or in two
-    texts, which would count one owner's signature as two.
+    Raises `InputError` for a key on another curve than P-256, and for a key that the root has under two names or in two
+    encodings, which would count one owner's signature as two.
     """
     origin = "a root's key"
     known = {name: parse_public_key(str(key.keyval.get("public")).encode(), origin) for name, key in root.keys.items()}
@@ -192,12 +195,12 @@ def root_keys(root: "Root", role: str = "targets") -> list[PublicKey]:
 
 
 def target_names(task: str, release: int) -> tuple[str, str]:
-    """Return the names of a release's targets: its weights and its description."""
+    """Return the names of a release's targets: weights and description."""
     return f"{task}/{release}/{WEIGHTS}", f"{task}/{release}/{CANDIDATE}"
 
 
 def expiry_of(role: str, at: datetime) -> datetime:
-    """Return until when metadata of a role hold that are signed now."""
+    """Return the expiry of a role's metadata signed at a time."""
     return (at + LIFETIME[role]).replace(microsecond=0)
 
 
@@ -210,7 +213,8 @@ def sign_online(
     targets_version: int,
     first: bool = False,
 ) -> None:
-    """Sign snapshot and timestamp; the timestamp is written last, so that a crash leaves the old state whole."""
+    """Sign snapshot and timestamp; the timestamp is written last, so that a crash leaves the old state intact."""
+    # clients start from the timestamp, so that no reader sees files that are not written yet
     snapshot.signed.meta["targets.json"].version = targets_version
     snapshot.signed.version += 0 if first else 1
     snapshot.signed.expires = expiry_of("snapshot", at)

@@ -1,12 +1,12 @@
-"""A party's repository of The Update Framework: its creation, and a stage for signatures that come one after another.
+"""A party's repository of The Update Framework: creation, and staging of metadata until it has enough signatures.
 
-The provider's is Uptane's image repository: it names every release. The customer's is Uptane's director repository: it
-names the release that its vehicles are to run, with a `Directive`. Both have roots of their own.
+The provider's is Uptane's image repository, which lists every release. The customer's is Uptane's director repository,
+which names the release for its vehicles, with a `Directive`. They have separate roots.
 
-OUT/keys/{1..m,online}.pem    private keys, to be given to their owners
-OUT/repository/metadata/      what vehicles fetch
+OUT/keys/{1..m,online}.pem    private keys, for their owners
+OUT/repository/metadata/      metadata that vehicles fetch
 OUT/repository/targets/       weights and descriptions of releases
-OUT/staged/targets.json       the next targets metadata, while it lacks signatures
+OUT/staged/targets.json       the next targets metadata, until it has enough signatures
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class StagedTargets:
-    """Targets metadata on its way: how many of the wanted signatures it has."""
+    """The state of staged targets metadata: its signatures and their threshold."""
 
     version: int
     signatures: int
@@ -52,24 +52,24 @@ class StagedTargets:
 
     @property
     def complete(self) -> bool:
-        """Return whether it has as many signatures as its threshold wants."""
+        """Return whether the signatures reach the threshold."""
         return self.signatures >= self.threshold
 
 
 def stage_release(
     out: Path, folder: Path, keys: Sequence[Path], directive: Directive | None = None, now: datetime | None = None
 ) -> StagedTargets:
-    """Add a candidate to the party's next targets metadata and sign it; the provider keeps its files, too.
+    """Add a candidate to the party's next targets metadata and sign it; the provider's repository gets its files, too.
 
     Args:
         out: the party's folder.
         folder: the candidate.
         keys: private keys of the party (PEM files) that sign now; others may follow.
-        directive: the customer's; None in the provider's repository.
-        now: time of the signatures; None: by this machine's clock.
+        directive: of the customer; None in the provider's repository.
+        now: time of the signatures; None: this machine's clock.
 
     Raises:
-        InputError: for a stranger's key or one given twice, a number that does not rise, and a clock that is off.
+        InputError: for an unknown key or one given twice, a number that is not above the last, and a wrong clock.
     """
     from tuf.api.metadata import TargetFile
 
@@ -84,7 +84,7 @@ def stage_release(
     if directive is not None:
         files[names[0]].unrecognized_fields["custom"] = {DIRECTIVE: directive.model_dump(mode="json")}
     _check_rising(out, candidate, files, party)
-    for name, file in files.items() if directive is None else ():  # vehicles download from the provider
+    for name, file in files.items() if directive is None else ():  # vehicles download from the provider's repository
         kept = out / "repository" / "targets" / name
         kept = kept.with_name(f"{file.hashes['sha256']}.{kept.name}")
         kept.parent.mkdir(parents=True, exist_ok=True)
@@ -96,7 +96,7 @@ def stage_release(
 def stage_directive(
     out: Path, task: str, directive: Directive, keys: Sequence[Path], now: datetime | None = None
 ) -> StagedTargets:
-    """Change the customer's directive on the release that its repository names already, and sign the change.
+    """Sign a change of the customer's directive on a release that its repository already names.
 
     Raises `InputError` as `stage_release`, and where the repository names no such release.
     """
@@ -112,14 +112,15 @@ def stage_directive(
 
 
 def publish(out: Path, now: datetime | None = None) -> int:
-    """Make the staged targets metadata the repository's current one; return its version.
+    """Make the staged targets metadata current; return its version.
 
-    Without a staged one, snapshot and timestamp are renewed. Raises `InputError` where signatures are missing.
+    Without staged metadata, snapshot and timestamp are renewed. Raises `InputError` where signatures are missing.
     """
     from tuf.api.metadata import Metadata
 
     at = now or datetime.now(UTC)
-    metadata, staged = out / "repository" / "metadata", _staged_path(out)
+    metadata = out / "repository" / "metadata"
+    staged = _staged_path(out)
     _check_clock(out, at)
     version = load_targets(out).signed.version
     online = read_private_key(key := out / "keys" / f"{ONLINE}.pem")
@@ -140,7 +141,7 @@ def publish(out: Path, now: datetime | None = None) -> int:
 
 
 def read_staged(out: Path) -> StagedTargets | None:
-    """Return the state of the staged targets metadata; None without one."""
+    """Return the state of the staged targets metadata; None if there is none."""
     return _count(out, load_metadata(_staged_path(out))) if _staged_path(out).is_file() else None
 
 
@@ -152,7 +153,7 @@ def _stage(
     keys: Sequence[Path],
     at: datetime,
 ) -> StagedTargets:
-    """Sign the next targets metadata with `files`; of the customer's, the task's other releases leave (`alone`)."""
+    """Sign the next targets metadata with `files`; `alone` (customer) removes the task's other releases."""
     _check_clock(out, at)
     owned = [read_private_key(path) for path in keys]
     party = read_party(out)
@@ -180,9 +181,9 @@ def _stage(
 
 
 def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFile"], party: Party) -> None:
-    """Raise `InputError` for a number that does not rise, and for earlier weights that are no roll-back to them.
+    """Raise `InputError` for a number that is not above the last, and for earlier weights without a roll-back.
 
-    Nor is a roll-back to other weights than those of the release that it names; the provider's repository knows them.
+    A roll-back must also have the weights of the release that it names, which the provider's repository checks.
     """
     known = load_targets(out).signed.targets
     if all(name in known and known[name].hashes == file.hashes for name, file in files.items()):
@@ -207,7 +208,7 @@ def _check_rising(out: Path, candidate: Candidate, files: Mapping[str, "TargetFi
 
 
 def _check_clock(out: Path, at: datetime) -> None:
-    """Raise `InputError` where the clock is behind the repository's latest signatures."""
+    """Raise `InputError` where the clock is earlier than the repository's latest signatures."""
     timestamp = load_metadata(out / "repository" / "metadata" / "timestamp.json")
     made = timestamp.signed.expires - LIFETIME["timestamp"]
     if at < made - timedelta(minutes=5):
@@ -233,15 +234,15 @@ MOST_KEYS = 16
 def create_repository(
     out: Path, party: Party, keys: int = 3, threshold: int = 2, own: Sequence[Path] = (), now: datetime | None = None
 ) -> tuple[PublicKey, ...]:
-    """Create a party's keys and its empty repository at `out`; return its public keys.
+    """Create a party's keys and empty repository at `out`; return the public keys.
 
     Args:
         out: the folder, which may not exist yet.
-        party: whose it is.
-        keys: number of keys m that are generated, unless `own` are given.
-        threshold: number of signatures n that root and targets want.
+        party: its owner.
+        keys: number m of generated keys, unless `own` are given.
+        threshold: number n of signatures that root and targets need.
         own: private keys of the party (PEM files).
-        now: time of the signatures; None: by this machine's clock.
+        now: time of the signatures; None: this machine's clock.
 
     Raises:
         InputError: for a folder that exists, a threshold above the number of keys, or a key given twice.
@@ -280,13 +281,15 @@ def create_repository(
 
 
 def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = None) -> None:
-    """Replace the online key by a new root, signed by the party's keys, and sign snapshot and timestamp anew.
+    """Replace the online key by a new root, signed with the party's keys, and sign snapshot and timestamp again.
 
-    What a thief of the old key signed is worth nothing from then on, high version numbers included. Raises `InputError`
-    for fewer keys than the root's threshold, keys of nobody, and one given twice.
+    Metadata signed with a stolen old key are invalid from then on, whatever their version numbers. Raises `InputError`
+    for fewer keys than the root's threshold, unknown keys, and one given twice.
     """
-    at, metadata = now or datetime.now(UTC), out / "repository" / "metadata"
-    owned, party = [read_private_key(path) for path in keys], read_party(out)
+    at = now or datetime.now(UTC)
+    metadata = out / "repository" / "metadata"
+    owned = [read_private_key(path) for path in keys]
+    party = read_party(out)
     check_distinct([key.public for key in owned], f"the keys of the {party}")
     signed = load_root(out)
     root: Root = signed.signed
@@ -305,6 +308,7 @@ def replace_online_key(out: Path, keys: Sequence[Path], now: datetime | None = N
         < root.roles["root"].threshold
     ):
         raise InputError(f"{out}: fewer signatures of the {party} than its root wants")
+    # a thief may have signed a snapshot of old targets: the latest file counts
     version = latest_version(metadata, "targets")
     write_metadata(signed, metadata / f"{root.version}.root.json")
     timestamp: Metadata[Timestamp] = load_metadata(metadata / "timestamp.json")

@@ -1,4 +1,4 @@
-"""The state of a party's repository: its releases and their vehicles, pending signatures, and times of expiry."""
+"""The status of a party's repository: releases, share of the fleet, pending signatures, and expiry."""
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,7 +23,7 @@ from flcav.storage.records import LEFT_OUT, Record
 
 @dataclass(frozen=True)
 class RepositoryStatus(Record):
-    """The state of a repository on one task."""
+    """The status of a repository for one task."""
 
     party: str
     folder: str
@@ -31,13 +31,13 @@ class RepositoryStatus(Record):
     version: int  # of the targets metadata
     threshold: int
     keys: tuple[str, ...]
-    fresh_until: datetime  # when the first of its metadata expires; vehicles refuse it afterwards
+    fresh_until: datetime  # first expiry of its metadata, after which vehicles refuse it
     staged: Annotated[StagedTargets | None, LEFT_OUT] = None
-    share: Annotated[float | None, LEFT_OUT] = None  # of the fleet; None of the provider
+    share: Annotated[float | None, LEFT_OUT] = None  # of the fleet; None for the provider
     revoked: tuple[str, ...] = ()
 
     def lines(self) -> list[str]:
-        """Return the state in words."""
+        """Return the status in words."""
         named = ", ".join(map(str, self.releases)) or "none"
         lines = [f"{self.folder}: of the {self.party}, releases {named}, version {self.version}"]
         if self.share is not None:
@@ -54,8 +54,10 @@ class RepositoryStatus(Record):
 
 
 def read_repository_status(out: Path, task: str) -> RepositoryStatus:
-    """Return the state of a party's repository; raises `InputError` where `out` holds none."""
-    party, targets, root = read_party(out), load_targets(out).signed, load_root(out).signed
+    """Return the status of a party's repository for a task; raises `InputError` where `out` is none."""
+    party = read_party(out)
+    targets = load_targets(out).signed
+    root = load_root(out).signed
     directive = read_directives(targets.targets).get(task)
     return RepositoryStatus(
         party=party,
@@ -74,7 +76,7 @@ def read_repository_status(out: Path, task: str) -> RepositoryStatus:
 
 
 def read_acknowledgements(folder: Path, repositories: list[Path]) -> list[Acknowledgement]:
-    """Return who of the repositories' parties signs the candidate in `folder` as it is now."""
+    """Return the valid acknowledgements of the candidate in `folder` by the repositories' parties."""
     found = []
     for out in repositories:
         root = load_root(out).signed

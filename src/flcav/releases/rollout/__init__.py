@@ -1,1 +1,1 @@
-"""The roll-out of a release: shares of the fleet, shadow runs that stop it, and delivery over the radio."""
+"""Roll-out of a release: growing shares of the fleet, shadow runs that can stop it, and delivery over the radio."""

@@ -1,7 +1,7 @@
-"""Roll-out to a deployed fleet: its vehicles fetch both repositories through the fleet's proxy, canaries first.
+"""Roll-out to a deployed fleet, whose vehicles fetch both repositories through the fleet's proxy, canaries first.
 
-The customer's keys sign one share of the fleet after the other while the shadow runs of its vehicles agree, and a share
-of 0 where they do not. Bytes are those that crossed the proxy's sockets.
+The customer's keys sign growing shares of the fleet while the shadow runs of its vehicles agree, and a share of 0 if
+they disagree. Bytes are those on the proxy's sockets.
 """
 
 import math
@@ -44,8 +44,8 @@ from flcav.releases.rollout.stages import (
 )
 from flcav.releases.rollout.updater import FOLDER, TASK, RecordedDrive, equip_vehicle
 
-LEAST = 2  # canaries: shadow runs of one vehicle do not tell
-POLL_S = 0.5  # between looks at the vehicles' reports
+LEAST = 2  # number of canaries, since one vehicle's shadow run gives no interval
+POLL_S = 0.5  # interval of reading the vehicles' reports [s]
 
 
 def roll_out(
@@ -62,24 +62,25 @@ def roll_out(
 ) -> Rollout:
     """Return the outcome of a roll-out of the customer's current release to a running fleet.
 
-    It ends where every registered vehicle drives the release, shadow runs stop it, or do not tell.
+    It ends when every registered vehicle drives the release, or when shadow runs stop it or are inconclusive.
 
     Args:
         fleet: folder of the fleet's authority.
         provider: folder of the provider, whose published repository is offered.
-        customer: that of the customer.
-        keys: private keys of the customer, as many as its targets want, so that a stop can be signed at once.
-        ledger: where every downlink is entered; None: nowhere.
-        share: of the fleet, to begin with; None: as the customer has signed it, or more for two canaries.
-        data: dataset whose drives stand for what the vehicles of this machine meet; None: as before.
-        patience_s: time that the vehicles of a share have; then those that have reported decide.
-        progress: callback for the vehicles that have the release.
+        customer: folder of the customer, likewise.
+        keys: private keys of the customer, as many as its targets need, so that a stop can be signed at once.
+        ledger: in which every downlink is entered; None: none.
+        share: first share of the fleet; None: that signed by the customer, increased to two canaries.
+        data: dataset with the recorded drives of this machine's vehicles; None: unchanged.
+        patience_s: timeout of a share [s], after which the vehicles that have reported decide.
+        progress: callback with the number of vehicles that have the release.
 
     Raises:
         InputError: for a fleet that is not up or has no vehicles, too few keys, and a release that was stopped.
     """
     read_ready(fleet)
-    names, directive = list_registered(fleet), read_directive(customer, TASK)
+    names = list_registered(fleet)
+    directive = read_directive(customer, TASK)
     candidate = read_released(provider, TASK, directive.release)
     if len(keys) < (threshold := read_repository_status(customer, TASK).threshold):
         raise InputError(f"{len(keys)} of {threshold} keys of the customer: a roll-out that stops by itself needs all")
@@ -109,9 +110,9 @@ def roll_out(
 
 
 def list_registered(fleet: Path) -> list[str]:
-    """Return the vehicles whose certificates are in force; raises `InputError` where there are none."""
+    """Return the vehicles whose certificates are in force; raises `InputError` if there are none."""
     registry = open_registry(fleet)
-    names = [own.name for own in registry.list_vehicles() if own.describe_state() == "registered"]
+    names = [vehicle.name for vehicle in registry.list_vehicles() if vehicle.describe_state() == "registered"]
     registry.close()
     if not names:
         raise InputError(f"{fleet}: has no registered vehicle")
@@ -119,7 +120,7 @@ def list_registered(fleet: Path) -> list[str]:
 
 
 def equip_fleet(fleet: Path, provider: Path, customer: Path, data: Path | None) -> None:
-    """Let the fleet's vehicles on this machine trust both parties, unless they trust others, and give each a drive."""
+    """Install both parties' roots in this machine's vehicles, unless they have roots, and assign them drives."""
     for out, party in ((provider, "provider"), (customer, "customer")):
         if read_party(out) != party:
             raise InputError(f"{out}: is not of the {party}")
@@ -128,13 +129,13 @@ def equip_fleet(fleet: Path, provider: Path, customer: Path, data: Path | None) 
     for number, folder in enumerate(sorted((fleet / VEHICLES).glob("*"))):
         drive = None
         if data is not None:
-            own = drives[number % len(drives)]
-            drive = RecordedDrive(str(data.resolve()), own.scene, own.agent)
+            recorded = drives[number % len(drives)]
+            drive = RecordedDrive(str(data.resolve()), recorded.scene, recorded.agent)
         equip_vehicle(folder, None if trusts_roots(folder / FOLDER) else roots, drive)
 
 
 def share_of(stage: float, names: Sequence[str], candidate: Candidate) -> float:
-    """Return the share that reaches `stage` of a fleet's vehicles, rounded up, and two at least, by their places."""
+    """Return the share that assigns at least `stage` of a fleet's vehicles, and two, by their places in the queue."""
     places = sorted(place_in_queue(name, candidate.task, candidate.release) for name in names)
     count = max(math.ceil(stage * len(places)), LEAST)
     return 1.0 if count >= len(places) else (math.floor(places[count - 1] * MILLION) + 1) / MILLION
@@ -146,7 +147,7 @@ def _with_share(directive: Directive, share: float) -> Directive:
 
 @dataclass(frozen=True)
 class _Rollout:
-    """A roll-out under way."""
+    """A roll-out in progress."""
 
     fleet: Path
     customer: Path
@@ -154,7 +155,9 @@ class _Rollout:
     candidate: Candidate
     names: Sequence[str]
     ledger: Ledger
-    booked: dict[str, int] = field(default_factory=dict)  # bytes down to each vehicle that are in the ledger, or before
+    booked: dict[str, int] = field(
+        default_factory=dict
+    )  # downloaded bytes already in the ledger, or before the roll-out, by vehicle
 
     def __post_init__(self) -> None:
         self.booked.update(self.count_down(read_reports(self.fleet)))
@@ -163,7 +166,7 @@ class _Rollout:
         return [name for name in self.names if is_assigned(name, TASK, directive)]
 
     def sign(self, share: float) -> Directive:
-        """Let the customer sign a share of the fleet, unless it is what it was, and publish."""
+        """Sign another share of the fleet as the customer, unless it is unchanged, and publish."""
         directive = read_directive(self.customer, TASK)
         if _with_share(directive, share) != directive:
             directive, _ = change_share(self.customer, TASK, share, self.keys)
@@ -171,13 +174,14 @@ class _Rollout:
         return directive
 
     def take_turn(self, share: float, patience_s: float) -> Turn:
-        """Sign a share, and wait until its vehicles have the release, shadow runs stop it, or the time is over."""
+        """Sign a share, and wait until its vehicles have the release, shadow runs stop it, or `patience_s` is over."""
         began, until = time.time(), time.monotonic() + patience_s
         before = {name for name, kept in read_reports(self.fleet).items() if self.drives(kept)}
         assigned = self.assigned(self.sign(share))
         while True:
             reports = {name: kept for name, kept in read_reports(self.fleet).items() if name in assigned}
-            reached, decision = {name for name, kept in reports.items() if self.drives(kept)}, self.judge(reports)
+            reached = {name for name, kept in reports.items() if self.drives(kept)}
+            decision = self.judge(reports)
             stop = decision is not None and decision.judgement == "stop" and decision.vehicles >= LEAST
             if stop or len(reached) == len(assigned) or time.monotonic() > until:
                 break
@@ -196,22 +200,23 @@ class _Rollout:
         return (kept.report.task, kept.report.release) == (TASK, self.candidate.release)
 
     def judge(self, reports: Mapping[str, KeptReport]) -> ShadowDecision | None:
-        """Return what follows from the shadow runs of the release beside the network that it replaces."""
+        """Return the decision by the shadow runs of the release against the network that it replaces."""
         runs = [kept.report.shadow for kept in reports.values() if kept.report.shadow is not None]
         wanted = (self.candidate.driving, self.candidate.weights)
         fitting = [run for run in runs if (run.driving, run.candidate) == wanted]
         return judge_shadows(fitting) if any(run.frames for run in fitting) else None
 
     def count_down(self, reports: Mapping[str, KeptReport]) -> dict[str, int]:
-        """Return the bytes that crossed the sockets down to each vehicle for releases, so far."""
-        crossed = read_traffic(self.fleet).vehicles  # is written with a delay, reports are not
-        known = {name: own.release_down for name, own in crossed.items()}
+        """Return the bytes downloaded for releases so far, by vehicle, on the proxy's sockets."""
+        crossed = read_traffic(self.fleet).vehicles  # written with a delay, unlike reports
+        known = {name: traffic.release_down for name, traffic in crossed.items()}
+        # the larger one is the later one
         return {
             name: max(known.get(name, 0), reports[name].down_bytes if name in reports else 0) for name in self.names
         }
 
     def book(self) -> dict[str, int]:
-        """Enter in the ledger what went down to each vehicle since the last time, and return it."""
+        """Enter the bytes downloaded since the last call in the ledger, and return them by vehicle."""
         now = self.count_down(read_reports(self.fleet))
         moved = {name: count - self.booked[name] for name, count in now.items() if count > self.booked[name]}
         for name, count in moved.items():

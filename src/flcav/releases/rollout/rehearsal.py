@@ -1,7 +1,7 @@
-"""A rehearsal of a roll-out on a simulated fleet: shares, downloads over the radio, shadow runs, a stop, a roll-back.
+"""Rehearsal of a roll-out on a simulated fleet: shares, downloads over the radio, shadow runs, stop and roll-back.
 
-Both parties get repositories and keys for it, so that no key of an owner is needed. Canaries run the network that they
-drove before beside the new one on what they meet; the next share follows, or the roll-out stops and is rolled back.
+Both parties get temporary repositories and keys, so that no owner's key is needed. Canaries run their previous network
+and the new one on the same frames; then the next share follows, or the roll-out stops and is rolled back.
 """
 
 import shutil
@@ -43,8 +43,8 @@ from flcav.releases.rollout.stages import (
     run_shadow,
 )
 
-MOST_TURNS = 12  # of the whole rehearsal; a vehicle drives once a turn
-KEYS = (1, 2)  # of each party, that sign
+MOST_TURNS = 12  # of a rehearsal; a vehicle drives once per turn
+KEYS = (1, 2)  # signing keys of a party
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ class _Parties:
         return [self.folder / party / "keys" / f"{number}.pem" for number in KEYS]
 
     def release(self, candidate: Path, share: float) -> None:
-        """Let both sign a candidate for a share of the fleet, and publish."""
+        """Sign a candidate for a share of the fleet as both parties, and publish."""
         directive = Directive(release=read_candidate(candidate).release, share_ppm=round(share * MILLION))
-        for party, own in (("provider", None), ("customer", directive)):
-            stage_release(self.folder / party, candidate, self.keys(party), own)
+        for party, instruction in (("provider", None), ("customer", directive)):
+            stage_release(self.folder / party, candidate, self.keys(party), instruction)
             publish(self.folder / party)
 
     def widen(self, share: float) -> None:
-        """Let the customer sign another share, and publish."""
+        """Sign another share as the customer, and publish."""
         change_share(self.folder / "customer", self.task, share, self.keys("customer"))
         publish(self.folder / "customer")
 
@@ -90,15 +90,15 @@ def rehearse(
 
     Args:
         candidate: folder of the new release.
-        earlier: folder of the release that drives.
+        earlier: folder of the driving release.
         data: dataset with the vehicles' drives, the traffic and the town.
-        out: new folder of both parties' repositories; the fleet's is removed in the end.
-        ledger: where every downlink is entered; None: nowhere.
+        out: new folder for both parties' repositories; the fleet's folder in it is removed at the end.
+        ledger: in which every downlink is entered; None: none.
         vehicles: number of vehicles.
-        poles: numbers of the town's poles with roadside units; empty: those recorded from.
+        poles: numbers of the town's poles with roadside units; empty: those of the recording.
         settings: of the network.
         seed: of shadowing and losses.
-        progress: callback for the turns done and at most.
+        progress: callback with the turns done and their limit.
 
     Raises:
         InputError: for a folder that exists, candidates that do not follow each other, and a dataset without drives,
@@ -110,7 +110,7 @@ def rehearse(
     opened, spent = Dataset.open(data), ledger if ledger is not None else Ledger(LinkMegabytes(0, 0))
     radio = SimulatedRadio(opened, settings or NetworkSettings(), tuple(poles), seed)
     drives = list_drives(opened)
-    radio.links(drives[0].scene)  # refuses what has no traffic or poles before anything is written
+    radio.links(drives[0].scene)  # raises without traffic or poles, before anything is written
     parties = _Parties(out, new.task)
     try:
         for party in ("provider", "customer"):
@@ -136,7 +136,7 @@ def rehearse(
 
 
 class _Shadows:
-    """Shadow runs of drives, each computed once."""
+    """The shadow runs of drives, cached by drive."""
 
     def __init__(self, data: Dataset, driving: Path, candidate: Path, old: str, new: str) -> None:
         self.data = data
@@ -144,7 +144,7 @@ class _Shadows:
         self.reports: dict[FleetDrive, ShadowReport] = {}
 
     def run(self, drives: Sequence[FleetDrive]) -> ShadowDecision | None:
-        """Return what follows from all drives so far and these; None without any."""
+        """Return the decision by all drives so far and these; None without any."""
         for drive in drives:
             if drive not in self.reports:
                 numbers = self.data.select(agents=[drive.agent], scenes=[drive.scene])
@@ -154,7 +154,7 @@ class _Shadows:
 
 @dataclass(frozen=True)
 class _Rehearsal:
-    """A rehearsal under way: who signs, who drives, how they download, and where that is entered."""
+    """A rehearsal in progress: parties, fleet, radio, and ledger."""
 
     parties: _Parties
     fleet: SimulatedFleet
@@ -162,8 +162,10 @@ class _Rehearsal:
     ledger: Ledger
 
     def roll_out(self, candidate: Path, shadows: _Shadows, progress: Report) -> list[Turn]:
-        """Return the turns until the whole fleet has the release, it is stopped, or there were `MOST_TURNS`."""
-        release, share, fleet = read_candidate(candidate).release, STAGES[0], self.fleet
+        """Return the turns until the whole fleet has the release, it is stopped, or `MOST_TURNS` is reached."""
+        release = read_candidate(candidate).release
+        share = STAGES[0]
+        fleet = self.fleet
         self.parties.release(candidate, share)
         turns: list[Turn] = []
         fetched: set[str] = set()
@@ -178,14 +180,16 @@ class _Rehearsal:
                 break
             wider = next_share(share, decision) if decision is not None else share
             if not self._assigned(release, share):
-                wider = next(stage for stage in STAGES if stage > share)  # a small fleet has no vehicle in the first
+                wider = next(
+                    stage for stage in STAGES if stage > share
+                )  # a small fleet may have no vehicle in the first stage
             if wider != share:
                 share = wider
                 self.parties.widen(share)
         return turns
 
     def spread(self, release: int, first: int) -> list[Turn]:
-        """Return the turns until every vehicle has a release that is for all, or there were `MOST_TURNS`."""
+        """Return the turns until every vehicle has a release for the whole fleet, or `MOST_TURNS` is reached."""
         turns: list[Turn] = []
         fetched: set[str] = set()
         while len(turns) < MOST_TURNS and not (turns and turns[-1].reached == turns[-1].assigned):
@@ -199,7 +203,7 @@ class _Rehearsal:
     def _deliver(
         self, release: int, share: float, number: int, fetched: set[str]
     ) -> tuple[int, float, int, int, tuple[Delivered, ...], float, float]:
-        """Deliver to the vehicles of a share that lack a release; return the fields of a `Turn` but the decision."""
+        """Deliver a release to vehicles of a share that lack it; return the fields of `Turn` before the decision."""
         assigned = self._assigned(release, share)
         lacking = [name for name in assigned if self.fleet.installed(name).release != release]
         before = self._megabytes()
@@ -210,7 +214,7 @@ class _Rehearsal:
         return release, share, len(assigned), reached, tuple(arrivals), after[0] - before[0], after[1] - before[1]
 
     def _megabytes(self) -> tuple[float, float]:
-        """Return what went down so far, over wireless and over wireline [MB]."""
+        """Return the downlink so far, wireless and wireline [MB]."""
         return self.ledger.used_mb("wireless", direction="down"), self.ledger.used_mb("wireline", direction="down")
 
 

@@ -1,10 +1,10 @@
-"""A simulated fleet: vehicles that repeat recorded drives, download over their radio, and install as real ones do.
+"""A simulated fleet: vehicles that repeat recorded drives, download over radio, and install as real ones do.
 
-Every vehicle of every recorded scene is a drive. Vehicle i takes the drive i at first and the next one later, so that
-vehicles beyond the number of drives take the same ones on other days. Folders, metadata, signatures and installation
-are those of `flcav release install`. A vehicle downloads from the nearest roadside unit at the rate that the trace's
-coverage gives it there; the band is shared, and one that leaves coverage begins anew at its next attempt. Every unit
-fetches the files once over wireline.
+A drive is one vehicle in one recorded scene. Vehicle i takes drive i in the first turn and the next drive in the next
+turn; vehicles beyond the number of drives repeat them on other days. Folders, metadata, signatures and installation are
+those of `flcav release install`. A vehicle downloads from the nearest roadside unit at the rate of its radio link at
+that instant of the trace; the band is shared, and a download interrupted by loss of coverage starts again. A roadside
+unit fetches the files once over wireline.
 """
 
 import os
@@ -27,7 +27,7 @@ from flcav.releases.checking import RepositorySources, check_release, trust_root
 from flcav.releases.installation import Installed, read_installed, update_vehicle, weights_path
 
 STAGE = "release"
-WAIT_S = 1.0  # between two attempts
+WAIT_S = 1.0  # between two attempts [s]
 
 
 @dataclass(frozen=True)
@@ -35,13 +35,13 @@ class Delivered:
     """The delivery to one vehicle."""
 
     vehicle: str
-    at_s: float | None  # on the trace's clock; None: not by its end
+    at_s: float | None  # time of arrival on the trace's clock [s]; None: not by its end
     attempts: int
     bytes: int  # on the radio, lost attempts included
-    reason: str  # why the last attempt failed; empty where it arrived
+    reason: str  # of the last attempt's failure; empty if it arrived
 
 
-def deliver(
+def deliver_release(
     links: RadioLinks,
     vehicles: Sequence[str],
     release: int,
@@ -51,10 +51,10 @@ def deliver(
     task: str = "objects",
     fetched: set[str] | None = None,
 ) -> tuple[Delivered, ...]:
-    """Return when each of `vehicles` has a release of `size_bytes`; what is sent enters the ledger.
+    """Return the deliveries of a release of `size_bytes` [bytes] to `vehicles`, and enter them in the ledger.
 
-    Downlinks count against no budget, but are entered message by message, and those of lost attempts too. fetched:
-    units that have the files already, to which those are added that fetch them now; None: none has.
+    Downlinks have no budget, but every message is entered, including lost attempts. fetched: roadside units that have
+    the files already, changed in place; None: none has.
     """
     waiting = dict.fromkeys(vehicles)
     attempts, moved = dict.fromkeys(vehicles, 0), dict.fromkeys(vehicles, 0)
@@ -91,7 +91,7 @@ def deliver(
 
 @dataclass(frozen=True)
 class FleetDrive:
-    """What one vehicle of a recording met in one scene."""
+    """A recorded drive: one vehicle in one scene."""
 
     scene: str
     agent: str
@@ -104,7 +104,7 @@ class FleetDrive:
 
 @dataclass(frozen=True)
 class SimulatedRadio:
-    """The roadside units of a recording's town, and the links of its scenes, computed once each."""
+    """The radio network of a recording: roadside units, and the links of its scenes, cached by scene."""
 
     data: Dataset
     settings: NetworkSettings
@@ -121,7 +121,7 @@ class SimulatedRadio:
 
 @dataclass(frozen=True)
 class SimulatedFleet:
-    """Vehicles in folders of their own."""
+    """A simulated fleet of vehicles, with a folder per vehicle."""
 
     folder: Path
     names: tuple[str, ...]
@@ -133,14 +133,14 @@ class SimulatedFleet:
         return self.drives[(self.names.index(vehicle) + turn) % len(self.drives)]
 
     def installed(self, vehicle: str) -> Installed:
-        """Return the network that drives a vehicle."""
+        """Return the driving network of a vehicle."""
         found = read_installed(self.folder / vehicle)
         assert found is not None
         return found
 
 
 def list_drives(data: Dataset) -> tuple[FleetDrive, ...]:
-    """Return the drives of a recording; raises `InputError` where no vehicle drives."""
+    """Return the drives of a recording; raises `InputError` if it has no vehicle."""
     keys = dict.fromkeys((key.scene, key.agent) for key in data.keys if kind_of(key.agent) == "vehicle")
     if not keys:
         raise InputError(f"{data.folder}: has no vehicle that drives")
@@ -155,7 +155,7 @@ def build_fleet(
     sources: RepositorySources,
     task: str,
 ) -> SimulatedFleet:
-    """Return a fleet of `count` vehicles in new folders, which trust both roots and drive what both parties name.
+    """Return a fleet of `count` vehicles in new folders, which trust both roots and have the signed release installed.
 
     roots: those of the provider and of the customer.
     """
@@ -177,21 +177,26 @@ def update_over_radio(
     ledger: Ledger,
     fetched: set[str],
 ) -> list[Delivered]:
-    """Let vehicles download and install what both parties name for them on their drives at a turn.
+    """Let vehicles download and install their signed release during their drives of a turn; return the deliveries.
 
-    Returns when each has it, from the beginning of its drive on. What is sent enters the ledger. fetched: roadside
-    units that have the files.
+    Times of arrival are relative to the start of the drive [s]. Messages are entered in the ledger. fetched: roadside
+    units that have the files, changed in place.
     """
-    groups: dict[tuple[int, str, int, int], dict[str, str]] = {}  # that download together: agent -> vehicle
+    groups: dict[
+        tuple[int, str, int, int], dict[str, str]
+    ] = {}  # vehicles that download together, by agent of the recording
     for vehicle in vehicles:
-        drive, day = fleet.drive_of(vehicle, turn), fleet.names.index(vehicle) // len(fleet.drives)
+        drive = fleet.drive_of(vehicle, turn)
+        day = fleet.names.index(vehicle) // len(fleet.drives)
         release, size = _ask(fleet, vehicle, sources)
         groups.setdefault((day, drive.scene, release, size), {})[drive.agent] = vehicle
     found = []
-    for (_, scene, release, size), own in groups.items():
+    for (_, scene, release, size), by_agent in groups.items():
         links = radio.links(scene)
-        named = replace(links, vehicle=tuple(own.get(agent, agent) for agent in links.vehicle))
-        arrived = deliver(named, [*own.values()], release, size, radio.settings, ledger, fleet.task, fetched)
+        named = replace(links, vehicle=tuple(by_agent.get(agent, agent) for agent in links.vehicle))
+        arrived = deliver_release(
+            named, [*by_agent.values()], release, size, radio.settings, ledger, fleet.task, fetched
+        )
         start = float(links.time_s[0])
         found += [each if each.at_s is None else replace(each, at_s=each.at_s - start) for each in arrived]
     for each in found:
@@ -201,7 +206,7 @@ def update_over_radio(
 
 
 def _ask(fleet: SimulatedFleet, vehicle: str, sources: RepositorySources) -> tuple[int, int]:
-    """Return the release that a vehicle is to download, and its size [bytes], without weights that it keeps."""
+    """Return the release for a vehicle, and the size of its download [bytes], without weights that it has."""
     checked = check_release(fleet.folder / vehicle, vehicle, sources, fleet.task)
     assert checked.approved is not None
     approved = checked.approved
@@ -210,7 +215,7 @@ def _ask(fleet: SimulatedFleet, vehicle: str, sources: RepositorySources) -> tup
 
 
 def _copy(source: str, target: str) -> str:
-    """Copy a file; weights, which are never written again, become the same file."""
+    """Copy a file; weights, which are never rewritten, are hard-linked."""
     if source.endswith(".safetensors"):
         os.link(source, target)
         return target

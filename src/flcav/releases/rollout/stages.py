@@ -1,8 +1,8 @@
-"""Stages of a roll-out: canaries first, then larger shares while shadow runs agree, else a stop and a roll-back.
+"""Stages of a roll-out: canaries first, then larger shares while shadow runs agree, else stop and roll-back.
 
-In a shadow run a vehicle runs the candidate on the frames that it drives with, and its detections are compared with
-those of the network that drives. A roll-back is a release with a number of its own: earlier weights under a number that
-rises, so that no vehicle ever takes an older number, even a signed one.
+In a shadow run a vehicle runs the candidate on its sensor frames, and its detections are compared with those of the
+driving network. A roll-back is a new release: earlier weights under a higher number, so that no vehicle ever accepts an
+older number, even a signed one.
 """
 
 import shutil
@@ -38,7 +38,7 @@ from flcav.sensors.frame import Frame
 from flcav.storage.files import write_json
 from flcav.storage.records import Record
 
-OVERLAP = 0.5
+OVERLAP = 0.5  # lowest IoU in bird's-eye view of agreeing detections
 LIMIT = 0.4  # of the mean disagreement over vehicles
 LEVEL = 0.05  # one-sided
 Judgement = Literal["go on", "wait", "stop"]
@@ -46,11 +46,11 @@ Judgement = Literal["go on", "wait", "stop"]
 
 @dataclass(frozen=True)
 class ShadowDecision:
-    """What follows from the shadow runs of several vehicles."""
+    """The decision on a roll-out by the shadow runs of several vehicles."""
 
     judgement: Judgement
     vehicles: int
-    mean: float  # disagreement
+    mean: float  # disagreement, in [0, 1]
     low: float  # one-sided bounds at .05, over vehicles
     high: float
 
@@ -64,7 +64,7 @@ class ShadowDecision:
 def run_shadow(
     vehicle: str, frames: Iterable[Frame], driving: tuple[Second, str], candidate: tuple[Second, str]
 ) -> ShadowReport:
-    """Return the shadow run of a vehicle on its frames; both networks come with the SHA-256 of their weights."""
+    """Return the shadow run of a vehicle on its frames; networks are given with the SHA-256 of their weights."""
     counts = np.zeros(4, np.int64)
     for frame in frames:
         (old,), (new,) = (detect_in(each, [frame], score_threshold=THRESHOLD) for each, _ in (driving, candidate))
@@ -74,7 +74,7 @@ def run_shadow(
 
 
 def read_shadow(path: Path) -> ShadowReport:
-    """Return the shadow run in a JSON file; raises `InputError` where there is none, or its numbers cannot be."""
+    """Return the shadow run in a JSON file; raises `InputError` if there is none, or its numbers are impossible."""
     found = ShadowReport.from_json(read_json(path), str(path))
     try:
         found.check()
@@ -84,20 +84,19 @@ def read_shadow(path: Path) -> ShadowReport:
 
 
 def count_agreed(first: Boxes, second: Boxes) -> int:
-    """Return how many detections of two networks agree, each matched once."""
+    """Return the number of detections on which two networks agree, matched one to one."""
     labels = set(first.label.tolist()) & set(second.label.tolist())
     pairs = ((select_class(first, label), select_class(second, label)) for label in sorted(labels))
     return sum(int((assign_targets(one, other, OVERLAP, "bev") >= 0).sum()) for one, other in pairs)
 
 
 def judge_shadows(reports: Sequence[ShadowReport], limit: float = LIMIT) -> ShadowDecision:
-    """Return whether a roll-out goes on: its canaries' mean disagreement lies below the limit, at .05.
+    """Return the decision on a roll-out: it goes on if its canaries' mean disagreement is below the limit, at .05.
 
-    It stops where the mean lies above the limit, and waits for more vehicles where neither is told. Bounds are
-    Student's t over vehicles. Raises `InputError` for no reports, of different networks, and for a vehicle that
-    reports twice.
+    It stops if the mean is above the limit, at .05, and waits for more vehicles otherwise. Bounds are Student's t over
+    vehicles. Raises `InputError` for no reports, reports on different networks, and two reports of one vehicle.
     """
-    reports = [each for each in reports if each.frames]  # who met nothing tells nothing
+    reports = [each for each in reports if each.frames]  # without frames there is no evidence
     if not reports:
         raise InputError("no shadow run of any frame: at least two vehicles' are wanted")
     if len({(each.driving, each.candidate) for each in reports}) > 1:
@@ -105,9 +104,11 @@ def judge_shadows(reports: Sequence[ShadowReport], limit: float = LIMIT) -> Shad
     if len({each.vehicle for each in reports}) < len(reports):
         raise InputError("a vehicle reports its shadow run twice")
     values = np.array([each.disagreement for each in reports])
-    mean, number = float(values.mean()), len(values)
+    mean = float(values.mean())
+    number = len(values)
     if number < 2:
         return ShadowDecision("stop" if mean > limit else "wait", number, mean, 0.0, 1.0)
+    # the disagreement is in [0, 1], and so are its bounds
     half = float(stdtrit(number - 1, 1 - LEVEL)) * float(values.std(ddof=1)) / float(np.sqrt(number))
     low, high = max(mean - half, 0.0), min(mean + half, 1.0)
     judgement: Judgement = "stop" if low > limit else "go on" if high < limit else "wait"
@@ -118,7 +119,7 @@ STAGES = (0.01, 0.05, 0.2, 1.0)  # shares of the fleet
 
 
 def read_directive(out: Path, task: str) -> Directive:
-    """Return the customer's directive on a task; raises `InputError` where there is none."""
+    """Return the customer's directive on a task; raises `InputError` if there is none."""
     found = read_directives(load_targets(out).signed.targets).get(task)
     if found is None:
         raise InputError(f"{out}: has no directive on {task}, so is not the customer's repository, or names no release")
@@ -126,9 +127,9 @@ def read_directive(out: Path, task: str) -> Directive:
 
 
 def next_share(share: float, decision: ShadowDecision) -> float:
-    """Return the share of the fleet that follows: the next of `STAGES`, the same where the canaries wait, or 0.
+    """Return the next share of the fleet: the next of `STAGES`, the same one while the decision is to wait, or 0.
 
-    0 stops the roll-out: vehicles that have the release keep it until a roll-back.
+    0 stops the roll-out; vehicles that have the release keep it until a roll-back.
     """
     if decision.judgement == "stop":
         return 0.0
@@ -140,31 +141,32 @@ def next_share(share: float, decision: ShadowDecision) -> float:
 def change_share(
     out: Path, task: str, share: float, keys: Sequence[Path], revoke: Sequence[str] = ()
 ) -> tuple[Directive, StagedTargets]:
-    """Stage a directive with another share of the fleet, and more revoked vehicles; return it and its signatures.
+    """Stage a directive with another share of the fleet, and further revoked vehicles; return it and its signatures.
 
-    A share of 0 stops the roll-out for vehicles that were named, too.
+    A share of 0 also stops the roll-out for vehicles assigned by name.
     """
     now = read_directive(out, task)
-    revoked, named = tuple(sorted({*now.revoked, *revoke})), now.vehicles if share else ()
+    revoked = tuple(sorted({*now.revoked, *revoke}))
+    named = now.vehicles if share else ()
     updates = {"share_ppm": round(share * MILLION), "revoked": revoked, "vehicles": named}
     changed = parse_config(Directive, now.model_dump() | updates, "the directive")
     return changed, stage_directive(out, task, changed, keys)
 
 
 def roll_back(earlier: Path, release: int, reason: str, out: Path, driving: str) -> Candidate:
-    """Write the candidate of a roll-back to `out`: the weights of an earlier one under a number that rises.
+    """Write the candidate of a roll-back to `out`: the weights of an earlier release under a higher number.
 
-    Its verification is that of the earlier candidate; acknowledgements are given anew.
+    Its verification is that of the earlier candidate; it needs new acknowledgements.
 
     Args:
-        earlier: folder of the candidate that is to drive again.
-        release: number of the roll-back, above all that were released.
-        reason: why, in words.
+        earlier: folder of the candidate whose weights will drive again.
+        release: number of the roll-back, above all earlier ones.
+        reason: in words.
         out: the new folder.
         driving: SHA-256 of the weights that it replaces.
 
     Raises:
-        InputError: for a folder that exists, a damaged candidate, and a number that does not rise.
+        InputError: for a folder that exists, a damaged candidate, and a number that is not above the earlier one's.
     """
     candidate = read_candidate(earlier)
     check_files(earlier, candidate)
@@ -182,15 +184,15 @@ def roll_back(earlier: Path, release: int, reason: str, out: Path, driving: str)
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn: a share of the fleet, the deliveries to it, and the results of the shadow runs."""
+    """One turn of a roll-out: a share of the fleet, deliveries, and the decision by shadow runs."""
 
     release: int
     share: float
-    assigned: int  # vehicles of the share
-    reached: int  # of these, have the release by the end of the turn
-    arrivals: tuple[Delivered, ...]  # seconds from the beginning of the vehicle's drive, or of the turn
-    wireless_mb: float
-    wireline_mb: float | None  # None: not counted
+    assigned: int  # number of vehicles in the share
+    reached: int  # number of these that have the release at the end of the turn
+    arrivals: tuple[Delivered, ...]  # times from the start of the vehicle's drive, or of the turn [s]
+    wireless_mb: float  # downlink [MB]
+    wireline_mb: float | None  # downlink [MB]; None: not counted
     decision: ShadowDecision | None  # None without shadow runs
 
     def describe(self) -> str:
@@ -209,12 +211,12 @@ class Turn:
 
 @dataclass(frozen=True)
 class Rollout(Record):
-    """What became of a roll-out: stopped or not, its turns, and how many vehicles drive which release in the end."""
+    """The outcome of a roll-out: stopped or not, its turns, and the numbers of vehicles by release at its end."""
 
     stopped: bool
     complete: bool  # every vehicle drives the new release, or after a stop the earlier weights
     turns: tuple[Turn, ...]
-    drive: Mapping[int, int]  # release -> vehicles
+    drive: Mapping[int, int]  # number of vehicles by driving release
 
     def lines(self) -> list[str]:
         """Return the roll-out in words."""

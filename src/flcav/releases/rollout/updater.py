@@ -1,10 +1,10 @@
-"""The updater of a fleet's vehicle: it follows the repositories that the fleet's proxy offers.
+"""The updater of a fleet's vehicle, which follows the repositories offered by the fleet's proxy.
 
-A release is fetched and verified, runs beside the network that drives, and is then installed; the fleet is told of each
-step. Wherever the updater is killed, the old network drives on, or the new one does.
+A release is fetched and verified, runs in the shadow of the driving network, and is then installed; every step is
+reported to the fleet. Whenever the updater is killed, either the old or the new network drives.
 
 VEHICLE/releases/                the folder of `vehicles.installation`
-VEHICLE/releases/drive.json      what the vehicle meets
+VEHICLE/releases/drive.json      the recorded drive in place of the vehicle's sensors
 VEHICLE/releases/shadow.json     its last shadow run
 """
 
@@ -38,15 +38,15 @@ from flcav.storage.records import Record
 
 FOLDER, DRIVE, SHADOW = "releases", "drive.json", "shadow.json"
 TASK = "objects"
-POLL_S, LONGEST_S = 2.0, 30.0  # between looks at the customer's timestamp; after one that failed, at most
-CHECK_S = 600.0  # after which everything is checked, whether the timestamp is another one or not
+POLL_S, LONGEST_S = 2.0, 30.0  # interval of polling the customer's timestamp; longest after failures [s]
+CHECK_S = 600.0  # interval of complete checks, even if the timestamp is unchanged [s]
 LARGEST_ANSWER = 1 << 16  # bytes of a timestamp, or of a sentence
 TIMEOUT = httpx.Timeout(30.0, connect=5.0)
 
 
 @dataclass(frozen=True)
 class RecordedDrive(Record):
-    """The frames of a recording, in place of a vehicle's own sensors."""
+    """A recorded drive, whose frames replace those of a vehicle's sensors."""
 
     data: str  # the dataset's folder
     scene: str
@@ -54,10 +54,10 @@ class RecordedDrive(Record):
 
 
 def equip_vehicle(folder: Path, roots: tuple[bytes, bytes] | None, drive: RecordedDrive | None) -> None:
-    """Let a fleet's vehicle follow releases: it trusts both roots, and its shadow runs are of `drive`.
+    """Set up a fleet's vehicle for releases: install both roots, and the `drive` of its shadow runs.
 
-    roots: those of the provider and of the customer; None, as for the drive: as it was. Raises `InputError` for roots
-    of others, and where the folder is no vehicle's.
+    roots: those of the provider and of the customer; None: unchanged, as for `drive`. Raises `InputError` for roots of
+    the wrong party, and where the folder is no vehicle's.
     """
     load_settings(folder)
     if roots is not None:
@@ -67,21 +67,26 @@ def equip_vehicle(folder: Path, roots: tuple[bytes, bytes] | None, drive: Record
 
 
 def run_updater(folder: Path) -> None:
-    """Update the vehicle in `folder` whenever the customer signs anew, until the parent of this process ends."""
-    parent, pause, seen, due = os.getppid(), POLL_S, b"", float("inf")
+    """Update the vehicle in `folder` whenever the customer's timestamp changes, until the parent process ends."""
+    parent = os.getppid()
+    pause = POLL_S
+    seen = b""
+    due = float("inf")
     client: httpx.Client | None = None
     while os.getppid() == parent:
         fine = True
         if trusts_roots(folder / FOLDER):
             client = client or open_client(folder)
             stamp = _ask(client)
-            if stamp is None:  # the certificate may be another one when it asks again
+            if stamp is None:  # reopened for the next request, as the certificate may have been replaced
                 client.close()
-                client, fine = None, False
+                client = None
+                fine = False
             elif stamp and (stamp != seen or time.monotonic() > due):
                 fine = _run_apart(lambda: update_in_fleet(folder))
                 if fine:
-                    seen, due = stamp, time.monotonic() + CHECK_S
+                    seen = stamp
+                    due = time.monotonic() + CHECK_S
         pause = POLL_S if fine else min(2 * pause, LONGEST_S)
         time.sleep(pause)
 
@@ -93,51 +98,53 @@ def open_client(folder: Path) -> httpx.Client:
 
 
 def update_in_fleet(folder: Path) -> None:
-    """Fetch, verify, run in the shadow and install what the fleet offers its vehicle in `folder`, and report.
+    """Fetch, verify, run in the shadow and install the release offered to the vehicle in `folder`, and report.
 
-    Raises `InputError` where the vehicle refuses it, `httpx.HTTPError` where the proxy is not there or refuses the
+    Raises `InputError` if the vehicle refuses it, `httpx.HTTPError` if the proxy cannot be reached or refuses the
     vehicle.
     """
-    own, vehicle = folder / FOLDER, requested_name(read_request(folder / REQUEST))
-    for left in (own / "networks").glob(".*.part"):  # of an update that was killed
+    home = folder / FOLDER
+    vehicle = requested_name(read_request(folder / REQUEST))
+    for left in (home / "networks").glob(".*.part"):  # left by an update that was killed
         left.unlink()
+    # every stage is reported before the next, so that the fleet sees a vehicle that stops within one
     with open_client(folder) as client:
         base = str(client.base_url)
         sources = RepositorySources(f"{base}image", f"{base}director", CertifiedFetcher(client))
-        told = ReleaseReport(TASK, 0, 0)
+        report = ReleaseReport(TASK, 0, 0)
         try:
-            driving = read_installed(own)
-            told = _describe(own, driving)
-            found = fetch_release(own, vehicle, sources, TASK)
+            driving = read_installed(home)
+            report = _describe(home, driving)
+            found = fetch_release(home, vehicle, sources, TASK)
             if found.newer is not None:
-                told = replace(told, verified=found.newer.release, shadow=None)
-                _report(client, told)
-                if (shadow := _run_shadow(own, vehicle, found)) is not None:
-                    write_json(own / SHADOW, shadow.as_json())
-                    told = replace(told, shadow=shadow)
-                    _report(client, told)
-                told = _describe(own, install_release(own, found.newer))
+                report = replace(report, verified=found.newer.release, shadow=None)
+                _report(client, report)
+                if (shadow := _run_shadow(home, vehicle, found)) is not None:
+                    write_json(home / SHADOW, shadow.as_json())
+                    report = replace(report, shadow=shadow)
+                    _report(client, report)
+                report = _describe(home, install_release(home, found.newer))
         except InputError as error:
-            _report(client, replace(told, refused=str(error)[:500]))
+            _report(client, replace(report, refused=str(error)[:500]))
             raise
-        _report(client, told)
+        _report(client, report)
 
 
-def _describe(own: Path, driving: Installed | None) -> ReleaseReport:
-    """Return the report of a vehicle that waits for nothing."""
+def _describe(home: Path, driving: Installed | None) -> ReleaseReport:
+    """Return the report of a vehicle without a pending release."""
     if driving is None:
         return ReleaseReport(TASK, 0, 0)
     shadow = None
-    if (own / SHADOW).is_file():
-        last = ShadowReport.from_json(read_json(own / SHADOW), str(own / SHADOW))
+    if (home / SHADOW).is_file():
+        last = ShadowReport.from_json(read_json(home / SHADOW), str(home / SHADOW))
         shadow = last if last.candidate == driving.weights else None
     return ReleaseReport(driving.task, driving.release, driving.release, shadow=shadow)
 
 
-def _run_shadow(own: Path, vehicle: str, found: Fetched) -> ShadowReport | None:
-    """Return the shadow run of what was fetched; None of a roll-back, and where nothing drives or nothing is met."""
+def _run_shadow(home: Path, vehicle: str, found: Fetched) -> ShadowReport | None:
+    """Return the shadow run of a fetched release; None for a roll-back, and without a driving network or a drive."""
     driving, newer = found.driving, found.newer
-    if driving is None or newer is None or newer.candidate.rolls_back is not None or not (own / DRIVE).is_file():
+    if driving is None or newer is None or newer.candidate.rolls_back is not None or not (home / DRIVE).is_file():
         return None
     from flcav.dataset.store import Dataset
     from flcav.machine.threads import use_threads
@@ -146,16 +153,16 @@ def _run_shadow(own: Path, vehicle: str, found: Fetched) -> ShadowReport | None:
     from flcav.releases.rollout.stages import run_shadow
 
     use_threads(1)
-    drive = RecordedDrive.from_json(read_json(own / DRIVE), str(own / DRIVE))
+    drive = RecordedDrive.from_json(read_json(home / DRIVE), str(home / DRIVE))
     data = Dataset.open(Path(drive.data))
     frames = map(data.frame, data.select(agents=[drive.agent], scenes=[drive.scene]))
     both = (driving, Installed(newer.task, newer.release, newer.weights))
-    old, new = ((load_network(OBJECTS, weights_path(own, each)), each.weights) for each in both)
+    old, new = ((load_network(OBJECTS, weights_path(home, each)), each.weights) for each in both)
     return run_shadow(vehicle, frames, old, new)
 
 
 def _ask(client: httpx.Client) -> bytes | None:
-    """Return the customer's timestamp; nothing where none is on offer, None where the proxy does not answer."""
+    """Return the customer's timestamp; empty if none is offered, None if the proxy does not answer."""
     try:
         status, content = _call(client, "GET", "director/metadata/timestamp.json")
     except httpx.HTTPError:
@@ -164,20 +171,20 @@ def _ask(client: httpx.Client) -> bytes | None:
 
 
 def _report(client: httpx.Client, report: ReleaseReport) -> None:
-    """Send a report; raises `httpx.HTTPError` where it is not taken."""
+    """Send a report; raises `httpx.HTTPError` if it is refused."""
     status, why = _call(client, "POST", REPORT, report.as_bytes())
     if status != httpx.codes.OK:
         raise httpx.HTTPError(f"the report is refused: {status} {why.decode(errors='replace')[:200]}")
 
 
 def _call(client: httpx.Client, method: str, path: str, content: bytes | None = None) -> tuple[int, bytes]:
-    """Return the status and the body of the proxy's answer; of a body that is too long, the beginning."""
+    """Return status and body of the proxy's response; of a long body, the beginning."""
     with client.stream(method, path, content=content) as answer:
         return answer.status_code, next(answer.iter_raw(LARGEST_ANSWER), b"")
 
 
 def _run_apart(do: Callable[[], None]) -> bool:
-    """Return whether `do` ended well in a process of its own, whose memory is free again afterwards."""
+    """Return whether `do` succeeds in a forked process, whose memory is released afterwards."""
     parent, child = os.getpid(), os.fork()
     if child:
         return os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 0

@@ -1,1 +1,1 @@
-"""Verification of a candidate: what its files say, and paired tests beside the network that drives."""
+"""Verification of a candidate: checks of its files, and paired tests against the driving network."""

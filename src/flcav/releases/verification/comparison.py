@@ -1,13 +1,13 @@
-"""Paired comparison of two networks over scenes: on the whole, and guard by guard.
+"""Paired comparison of two networks over scenes: the overall measure, and guards of slices.
 
-The bootstrap draws whole scenes, the same for both networks. On the whole, non-inferiority is claimed (Piaggio et al.,
-JAMA 308, 2012): the lower bound of the difference at .05, one-sided, lies above minus the margin. Guards are many, so
-that the same claim would refuse good networks by chance: they are against catastrophes alone, by one rule. Each has a
-`Limit`, and it is lost where the upper bound of the candidate's distance to the limit is below 0. The bound is at .05
-for all guards together (Bonferroni), by Student's t with the bootstrap's standard error. Where the driving network
-itself reaches next to nothing, shares of it are lost and won by chance: such a guard is not judged.
+The bootstrap resamples whole scenes, the same for both networks. The overall claim is non-inferiority (Piaggio et al.,
+JAMA 308, 2012): the one-sided lower bound of the difference at .05 is above minus the margin. There are many guards, so
+that the same claim for all of them would refuse good networks by chance; they only protect against large losses. A
+guard has a `Limit`, and is lost if the upper bound of the candidate's distance to the limit is below 0. The bound holds
+at .05 for all guards together (Bonferroni), by Student's t with the bootstrap's standard error. A guard is not judged
+if the driving network itself reaches almost nothing, since shares of that vary by chance.
 
-This module has the guards by AP, which rank detections of all scores; `guards` has those of each class.
+This module has the guards by AP, which ranks detections of all scores; `guards` has those of single classes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -37,23 +37,23 @@ Mask = NDArray[np.bool_]
 
 @dataclass(frozen=True)
 class Overlaps:
-    """How the D detections of one class in a frame lie on its T targets and on neutral objects."""
+    """The overlaps of the D detections of one class in a frame with its T targets and with neutral objects."""
 
-    score: NDArray[np.float64]  # (D,) falling
+    score: NDArray[np.float64]  # (D,) decreasing
     iou: NDArray[np.float64]  # (D, T) of volumes
     turned: NDArray[np.float64]  # (D, T) difference of headings [rad], in [0, pi]
     covered: Mask  # (D, T) whether at least half of the detection's footprint lies on the target
-    neutral: Mask  # (D,) the same on a neutral object
-    detections: NDArray[np.int64]  # (D,) their places among the frame's detections of all classes
-    targets: NDArray[np.int64]  # (T,) places of the targets among the frame's of all classes
+    neutral: Mask  # (D,) the same for a neutral object
+    detections: NDArray[np.int64]  # (D,) indices into the frame's detections of all classes
+    targets: NDArray[np.int64]  # (T,) indices into the frame's targets of all classes
 
 
 def measure_overlaps(detections: Boxes, truth: FrameTruth, label: str) -> Overlaps:
     """Return the overlaps of the detections of one class in a frame."""
-    own, among = np.flatnonzero(detections.label == label), np.flatnonzero(truth.targets.label == label)
+    rows, among = np.flatnonzero(detections.label == label), np.flatnonzero(truth.targets.label == label)
     if detections.score is not None:
-        own = own[np.argsort(-detections.score[own], kind="stable")]
-    found, targets = detections[own], truth.targets[among]
+        rows = rows[np.argsort(-detections.score[rows], kind="stable")]
+    found, targets = detections[rows], truth.targets[among]
     known = iou(torch.from_numpy(found.array()), torch.from_numpy(targets.array())).numpy()
     return Overlaps(
         score=np.zeros(0) if found.score is None else found.score,
@@ -61,7 +61,7 @@ def measure_overlaps(detections: Boxes, truth: FrameTruth, label: str) -> Overla
         turned=np.abs(wrap_angle(found.yaw[:, None] - targets.yaw)),
         covered=lies_on(found, targets),
         neutral=on_neutral(found, select_class(truth.neutral, label)),
-        detections=own,
+        detections=rows,
         targets=among,
     )
 
@@ -69,9 +69,9 @@ def measure_overlaps(detections: Boxes, truth: FrameTruth, label: str) -> Overla
 def match_overlaps(
     overlaps: Sequence[Overlaps], least: float, wanted: Sequence[Mask] | None = None, kept: Sequence[Mask] | None = None
 ) -> Matches:
-    """Return the matches from an IoU of `least` on, of all targets or of a slice.
+    """Return the matches at an IoU of `least` or more, for all targets or those of a slice.
 
-    wanted: of each frame, whether a target is in the slice. kept: of each frame, whether a detection counts in it.
+    wanted: masks per frame (T,), targets in the slice. kept: masks per frame (D,), detections that count in it.
     """
     parts = [
         _match_frame(each, least, None if wanted is None else wanted[number], None if kept is None else kept[number])
@@ -86,9 +86,9 @@ def match_overlaps(
 
 
 def match_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[np.intp]) -> NDArray[np.int64]:
-    """Return (R,) the target of each of the detections `rows`, -1 for none, greedily by score.
+    """Return the targets (R,) of the detections `rows` (R,), -1 for none, matched greedily by score.
 
-    least: IoU from which a detection finds a target. inside (T,): targets that can be found. rows (R,), rising.
+    least: lowest IoU of a match. inside: (T,) targets that can be matched. rows: increasing.
     """
     return match_greedily(np.where(inside, each.iou, -1.0), least, rows)[rows]
 
@@ -96,7 +96,7 @@ def match_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[n
 def _match_frame(
     each: Overlaps, least: float, wanted: Mask | None, kept: Mask | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], int]:
-    """Return the scores of one frame's detections that count, their heading errors (NaN: false), and its targets."""
+    """Return a frame's counted detections, as scores and heading errors [rad] (NaN: no match), and its targets."""
     inside = np.ones(len(each.targets), bool) if wanted is None else wanted[each.targets]
     rows = np.arange(len(each.score)) if kept is None else np.flatnonzero(kept[each.detections])
     found = match_detections(each, least, inside, rows)
@@ -109,10 +109,10 @@ def _match_frame(
 
 
 LEVEL = 0.05  # one-sided
-KEPT = 0.8  # share of the driving network's measure that every slice keeps
-LEAST_TARGETS = 10  # of a slice that is compared
+KEPT = 0.8  # share of the driving network's measure that every slice must keep
+LEAST_TARGETS = 10  # in a slice that is compared
 LEAST_OF_GUARD = 5  # scenes of a guard that is judged
-LEAST_SCENES = 10  # of a verification: the bootstrap of fewer is too sure of itself
+LEAST_SCENES = 10  # of a verification: with fewer, bootstrap intervals are too narrow
 Times = NDArray[np.int64]
 Values = NDArray[np.float64]
 Measure = Callable[[Times], Values]
@@ -120,9 +120,9 @@ Measure = Callable[[Times], Values]
 
 @dataclass(frozen=True)
 class Limit:
-    """What the candidate's measure must reach, by the driving network's: `share` of it and `more`.
+    """The limit of the candidate's measure: `share` times the driving network's, plus `more`.
 
-    With `falling`, lower values are better, and it must not exceed this.
+    It is a lower limit or, with `falling`, where lower values are better, an upper one.
     """
 
     share: float = KEPT
@@ -131,17 +131,17 @@ class Limit:
 
     @property
     def is_share(self) -> bool:
-        """Return whether it is a share of the driving network's measure alone."""
+        """Return whether the limit is a plain share of the driving network's measure."""
         return not self.falling and self.more == 0
 
     def spare(self, driving: Values, candidate: Values) -> Values:
-        """Return by how much the candidate is better than the limit."""
+        """Return the margin (n,) by which the candidate is better than the limit."""
         return (candidate - self.share * driving - self.more) * (-1 if self.falling else 1)
 
 
 @dataclass(frozen=True)
 class GuardPair:
-    """A measure of both networks on the same frames: (n, F) multiplicities of frames in, (n,) values out."""
+    """A measure of both networks on the same frames, as functions of multiplicities of frames (n, F) to values (n,)."""
 
     by: str
     name: str
@@ -154,18 +154,19 @@ class GuardPair:
 
 
 def draw_scenes(scene: NDArray[np.str_], redraws: int = REDRAWS) -> Times:
-    """Return (redraws, F) how often each of F frames is in each bootstrap sample of the scenes (F,)."""
+    """Return the multiplicities (redraws, F) of F frames in bootstrap samples of their scenes (F,)."""
     names, index = np.unique(scene, return_inverse=True)
     rng = stream(0, "release", "whole", "AP50")
     return rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=redraws)[:, index]
 
 
 def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Comparison, float]:
-    """Return the comparison of a pair and the standard error of the difference over scenes.
+    """Return the comparison of a pair, and the standard error of the difference over scenes.
 
-    times (n, F): bootstrap samples, see `draw_scenes`. guards: number of guards that are judged together, by which the
-    level is divided.
+    times: (n, F) bootstrap samples, see `draw_scenes`. guards: number of guards judged together, by which the level is
+    divided (Bonferroni).
     """
+    # both networks are measured on the same resampled scenes, so that their common variation cancels
     once = np.ones((1, len(pair.scene)), np.int64)
     old, new = pair.driving(once), pair.candidate(once)
     before, after = pair.driving(times), pair.candidate(times)
@@ -175,13 +176,14 @@ def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Compar
     spare = None
     weak = pair.limit.is_share and not old[0] >= LEAST_MEASURE
     if len(after) and pair.scenes >= LEAST_OF_GUARD and not weak:
-        error, mean = float(pair.limit.spare(before, after).std()), float(pair.limit.spare(old, new)[0])
+        error = float(pair.limit.spare(before, after).std())
+        mean = float(pair.limit.spare(old, new)[0])
         spare = mean + error * float(stdtrit(pair.scenes - 1, 1 - LEVEL / guards))
         least = mean - error * float(stdtrit(pair.scenes - 1, 1 - LEVEL))
         judgement = "lost" if spare < 0 else "kept" if least >= 0 else "open"
-    own, change = (np.nan, np.nan), (np.nan, np.nan)
+    interval, change = (np.nan, np.nan), (np.nan, np.nan)
     if len(after):
-        own, change = np.quantile(after, TAILS), np.quantile(after - before, (LEVEL, 1 - LEVEL))
+        interval, change = np.quantile(after, TAILS), np.quantile(after - before, (LEVEL, 1 - LEVEL))
     compared = Comparison(
         by=pair.by,
         name=pair.name,
@@ -189,8 +191,8 @@ def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Compar
         scenes=pair.scenes,
         driving=float(old[0]),
         candidate=float(new[0]),
-        candidate_low=float(own[0]),
-        candidate_high=float(own[1]),
+        candidate_low=float(interval[0]),
+        candidate_high=float(interval[1]),
         low=float(change[0]),
         high=float(change[1]),
         spare=spare,
@@ -201,14 +203,14 @@ def compare_pair(pair: GuardPair, times: Times, guards: int = 1) -> tuple[Compar
 
 @dataclass(frozen=True)
 class MeasuredNetwork:
-    """Results of a network, with the overlaps frame by frame of each class with targets."""
+    """The results of a network, with overlaps per frame by class with targets."""
 
     tested: ConditionResults
     overlaps: dict[str, list[Overlaps]]
 
 
 def measure_results(tested: ConditionResults) -> MeasuredNetwork:
-    """Return results with the overlaps of all detections, which every slice is matched from."""
+    """Return results with the overlaps of all detections, from which every slice is matched."""
     labels = sorted({str(label) for truth in tested.truths for label in truth.targets.label})
     pairs = [*zip(tested.detections, tested.truths, strict=True)]
     return MeasuredNetwork(tested, {label: [measure_overlaps(*pair, label) for pair in pairs] for label in labels})
@@ -243,7 +245,7 @@ def pair_slices(driving: MeasuredNetwork, candidate: MeasuredNetwork) -> Iterato
 
 
 def _ranges(tested: ConditionResults) -> Iterator[tuple[str, str, list[Mask], tuple[float, float] | None]]:
-    """Yield the slices of targets: by, name, which targets, and the distances of detections that count there."""
+    """Yield the slices of targets: kind, name, masks of targets per frame, range of counted detections [m]."""
     for low, high in DISTANCES_M:
         wanted = [_between(_distance(truth.targets), low, high) for truth in tested.truths]
         yield "distance", f"{low}-{high} m", wanted, (low - BORDER_M, high + BORDER_M)
@@ -253,17 +255,17 @@ def _ranges(tested: ConditionResults) -> Iterator[tuple[str, str, list[Mask], tu
 
 
 def list_frame_slices(tested: ConditionResults) -> Iterator[tuple[str, str, NDArray[np.bool_]]]:
-    """Yield the slices of frames, where there are several of a kind: by, name, which frames (F,)."""
+    """Yield the slices of frames, for kinds with several: kind, name, mask of the frames (F,)."""
     names = {
         "weather": [truth.weather or "" for truth in tested.truths],
         "scenario": [each.scenario for each in tested.frames],
         "town": [each.town for each in tested.frames],
         "cell": [each.cell for each in tested.frames],
     }
-    for by, own in names.items():
-        known = sorted({name for name in own if name})
+    for by, labels in names.items():
+        known = sorted({name for name in labels if name})
         for name in known if len(known) > 1 else ():
-            yield by, name, np.array([each == name for each in own])
+            yield by, name, np.array([each == name for each in labels])
 
 
 def _distance(boxes: Boxes) -> Values:
@@ -280,7 +282,7 @@ def _match(
     wanted: Sequence[Mask] | None = None,
     within: tuple[float, float] | None = None,
 ) -> dict[str, Matches]:
-    """Return the matches of each class; wanted: targets of a slice; within: distances of detections that count."""
+    """Return the matches by class; wanted: targets of a slice; within: range of counted detections [m]."""
     kept = None if within is None else [_between(_distance(boxes), *within) for boxes in measured.tested.detections]
     return {label: match_overlaps(each, least, wanted, kept) for label, each in measured.overlaps.items()}
 
@@ -294,7 +296,7 @@ def _pair(
     inside: Mask | None = None,
     measure: Callable[[Matches, Times], Values] = weighted_precision,
 ) -> GuardPair:
-    """Return a pair over the classes with targets in the slice; inside: (F,) frames that are in it."""
+    """Return the pair over the classes with targets in a slice; inside: (F,) frames in the slice."""
     scene = np.array([truth.scene for truth in driving.tested.truths])
     counted = np.ones(len(scene), np.int64) if inside is None else inside.astype(np.int64)
 
@@ -306,7 +308,7 @@ def _pair(
 
 
 def _mean(matches: dict[str, Matches], times: Times, measure: Callable[[Matches, Times], Values]) -> Values:
-    """Return (n,) the mean over the classes with targets; NaN without any."""
+    """Return the means (n,) over the classes with targets; NaN without any."""
     if not matches:
         return np.full(len(times), np.nan)
     each = np.array([measure(one, times) for one in matches.values()])
@@ -316,19 +318,19 @@ def _mean(matches: dict[str, Matches], times: Times, measure: Callable[[Matches,
 
 
 def _orientation(matches: Matches, times: Times) -> Values:
-    """Return (n,) the average orientation similarity."""
+    """Return the average orientation similarity (n,), AOS (Geiger et al., CVPR 2012)."""
     return weighted_precision(matches, times, (1 + np.cos(np.nan_to_num(matches.turned))) / 2)
 
 
 def _recall(matches: Matches, times: Times) -> Values:
-    """Return (n,) the share of the targets that are found from the score of use on."""
+    """Return the recall (n,) at the score threshold in use."""
     hits = np.bincount(matches.frame[matches.hit & (matches.score >= THRESHOLD)], minlength=len(matches.targets))
     with np.errstate(invalid="ignore"):
         return times @ hits / (times @ matches.targets)
 
 
 def _precision(matches: Matches, times: Times) -> Values:
-    """Return (n,) the share of right detections among those from the score of use on; 0 where there are none."""
+    """Return the precision (n,) at the score threshold in use; 0 without detections."""
     used = matches.score >= THRESHOLD
     hits = np.bincount(matches.frame[matches.hit & used], minlength=len(matches.targets))
     every = np.bincount(matches.frame[used], minlength=len(matches.targets))

@@ -1,4 +1,4 @@
-"""Checks of a candidate's files before any frame is tested: hashes, numbers, architecture, card, and provenance."""
+"""Checks of a candidate's files without running the network: hashes, numbers, architecture, card, provenance."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
@@ -17,11 +17,11 @@ from flcav.releases.verification.records import VerificationData
 from flcav.storage.files import sha256
 
 LAYERS = ("sparse_channels", "pillar_channels", "bev_layers", "bev_channels", "bev_up_channels", "voxel_m")
-FREE = ("calibration", "augmentation", "bfloat16")  # settings in which an update may differ
+FREE = ("calibration", "augmentation", "bfloat16")  # settings that an update may change
 
 
 def describe_data(data: Dataset, frames: int, scenes: int) -> VerificationData:
-    """Return the record of a dataset that is tested on."""
+    """Return the record of a test dataset."""
     recipe = data.manifest.recipe
     town, seed = recipe.get("town"), recipe.get("seed")
     return VerificationData(
@@ -35,9 +35,9 @@ def describe_data(data: Dataset, frames: int, scenes: int) -> VerificationData:
 
 
 def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Sequence[VerificationData]) -> Iterator[str]:
-    """Yield the reasons for which the candidate's files alone refuse it; the network is not run.
+    """Yield the reasons to refuse a candidate because of its files; the network is not run.
 
-    driving: weights of the network that drives. tested: the datasets of the verification.
+    driving: weights of the driving network. tested: the test datasets of the verification.
     """
     try:
         check_files(folder, candidate)
@@ -71,9 +71,9 @@ def find_faults(folder: Path, candidate: Candidate, driving: Path, tested: Seque
 
 
 def find_overlap(candidate: Candidate, tested: Sequence[VerificationData]) -> Iterator[str]:
-    """Yield the datasets of the candidate's provenance whose scenes it would be tested on.
+    """Yield a sentence per training dataset of the candidate whose scenes are among the test scenes.
 
-    Scenes are the same where the manifests are, or town and seed, whatever the split, the sensors and the name.
+    Scenes are the same if the manifests are, or if town and seed are, whatever the split, the sensors and the name.
     """
     for known in candidate.data:
         for test in tested:
@@ -83,9 +83,9 @@ def find_overlap(candidate: Candidate, tested: Sequence[VerificationData]) -> It
 
 
 def _fits_name(network: Second, name: str) -> bool:
-    """Return whether a network can be of the configuration called `name`: its layers are, whatever its classes.
+    """Return whether a network's layers are those of the configuration `name`, whatever its classes.
 
-    A name that is none of flcav's is its owner's.
+    A name unknown to flcav fits any network.
     """
     known = OBJECTS.configurations.get(name)
     return known is None or all(getattr(known, layer) == getattr(network.config, layer) for layer in LAYERS)

@@ -1,8 +1,8 @@
-"""Guards of classes: what a network finds and invents, and what it says of its boxes, on slices of the frames.
+"""Guards of classes: recall, false detections, box errors and predicted variances, on slices of the frames.
 
-The detections of a class are matched to its targets once. Every measure is a sum over detections or targets divided by
-another, so that a slice is a choice of rows, and a bootstrap sample weights the frames. `MEASURES` are all of them,
-with the limits that `comparison` judges them by. Errors and variances are of the detections that find a target.
+The detections of a class are matched to its targets once. Every measure is a ratio of two sums over detections or
+targets, so that a slice selects rows, and a bootstrap sample weights frames. `MEASURES` lists all of them, with the
+limits that `comparison` applies. Errors and variances are those of detections with a matched target.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -25,15 +25,15 @@ from flcav.releases.verification.comparison import (
     match_detections,
 )
 
-OVERLAP = 0.5  # IoU in 3D from which a detection finds a target
-SECTORS_DEG = ((-90, -30), (-30, 0), (0, 30), (30, 90))  # of azimuth, counter-clockwise from straight ahead
-LEAST_SIGMAS = 0.01
+OVERLAP = 0.5  # lowest IoU in 3D of a match
+SECTORS_DEG = ((-90, -30), (-30, 0), (0, 30), (30, 90))  # of azimuth, counter-clockwise from the forward axis
+LEAST_SIGMAS = 0.01  # lower bound of normalised errors, whose logarithm is taken
 PARTS = ("x", "y", "height above ground", "length", "width", "height", "axis")  # of a box, LiDAR frame
 
 
 @dataclass(frozen=True)
 class Rows:
-    """Where N detections or targets of a class are, and how long they are."""
+    """Frames, positions and lengths of N detections or targets of a class, LiDAR frame."""
 
     frame: NDArray[np.int64]  # (N,)
     distance: Values  # (N,) in the plane [m]
@@ -43,31 +43,31 @@ class Rows:
 
 @dataclass(frozen=True)
 class ClassTable:
-    """The D detections of one class that count, and its T targets, over F frames."""
+    """The D counted detections of one class and its T targets, over F frames."""
 
     frames: int
     detections: Rows
     score: Values  # (D,)
-    right: Mask  # (D,) whether it finds a target
-    error: Values  # (D, 7) x, y, z, length, width, height [m], yaw [rad] minus the target's; 0 where it finds none
-    variance: Values | None  # (D, 7) predicted, of the same
+    right: Mask  # (D,) whether it matches a target
+    error: Values  # (D, 7) x, y, z, length, width, height [m], yaw [rad] minus the target's; 0 without a match
+    variance: Values | None  # (D, 7) predicted, of the same quantities [m^2], [rad^2]
     targets: Rows
-    seen: Values  # (T,) score of the detection that finds it; 0: none
+    seen: Values  # (T,) score of the matched detection; 0: none
 
     @property
     def used(self) -> Mask:
-        """Return (D,) whether a detection has the score of use."""
+        """Return whether detections (D,) reach the score threshold in use."""
         return self.score >= THRESHOLD
 
     @property
     def axis_error(self) -> Values:
-        """Return (D, 7) the errors with yaw as that of the axis, in [-pi/2, pi/2): the heading is another measure."""
+        """Return the errors (D, 7) with yaw modulo pi, in [-pi/2, pi/2), since the heading has a separate measure."""
         return np.column_stack((self.error[:, :6], wrap_angle(2 * self.error[:, 6]) / 2))
 
 
 @dataclass(frozen=True)
 class MeasureTerms:
-    """What N rows add to the numerator and to the denominator of a measure."""
+    """The terms of N rows in the numerator and the denominator of a measure."""
 
     rows: Rows
     above: Values  # (N,)
@@ -76,18 +76,18 @@ class MeasureTerms:
 
 @dataclass(frozen=True)
 class ClassMeasure:
-    """A measure of a class, and the limit of the candidate's."""
+    """A measure of a class, with its limit for the candidate."""
 
     by: str
-    name: str  # "" where `by` says it
+    name: str  # "" where `by` is enough
     limit: Limit
     terms: Callable[[ClassTable], MeasureTerms]
-    everywhere: bool = False  # on every slice and in every condition, else on distances alone
+    everywhere: bool = False  # on every slice and in every condition, else only by distance
 
 
 @dataclass(frozen=True)
 class Slice:
-    """A part of the rows and of the F frames."""
+    """A slice: some of the rows, and some of the F frames."""
 
     name: str
     rows: Callable[[Rows], Mask]
@@ -95,18 +95,18 @@ class Slice:
 
 
 def tabulate(measured: MeasuredNetwork, label: str) -> ClassTable:
-    """Return the table of one class that has targets."""
+    """Return the table of a class with targets."""
     tested = measured.tested
     boxes, targets, errors, rights, seen = [], [], [], [], []
     for each, detections, truth in zip(measured.overlaps[label], tested.detections, tested.truths, strict=True):
-        own, wanted = detections[each.detections], truth.targets[each.targets]
-        found = match_detections(each, OVERLAP, np.ones(len(wanted), bool), np.arange(len(own)))
+        boxes_of_class, wanted = detections[each.detections], truth.targets[each.targets]
+        found = match_detections(each, OVERLAP, np.ones(len(wanted), bool), np.arange(len(boxes_of_class)))
         hit = found >= 0
-        error, score = np.zeros((len(own), 7)), np.zeros(len(wanted))
-        error[hit] = own.array()[hit] - wanted.array()[found[hit]]
+        error, score = np.zeros((len(boxes_of_class), 7)), np.zeros(len(wanted))
+        error[hit] = boxes_of_class.array()[hit] - wanted.array()[found[hit]]
         score[found[hit]] = each.score[hit]
         counts = hit | ~each.neutral
-        boxes.append(own[counts])
+        boxes.append(boxes_of_class[counts])
         errors.append(error[counts])
         rights.append(hit[counts])
         targets.append(wanted)
@@ -127,17 +127,17 @@ def tabulate(measured: MeasuredNetwork, label: str) -> ClassTable:
 def pair_classes(
     driving: MeasuredNetwork, candidate: MeasuredNetwork, condition: str = "", groups: Sequence[tuple[str, Mask]] = ()
 ) -> Iterator[GuardPair]:
-    """Yield the pairs of every measure of each class, on all rows and slice by slice.
+    """Yield the pairs of all measures by class, on all rows and on slices.
 
-    condition: of the sensor; what is found and invented is measured there, in all. groups: slices of the frames, by
-    name.
+    condition: of the sensor, in which only recall and false detections on all rows are measured. groups: slices of
+    frames, as name and mask (F,).
     """
     scene = np.array([truth.scene for truth in driving.tested.truths])
     all_frames = np.ones(len(scene), bool)
     whole = Slice(condition, lambda rows: np.ones(len(rows.frame), bool), all_frames)
     far = [Slice(f"{a}-{b} m", _between("distance", a, b), all_frames) for a, b in DISTANCES_M]
     sectors = [Slice(f"{a} to {b} degrees", _between("azimuth", a, b), all_frames) for a, b in SECTORS_DEG]
-    known = [Slice(name, lambda rows, own=inside: own[rows.frame], inside) for name, inside in groups]
+    known = [Slice(name, lambda rows, mask=inside: mask[rows.frame], inside) for name, inside in groups]
     for label in driving.overlaps:
         tables = tabulate(driving, label), tabulate(candidate, label)
         long = float(np.median(tables[0].targets.length)) if len(tables[0].seen) else 0.0
@@ -159,7 +159,7 @@ def pair_classes(
 def _pair(
     measure: ClassMeasure, label: str, tables: tuple[ClassTable, ClassTable], scene: NDArray[np.str_], part: Slice
 ) -> Iterator[GuardPair]:
-    """Yield the pair of a measure on a slice; none where one of the networks has too few rows for it."""
+    """Yield the pair of a measure on a slice; none if one of the networks has too few rows."""
     sums = []
     for table in tables:
         terms = measure.terms(table)
@@ -211,7 +211,7 @@ def _precision(table: ClassTable) -> MeasureTerms:
 
 
 def _confidence(table: ClassTable) -> MeasureTerms:
-    """Return the score minus whether it is right, of detections in use: 0 where scores are calibrated."""
+    """Return the score minus correctness of detections in use, whose mean is 0 for calibrated scores."""
     return MeasureTerms(table.detections, table.used * (table.score - table.right), table.used.astype(float))
 
 
@@ -228,7 +228,7 @@ def _bias(part: int) -> Callable[[ClassTable], MeasureTerms]:
 
 
 def _normalised(part: int) -> Callable[[ClassTable], MeasureTerms]:
-    """Return the logarithm of errors in predicted standard deviations, from `LEAST_SIGMAS` on: it has no heavy tail."""
+    """Return the log of errors over predicted standard deviations, at least `LEAST_SIGMAS`: it has no heavy tail."""
 
     def normalised(table: ClassTable) -> MeasureTerms:
         assert table.variance is not None
@@ -242,6 +242,7 @@ def _of_right(table: ClassTable, values: Values) -> MeasureTerms:
     return MeasureTerms(table.detections, np.where(table.right, values, 0.0), table.right.astype(float))
 
 
+# limits are loose, since guards only protect against large losses: see `comparison`
 MEASURES = (
     ClassMeasure("found", "", Limit(0.6), _found, everywhere=True),
     ClassMeasure("false", "", Limit(2, 0.15, falling=True), _false, everywhere=True),

@@ -1,4 +1,4 @@
-"""Records of a verification: the comparison on the whole, guards of slices, the tested domain, and the decision."""
+"""Records of a verification: overall comparison, guards of slices, tested domain, and decision."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -7,38 +7,38 @@ from typing import Literal
 from flcav.interface.wording import plural
 from flcav.storage.records import Record
 
-LEAST_MEASURE = 0.05  # of the driving network in a slice that is judged
+LEAST_MEASURE = 0.05  # least measure of the driving network in a judged slice
 Judgement = Literal["kept", "lost", "open"]
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """A measure of the driving network and of the candidate on the same frames, and their difference's interval."""
+    """A measure of driving network and candidate on the same frames, with the interval of the difference."""
 
-    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, condition, measure; of `guards`
+    by: str  # whole, class, distance, occlusion, weather, scenario, town, cell, condition, measure; those of `guards`
     name: str
     targets: int
     scenes: int
     driving: float
     candidate: float
-    candidate_low: float  # ends of the candidate's 95 % interval over scenes; NaN where the frames give none
+    candidate_low: float  # ends of the candidate's 95 % interval over scenes; NaN: undefined
     candidate_high: float
-    low: float  # ends of the 90 % interval of candidate minus driving: each is a one-sided bound at .05
+    low: float  # ends of the 90 % interval of candidate minus driving, one-sided bounds at .05
     high: float
-    spare: float | None  # of a guard: bound of how much better than its limit the candidate may be; None: not judged
-    judgement: Judgement  # of a guard: lost, which refuses, where `spare` is below 0; kept; or the frames do not tell
+    spare: float | None  # of a guard: upper bound of the candidate's distance to the limit; None: not judged
+    judgement: Judgement  # of a guard: lost (refused) if `spare` is below 0; kept; or open: too few frames to decide
 
 
 @dataclass(frozen=True)
 class OddCoverage:
-    """How much of an operational design domain, as ASAM OpenODD describes it, the test frames cover."""
+    """The coverage of an operational design domain (ASAM OpenODD) by the test frames."""
 
     domain: str
     revision: str | None  # digest of the domain's files
     by: tuple[str, ...]  # the two attributes of cells
     frames: Mapping[str, int]  # inside, outside, unknown
     grade: float  # share of the buckets inside the domain that are covered, mean over its attributes
-    holes: Mapping[str, tuple[str, ...]]  # attribute -> buckets inside the domain that no frame was in
+    holes: Mapping[str, tuple[str, ...]]  # buckets inside the domain without a frame, by attribute
 
     def describe(self) -> str:
         """Return the coverage in words."""
@@ -49,16 +49,16 @@ class OddCoverage:
 
 @dataclass(frozen=True)
 class VerifiedDomain:
-    """The operational design domain that a candidate was tested in: the ranges of what the test frames hold."""
+    """The tested operational design domain of a candidate: ranges of conditions in the test frames."""
 
     towns: tuple[str, ...]
     scenarios: tuple[str, ...]
     weathers: tuple[str, ...]
-    visibility_m: tuple[float, float] | None  # least and most
-    rain_mm_h: tuple[float, float] | None
-    sun_elevation_deg: tuple[float, float] | None
-    speed_m_s: tuple[float, float]  # of the objects
-    distance_m: tuple[float, float]  # of the targets
+    visibility_m: tuple[float, float] | None  # least and most, as in the following [m]
+    rain_mm_h: tuple[float, float] | None  # [mm/h]
+    sun_elevation_deg: tuple[float, float] | None  # [degrees]
+    speed_m_s: tuple[float, float]  # of the objects [m/s]
+    distance_m: tuple[float, float]  # of the targets from the LiDAR [m]
     objects: Mapping[str, int]  # targets by class
     lidars: tuple[str, ...]  # names of the rigs or sensors
     odd: OddCoverage
@@ -66,7 +66,7 @@ class VerifiedDomain:
 
 @dataclass(frozen=True)
 class VerificationData:
-    """A dataset that was tested on."""
+    """A test dataset."""
 
     name: str
     manifest: str  # SHA-256
@@ -78,19 +78,19 @@ class VerificationData:
 
 @dataclass(frozen=True)
 class CandidateVerification(Record):
-    """The verification of a candidate beside the driving network: accepted, or refused for reasons."""
+    """The verification of a candidate against the driving network: accepted, or refused with reasons."""
 
     candidate: str  # SHA-256 of the weights
     driving: str
     accepted: bool
     reasons: tuple[str, ...]  # of the refusal; () where accepted
-    undecided: bool  # refused because the frames do not tell
-    margin: float  # by which AP50 may be lower
+    undecided: bool  # refused because there are too few frames to decide
+    margin: float  # largest acceptable loss of AP50
     kept_share: float  # of the driving network's measure that a slice must keep
     frames: int
     scenes: int
-    frames_to_decide: int | None  # None where decided, or where no number would do
-    whole: Comparison | None  # None where the files alone refuse it
+    frames_to_decide: int | None  # None if decided, or if no number suffices
+    whole: Comparison | None  # None if refused because of its files
     guards: tuple[Comparison, ...]
     data: tuple[VerificationData, ...]
     domain: VerifiedDomain | None

@@ -1,7 +1,7 @@
-"""Tests of one network on recorded frames: its detections in every condition, and the ground truth.
+"""Tests of a network on recorded frames: its detections in every condition, and the ground truth.
 
-A condition takes a recorded frame and returns it as a sensor on the road would have given it: range noise, lost
-returns, a turned mount, late detections. The objects to be found stay the same.
+A condition changes a recorded frame as a degraded sensor would: noise on points, lost returns, a misaligned mount, late
+detections. The targets stay the same.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -26,11 +26,11 @@ from flcav.perception.weights import load_network
 from flcav.sensors.frame import Frame
 from flcav.statistics.streams import stream
 
-NOISE_M = 0.05  # standard deviation of each coordinate
-DROPPED = 0.5  # share of the returns
-TURNED_RAD = (0.01, 0.005)  # of the LiDAR: yaw and pitch, unknown to the vehicle
-LIFTED_M = 0.05
-LATE_S = 0.2  # from the spin until detections are used
+NOISE_M = 0.05  # standard deviation per coordinate [m]
+DROPPED = 0.5  # share of lost returns
+TURNED_RAD = (0.01, 0.005)  # yaw and pitch of the LiDAR [rad], unknown to the vehicle
+LIFTED_M = 0.05  # height error of the LiDAR [m]
+LATE_S = 0.2  # latency from the spin to the use of detections [s]
 
 PLAIN = "plain"
 Condition = Callable[[Frame], Frame]
@@ -38,7 +38,7 @@ Points = NDArray[np.float32]
 
 
 def add_range_noise(frame: Frame) -> Frame:
-    """Return the frame with Gaussian noise on each coordinate of its points."""
+    """Return the frame with Gaussian noise on the coordinates of its points."""
     rng = stream(0, "noise", frame.key)
 
     def noisy(points: Points) -> Points:
@@ -56,7 +56,7 @@ def drop_returns(frame: Frame) -> Frame:
 
 
 def turn_mount(frame: Frame) -> Frame:
-    """Return the frame of a LiDAR that was turned and lifted, which the vehicle does not know."""
+    """Return the frame with points of a LiDAR that was turned and lifted, unknown to the vehicle."""
     seen = inverse(pose(0, 0, LIFTED_M, *TURNED_RAD))
 
     def turned(points: Points) -> Points:
@@ -68,7 +68,7 @@ def turn_mount(frame: Frame) -> Frame:
 
 
 def move_on(frame: Frame) -> Frame:
-    """Return the frame with its objects where they are when late detections are used, by their velocities."""
+    """Return the frame with its objects moved by their velocities to the time at which late detections are used."""
     known = frame.annotations
     velocity = np.nan_to_num(known.velocity)
     boxes = replace(known.boxes, center=known.boxes.center + LATE_S * velocity)
@@ -95,34 +95,34 @@ def _change(frame: Frame, change: Callable[[Points], Points]) -> Frame:
 
 
 Work = tuple[Path, Sequence["VerificationFrame"], str]  # weights, frames, condition
-AT_ONCE = 16  # frames of a piece of work
-SPARSE = 4  # every fourth frame is tested in each further condition
+AT_ONCE = 16  # frames per work item
+SPARSE = 4  # every fourth frame is tested in the further conditions
 
 
 @dataclass(frozen=True)
 class VerificationFrame:
-    """A frame that is tested: its number in a dataset, and what is known of its scene."""
+    """A test frame: its number in a dataset, and properties of its scene."""
 
     data: Path
     number: int
     town: str
     scenario: str
-    cell: str = ""  # of the operational design domain; "" where it is not known
+    cell: str = ""  # of the operational design domain; "" if unknown
 
 
 @dataclass(frozen=True)
 class ConditionResults:
-    """Results of a network in one condition, frame by frame."""
+    """The results of a network in one condition, frame by frame."""
 
     frames: tuple[VerificationFrame, ...]
     detections: tuple[Boxes, ...]  # LiDAR frame
-    truths: tuple[FrameTruth, ...]  # scenes are named by dataset and scene
+    truths: tuple[FrameTruth, ...]  # with scenes named DATASET/SCENE
 
 
 def choose_test_frames(
     folders: Sequence[Path], network: Second, most: int | None = None
 ) -> tuple[VerificationFrame, ...]:
-    """Return the frames of datasets whose sensors fit the network, at most `most` of each, evenly spread.
+    """Return the frames of datasets whose sensors fit the network, at most `most` per dataset, evenly spaced.
 
     Raises `InputError` where a dataset has no labels, none fits, or one is given twice.
     """
@@ -168,7 +168,7 @@ def run_tests(
     jobs: int = 1,
     progress: Report = ignore_progress,
 ) -> list[dict[str, ConditionResults]]:
-    """Return the results of networks (files of weights) by condition; those besides `PLAIN` on every fourth frame."""
+    """Return the results of networks (files of weights) by condition; all but `PLAIN` on every fourth frame."""
     works = [
         (path, part, name)
         for path in networks
@@ -189,12 +189,12 @@ def _run(weights: Path, frames: Sequence[VerificationFrame], condition: str) -> 
 def _collect(
     networks: Sequence[Path], works: Sequence[Work], parts: Iterable[ConditionResults], progress: Report
 ) -> list[dict[str, ConditionResults]]:
-    """Return the results of each network by condition, from those of the pieces of work."""
+    """Return the results per network by condition, from those of the work items."""
     results: list[dict[str, list[ConditionResults]]] = [{} for _ in networks]
     for done, (part, (path, _, name)) in enumerate(zip(parts, works, strict=True), start=1):
         results[networks.index(path)].setdefault(name, []).append(part)
         progress(done, len(works), "")
-    return [{name: _join(own) for name, own in each.items()} for each in results]
+    return [{name: _join(pieces) for name, pieces in each.items()} for each in results]
 
 
 def _split(frames: Sequence[VerificationFrame]) -> list[Sequence[VerificationFrame]]:
@@ -209,4 +209,4 @@ def _join(parts: Sequence[ConditionResults]) -> ConditionResults:
 
 
 def _nothing() -> None:
-    """Begin a worker."""
+    """Initialise a worker process."""

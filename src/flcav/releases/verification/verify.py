@@ -62,7 +62,7 @@ ODD, BY = "urban", ("junction", "visibility")
 def describe_domain(
     frames: Sequence[VerificationFrame], truths: Sequence[FrameTruth], classes: Sequence[str], odd: OddCoverage
 ) -> VerifiedDomain:
-    """Return the domain that frames cover, for a network of `classes`."""
+    """Return the domain covered by frames, for a network with `classes`."""
     opened = {folder: Dataset.open(folder, checked=False) for folder in {each.data for each in frames}}
     read = [opened[each.data].frame(each.number) for each in frames]
     weather = [frame.weather for frame in read if frame.weather is not None]
@@ -86,7 +86,7 @@ def describe_domain(
 def find_cells(
     frames: Sequence[VerificationFrame], domain: Domain, by: Sequence[str]
 ) -> tuple[tuple[str, ...], OddCoverage]:
-    """Return the cell of each frame by two attributes of a domain, and how much of the domain the frames cover.
+    """Return the frames' cells by two attributes of a domain, and the frames' coverage of the domain.
 
     Raises `InputError` for an attribute without buckets, and where nothing measures what the domain tests.
     """
@@ -121,9 +121,9 @@ def _span(values: Sequence[float]) -> tuple[float, float] | None:
     return (round(min(values), 3), round(max(values), 3)) if len(values) else None
 
 
-MARGIN, MOST_MARGIN = 0.05, 0.5  # AP50
-LEAST_SEEN = 3  # detections of the driving network in a frame where the candidate finds something, too
-GUARD_REDRAWS = 200  # of the scenes, of each slice
+MARGIN, MOST_MARGIN = 0.05, 0.5  # of AP50
+LEAST_SEEN = 3  # detections of the driving network in a frame from which on the candidate must detect something
+GUARD_REDRAWS = 200  # bootstrap samples per guard
 Results = Mapping[str, ConditionResults]  # by condition
 
 
@@ -140,19 +140,19 @@ def verify(
     known: Results | None = None,
     progress: Report = ignore_progress,
 ) -> CandidateVerification:
-    """Return the verification of a candidate beside the network that drives.
+    """Return the verification of a candidate against the driving network.
 
     Args:
         folder: the candidate.
-        driving: weights of the network that drives.
-        data: datasets of scenes that no network was trained on.
-        margin: by which AP50 may be lower on the whole.
-        most: frames of each dataset at most; None: all.
-        odd: operational design domain, by name or as an OpenODD file, whose coverage is told.
-        by: two attributes of it: a cell is a bucket of each, and a slice.
+        driving: weights of the driving network.
+        data: datasets with scenes on which no network was trained.
+        margin: largest acceptable loss of AP50 over all frames.
+        most: limit of frames per dataset; None: all.
+        odd: operational design domain, by name or as an OpenODD file, whose coverage is reported.
+        by: two of its attributes: pairs of their buckets are cells, which are slices.
         jobs: worker processes.
         known: results of the driving network on the same frames, from an earlier verification.
-        progress: callback for the tests done and in total.
+        progress: callback with the tests done and in total.
 
     Raises:
         InputError: for no candidate, another task than objects, no frames, and datasets that do not fit.
@@ -160,7 +160,8 @@ def verify(
     candidate = read_candidate(folder)
     if candidate.task != OBJECTS.name:
         raise InputError(f"{folder}: a network of '{candidate.task}', and those of '{OBJECTS.name}' are verified")
-    network, allowed = load_network(OBJECTS, driving), read_domain(odd)
+    network = load_network(OBJECTS, driving)
+    allowed = read_domain(odd)
     frames = choose_test_frames(data, network, most)
     if not frames:
         raise InputError(f"no frame to verify with in {', '.join(map(str, data))}")
@@ -170,8 +171,8 @@ def verify(
     faults = list(find_faults(folder, candidate, driving, tested))
     if faults:
         return decide_on_candidate(candidate, None, None, tested, None, margin, faults)
-    own = [] if known is not None else [driving]
-    results = run_tests([*own, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
+    missing = [] if known is not None else [driving]
+    results = run_tests([*missing, folder / WEIGHTS], frames, jobs=jobs, progress=progress)
     old, new = known if known is not None else results[0], results[-1]
     if not any(len(truth.targets) for truth in new[PLAIN].truths):
         raise InputError(f"no object to be found in {', '.join(map(str, data))}")
@@ -188,7 +189,7 @@ def decide_on_candidate(
     margin: float = MARGIN,
     faults: Sequence[str] = (),
 ) -> CandidateVerification:
-    """Return the decision on a candidate by the results of both networks, or by the faults of its files alone."""
+    """Return the decision on a candidate by the results of both networks, or by the faults of its files."""
     frames, scenes = sum(each.frames for each in data), sum(each.scenes for each in data)
     reasons, open_reasons, wanted = list(faults), [], 0
     whole: Comparison | None = None
@@ -246,7 +247,7 @@ def write_verification(folder: Path, verification: CandidateVerification) -> Non
 def read_verification(folder: Path) -> CandidateVerification:
     """Return the verification in a candidate's folder.
 
-    Raises `InputError` for none, one of other weights, and one whose acceptance its own numbers contradict.
+    Raises `InputError` if there is none, it is of other weights, or its numbers contradict its acceptance.
     """
     path = folder / VERIFICATION
     if not path.is_file():
@@ -263,7 +264,8 @@ def read_verification(folder: Path) -> CandidateVerification:
 
 
 def _supports_acceptance(found: CandidateVerification) -> bool:
-    """Return whether the numbers of a verification allow that the candidate is accepted."""
+    """Return whether the numbers of a verification allow its acceptance."""
+    # the file only claims acceptance, so its numbers are judged again
     whole = found.whole
     if whole is None or found.reasons or found.undecided or found.kept_share != KEPT:
         return False
@@ -292,17 +294,17 @@ def _guard(old: MeasuredNetwork, new: MeasuredNetwork, driving: Results, candida
             both = measure_results(driving[name]), measure_results(candidate[name])
             pairs += [pair_whole(*both, "condition", name), *pair_classes(*both, name)]
     pairs = [pair for pair in pairs if pair.targets >= LEAST_TARGETS]
-    drawn = {len(pair.scene): pair.scene for pair in pairs}  # conditions share their frames, which are fewer
+    drawn = {len(pair.scene): pair.scene for pair in pairs}  # conditions share a smaller set of frames
     times = {frames: draw_scenes(scene, GUARD_REDRAWS) for frames, scene in drawn.items()}
     found = [compare_pair(pair, times[len(pair.scene)], len(pairs))[0] for pair in pairs]
     return [each for each in found if np.isfinite([each.driving, each.candidate]).all()]
 
 
 def _find_broken(driving: ConditionResults, candidate: ConditionResults, condition: str) -> list[str]:
-    """Return a reason for boxes that are no numbers, and for classes and frames in which nothing is found any more.
+    """Return reasons to refuse boxes with NaN, and classes and frames in which nothing is detected any more.
 
-    A class counts where the driving network finds it, rightly or wrongly, and a frame where it finds some at the score
-    of use; the candidate's detections count from the lowest score on.
+    A class counts if the driving network detects it, rightly or wrongly, and a frame if it detects enough at the score
+    threshold in use; all detections of the candidate count, whatever their score.
     """
     where = "" if condition == PLAIN else f" ({condition})"
     reasons = []
@@ -331,12 +333,12 @@ def _is_finite(boxes: Boxes) -> bool:
 
 
 def _frames(effect: float, error: float, frames: int, scenes: int) -> int:
-    """Return the number of frames by which an effect is significant at `LEVEL`; 0 where no number is enough."""
+    """Return the number of frames with which an effect is significant at `LEVEL`; 0 if no number is enough."""
     enough = plan_scenes(effect, error, scenes, LEVEL)
     return 0 if enough is None else int(np.ceil(enough * frames / scenes))
 
 
 def _describe(path: Path, frames: Sequence[VerificationFrame]) -> VerificationData:
-    own = [each for each in frames if each.data == path]
+    selected = [each for each in frames if each.data == path]
     data = Dataset.open(path, checked=False)
-    return describe_data(data, len(own), len({data.keys[each.number].scene for each in own}))
+    return describe_data(data, len(selected), len({data.keys[each.number].scene for each in selected}))

@@ -215,7 +215,7 @@ def make_edited_error(
     after = []
     for step in steps:
         if step.name in edited:
-            differences = describe_differences(*edited[step.name])
+            differences = describe_changes(*edited[step.name])
             if not differences and any(name in edited for name in step.needs):
                 after.append(step.name)
             else:
@@ -237,7 +237,7 @@ def asks_the_same(held: StepRecord, wanted: Mapping[str, Json]) -> bool:
     return held.asked is not None and told[0] == told[1]
 
 
-def describe_differences(held: StepRecord, wanted: StepRecord) -> list[str]:
+def describe_changes(held: StepRecord, wanted: StepRecord) -> list[str]:
     """Return the arguments of a step that are not as they were, in words; none where they were not recorded."""
     if held.asked is None or wanted.asked is None:
         return []

@@ -34,6 +34,7 @@ from flcav.runs.poles import find_sites
 from flcav.runs.registry import LABELLERS, LOSSES, load_all
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.training import LabelQuality, Pretrained
+from flcav.runs.stages.rounds import RegionStart
 from flcav.runs.stages.settings import FederationSettings, RegionInputs
 from flcav.runs.training.learning import Learning, load_stage_network
 
@@ -171,21 +172,21 @@ def drive_region(
     settings: FederationSettings,
     learning: Learning,
     inputs: RegionInputs,
-    clients: Sequence[str],
-    earlier: int,
+    start: RegionStart,
     rules: Rules,
     seeds: Sequence[int],
 ) -> DrivenRounds:
     """Return what the radio network makes of a region's rounds by `rules`, and write their clock.
 
-    `seeds` are those of the rounds, which follow `earlier` ones. Without a network no client is lost.
+    `start` names the vehicles and counts the rounds before these; `seeds` are those of these rounds. Without a network
+    no client is lost.
     """
     network = settings.federation.network
     if network is None:
         return DrivenRounds(rules, {}, ())
-    fleet = open_region_fleet(settings, learning, inputs.region, clients)
-    scenes = link_stage_scenes(work, inputs, network, earlier + len(seeds), learning.seed)
-    driven = drive_rounds(fleet, scenes, network, rules, seeds, earlier)
+    fleet = open_region_fleet(settings, learning, inputs.region, [*start.clients])
+    scenes = link_stage_scenes(work, inputs, network, start.earlier + len(seeds), learning.seed)
+    driven = drive_rounds(fleet, scenes, network, rules, seeds, start.earlier)
     save_clock(driven, work, inputs.region)
     return driven
 

@@ -72,7 +72,7 @@ def list_rounds(run: Run) -> Iterator[tuple[str, StageResult, FederatedRound]]:
                 yield arm, stage, record
 
 
-def tabulate_rounds(run: Run) -> pa.Table:
+def tabulate_federated_rounds(run: Run) -> pa.Table:
     """Return a table with a row per arm, stage, task, server and round."""
     rows = [
         {
@@ -87,12 +87,12 @@ def tabulate_rounds(run: Run) -> pa.Table:
     return pa.Table.from_pylist(rows, schema=SCHEMA)
 
 
-def save_rounds(run: Run, out: Path) -> None:
-    """Write `tabulate_rounds` to `out`/rounds.parquet, and the curves of every federation to `out`/events.
+def write_rounds(run: Run, out: Path) -> None:
+    """Write `tabulate_federated_rounds` to `out`/rounds.parquet, and the curves of every federation to `out`/events.
 
     There is a folder of TensorBoard's event files for each arm, stage, task and server.
     """
-    write_any_table(tabulate_rounds(run), out / ROUNDS)
+    write_any_table(tabulate_federated_rounds(run), out / ROUNDS)
     shutil.rmtree(out / EVENTS, ignore_errors=True)
     curves: dict[str, list[FederatedRound]] = {}
     for arm, stage, record in list_rounds(run):

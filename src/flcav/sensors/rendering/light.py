@@ -236,14 +236,14 @@ def compute_ambient_occlusion(scene: Scene, seen: GBuffer, lens: Lens, hidden: i
     )  # rays of one direction are consecutive, which is faster
     origin, towards = np.empty((*blocks, 3), np.float32), np.empty((*blocks, 3), np.float32)
     far = np.full(blocks, -1, np.float32)
-    _hemisphere(seen, lens.width, columns, rows, _ways(), origin, towards, far)
+    _hemisphere(seen, lens.width, rows, _ways(), origin, towards, far)
     starts, aims = origin.reshape(-1, 3), towards.reshape(-1, 3)
     blocked = scene.find_occluded(starts, aims, far.ravel(), hidden=hidden, threads=threads)
     around = blocked.reshape(blocks).transpose(2, 0, 3, 1).reshape(blocks[2] * SPAN, -1)[:rows, :columns]
     around, out = np.ascontiguousarray(around).view(np.uint8), np.empty(len(seen), np.float32)
 
     def spread(first: int, last: int) -> None:
-        _spread(seen, around, lens.width, lens.height, columns, first, last, out)
+        _spread(seen, around, lens.width, lens.height, first, last, out)
 
     share_among_threads(spread, rows, threads)
     return out
@@ -262,7 +262,8 @@ def _ways() -> Array32:
 
 
 @compiled
-def _hemisphere(seen, width, columns, rows, ways, origin, towards, far):
+def _hemisphere(seen, width, rows, ways, origin, towards, far):
+    columns = (width + 1) // 2
     for row in range(rows):
         for column in range(columns):
             pixel = 2 * row * width + 2 * column
@@ -280,10 +281,11 @@ def _hemisphere(seen, width, columns, rows, ways, origin, towards, far):
 
 
 @compiled
-def _spread(seen, blocked, width, height, columns, first, last, out):
+def _spread(seen, blocked, width, height, first, last, out):
     """Write the ambient occlusion of the blocks in rows `first` to `last`: 1 where no ray nearby is blocked."""
     # A sliding window of column sums finds the many blocks without a blocked ray in their neighbourhood.
     half = SPAN // 2
+    columns = blocked.shape[1]
     along = np.zeros(columns, np.int64)  # blocked rays in the neighbourhood's rows, by column
     for row in range(max(first - half, 0), min(first + half - 1, len(blocked))):
         for column in range(columns):

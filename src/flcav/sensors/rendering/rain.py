@@ -57,11 +57,12 @@ def smear(image, weight, width, height, out):
 
 
 @compiled
-def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, width, height):
+def add_mirrored(radiance, seen, appearance, mirrored, wetness, extinction, width):
     """Add the reflections `mirrored` (H / 2, W / 2, 3) to road pixels, by Fresnel reflectance and puddles.
 
     `radiance` is (H * W, 3), `extinction` in [1/m], `wetness` 0 to 1.
     """
+    height = len(radiance) // width
     for pixel in range(len(radiance)):
         row = seen.row[pixel]
         if row < 0 or seen.instance[pixel] != 0 or appearance.material[row] != ROAD:

@@ -190,9 +190,7 @@ def _mirror(
     smeared = np.zeros_like(image)
     rain.smear(image, weight, width, height, smeared)
     light = world.light
-    rain.add_mirrored(
-        radiance, seen, world.appearance, smeared, light.wetness, light.extinction, lens.width, lens.height
-    )
+    rain.add_mirrored(radiance, seen, world.appearance, smeared, light.wetness, light.extinction, lens.width)
 
 
 LEAF = int(Material.LEAF)
@@ -245,7 +243,6 @@ def mark_thin(kind: Bytes, town: Town, world_from_camera: Array, lens: Lens, see
         near[kept][small],
         seen.distance,
         lens.width,
-        lens.height,
         kind,
     )
 
@@ -291,7 +288,8 @@ def _edges(seen, radiance, dark, material, width, first, last, out):
 
 
 @compiled
-def _draw_bars(start, end, half, near, distance, width, height, kind):
+def _draw_bars(start, end, half, near, distance, width, kind):
+    height = len(kind) // width
     for bar in range(len(half)):
         along_x, along_y = end[bar, 0] - start[bar, 0], end[bar, 1] - start[bar, 1]
         steps = int(max(abs(along_x), abs(along_y))) + 1
@@ -317,7 +315,7 @@ def further_rays(rays: Array32, kind: Bytes, lens: Lens) -> tuple[Array32, Ints3
     flagged = kind[kind > 0]
     total = int(np.bincount(flagged, minlength=4) @ (0, len(_THREE), len(_NINE), len(_NINE)))
     directions, pixel = np.empty((total, 3), np.float32), np.empty(total, np.int32)
-    _spread(rays, kind, lens.width, lens.height, _THREE, _NINE, directions, pixel)
+    _spread(rays, kind, lens.width, directions, pixel)
     return directions, pixel
 
 
@@ -360,12 +358,12 @@ def average_samples(radiance, further, pixel, ceiling):
 
 
 @compiled
-def _spread(rays, kind, width, height, three, nine, directions, pixel):
+def _spread(rays, kind, width, directions, pixel):
     sample = 0
     for centre in range(len(kind)):
         if kind[centre] == 0:
             continue
-        offsets = nine if kind[centre] & THIN else three
+        offsets = _NINE if kind[centre] & THIN else _THREE
         right = centre + 1 if centre % width + 1 < width else centre - 1
         below = centre + width if centre + width < len(kind) else centre - width
         sign_x, sign_y = np.float32(right - centre), np.float32(1 if below > centre else -1)

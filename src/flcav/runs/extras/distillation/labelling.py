@@ -29,7 +29,7 @@ from flcav.fusion.pose_graph import posts_of
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
-from flcav.network.ledger import Direction, Ledger, send_message
+from flcav.network.ledger import Direction, send_message
 from flcav.perception.objects.distillation import DistillationTerms, DistilledObjects
 from flcav.perception.objects.model import SecondConfig, second
 from flcav.perception.objects.samples import Sample
@@ -37,11 +37,10 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.weights import from_arrays
 from flcav.runs.engine import Work
-from flcav.runs.frames import SLACK_S, Frames, list_window
+from flcav.runs.frames import SLACK_S, list_window
 from flcav.runs.labels.pseudo_labels import Spin, road_views
 from flcav.runs.labels.quality import LABELS, measure_labels, read_label_history
 from flcav.runs.labels.sightings import make_sighting
-from flcav.runs.recipe import EDGE
 from flcav.runs.results.training import LabelHistory, LabelQuality
 from flcav.runs.stages.regions import Labelling, RenewedSamples
 from flcav.runs.stages.settings import FederationSettings
@@ -58,33 +57,28 @@ class RoadAverageLabels(RenewedSamples):
         self,
         how: Distillation,
         poses: PoseSource,
-        config: SecondConfig,
-        threshold: float,
-        split: Frames,
-        frames: Sequence[int],
-        poles: Sequence[int],
-        region: str,
-        book: Ledger,
-        stage: str = EDGE,
+        about: Labelling,
         folder: Path | None = None,
         report: Report = ignore_progress,
     ) -> None:
-        """Hold the vehicles' `frames` of a split, to be labelled with the sensors on `poles`.
+        """Hold the vehicles' frames, to be labelled with the sensors on the poles; `about` names both.
 
-        poses: of the vehicles' navigation. threshold: lowest score of a label that vehicles alone tell of. book: holds
-        the messages, under `stage`. folder: where the quality of the labels is kept, `read_label_history`; None:
-        nowhere.
+        poses: of the vehicles' navigation. folder: where the quality of the labels is kept, `read_label_history`; None:
+        nowhere. The threshold of `about` holds for labels that only vehicles contribute to.
         """
-        self._how, self._config, self._threshold = how, config, threshold
+        split, frames = about.split, about.frames
+        config: SecondConfig = about.config
+        self._how, self._config, self._threshold = how, config, about.threshold
         self._poses: PoseSource = poses
-        self._split, self._region = split, region
-        self._frames, self._book, self._stage, self._folder, self._report = frames, book, stage, folder, report
+        self._split, self._region = split, about.inputs.region
+        self._frames, self._book, self._stage = frames, about.book, about.stage
+        self._folder, self._report = folder, report
         self._told = list_window(split, frames, how.window_s)
-        seen = [i for pole in poles for i in split.poles.get(pole, ())]
+        seen = [i for pole in about.poles for i in split.poles.get(pole, ())]
         self._time_s = {self._spin(i): split.data.keys[i].time_s for i in (*seen, *self._told)}
         self._around = {spin: self._find_around(spin) for spin in dict.fromkeys(map(self._spin, frames))}
         spins = {spin for around in self._around.values() for spin in around}
-        self._views = road_views(split, poles, True, spins)
+        self._views = road_views(split, about.poles, True, spins)
         self._seen_by = {i: self._list_views(self._spin(i)) for i in frames}  # as each frame's vehicle has them
         town = split.data.town() if how.pose_graph or how.map_context else None
         self._posts = None
@@ -189,20 +183,7 @@ def label_by_average(work: Work, settings: FederationSettings, about: Labelling)
     how, first = settings.distillation, about.inputs.edge is None
     if how is None:
         return None
-    found = RoadAverageLabels(
-        how,
-        settings.navigation,
-        about.config,
-        about.threshold,
-        about.split,
-        about.frames,
-        about.poles,
-        about.inputs.region,
-        about.book,
-        about.stage,
-        work.folder if first else None,
-        work.report,
-    )
+    found = RoadAverageLabels(how, settings.navigation, about, work.folder if first else None, work.report)
     if first:
         found.send_views()
     return found

@@ -5,17 +5,17 @@ from flcav.federation.strategies import Strategy
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import needs_known_number
-from flcav.runs.arms import Calls, Setting, plans_joiners
+from flcav.runs.arms import CalledNumbers, Setting, plans_joiners
 from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.recipe import Federation, RunRecipe
 
 
-def count_called(recipe: RunRecipe, how: Federation) -> Calls | None:
+def count_called(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:
     """Return what a plan chooses the vehicles of a group on request from; None for a fixed roster."""
     if how.requests is None:
         return None
     most = how.requests.most or max(map(recipe.vehicles, recipe.with_role("federate")))
-    return Calls(1, most, how.requests.overlap)
+    return CalledNumbers(1, most, how.requests.overlap)
 
 
 def check_groups(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:

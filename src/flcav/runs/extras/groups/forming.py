@@ -51,7 +51,7 @@ from flcav.runs.extras.groups.members import (
     Unreadable,
     answer_requests,
     hold_back,
-    read_request,
+    read_position,
     take_requests,
 )
 from flcav.runs.extras.groups.roadside import label_roadside
@@ -210,14 +210,14 @@ def call_group(
             uplink.enter(name, *(message.encode() for message in taken.messages[name]))
             positions[name] = np.array([own.x, own.y, positions[name][2] if name in positions else 0.0])
         asking = [name for name in vehicles if name in asked and name in positions and name not in before]
-        positions |= uplink.hear(REQUEST, asking, read_request, {SCENE: np.array([scene])})
+        positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
         present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
         if not present:
             return Called(Group(limit, vehicles, "nobody", stayed=uplink.silent), {}, GroupWatch(how, {}), task, book)
         placed = Placed.load(work.inputs[inputs.place])
         lead = find_lead(positions, present, find_servers(split, placed, inputs), how.range_m)
         near = find_in_range(positions, present, how.range_m)
-        linked = find_linked(settings, learning, split, placed, scene, inputs.region, near, how.link_s)
+        linked = find_linked(settings, learning, split, placed, scene, near, how.link_s)
         offers = uplink.hear(OFFER, linked, Offer.read)
     stayed = {name: ABSENT for name in vehicles if name not in positions}
     stayed |= {name: SERVER_RANGE for name in positions if name not in near}
@@ -341,7 +341,6 @@ def find_linked(
     split: Frames,
     placed: Placed,
     scene: int,
-    region: str,
     clients: Sequence[str],
     most_s: float,
 ) -> list[str]:
@@ -352,4 +351,4 @@ def find_linked(
     links = link_scenes(split, placed, network, EVERY_SCENE, learning.seed)[scene]
     bits = 8 * update_bytes(to_arrays(learning.build_network()), settings.federation.upload)
     rates = dict(zip(links.vehicle, links.rate_bps[0].max(axis=1).tolist(), strict=True))
-    return [name for name in clients if bits <= most_s * rates.get(name.removeprefix(f"{region}/"), 0.0)]
+    return [name for name in clients if bits <= most_s * rates.get(name.partition("/")[2], 0.0)]

@@ -74,7 +74,7 @@ class Offer:
         return cls(samples, labels, sketch)
 
 
-def read_request(message: bytes) -> Array:
+def read_position(message: bytes) -> Array:
     """Return the position (3,) [m] in a request; raises `Unreadable`."""
     return _read(message, position=(3,))["position"].astype(np.float64)
 
