@@ -26,8 +26,8 @@ VEHICLES = tuple(SEMANTICS[name] for name in ("rider", "car", "truck", "bus", "m
 PEOPLE = (SEMANTICS["pedestrian"],)
 
 
-class LidarSweep(NamedTuple):
-    """The sweep of a LiDAR, and what the semantic one beside it met."""
+class LabelledSweep(NamedTuple):
+    """The sweep of a LiDAR, and that of the semantic LiDAR with the same pose."""
 
     lidar: Lidar
     world_from_sensor: Array  # (4, 4) [m]
