@@ -11,9 +11,9 @@ from flcav.optimization.placement.instance import TIE, CoverageInstance, as_floa
 
 NODES = 2000  # of the search tree at most, where a limit is asked for
 CUTS = 20  # times that a choice beyond a limit, within HiGHS' tolerances, is excluded and the program solved again
-LARGEST = 1e6  # sum to which weights or costs are scaled, so that tolerances of 1e-6 are small beside it
+LARGEST = 1e6  # sum to which weights or costs are scaled, so that tolerances of 1e-6 are small relative to it
 SMALLEST = 1e-7  # of scaled weights and costs that are not 0
-COARSE = 100_000  # times their common unit up to which sums are told from each other by HiGHS
+COARSE = 100_000  # times their common unit up to which HiGHS can distinguish sums
 
 
 def bound_by_highs(instance: CoverageInstance, budget: float) -> tuple[float, Array]:

@@ -68,7 +68,7 @@ class Placement:
     covered: int  # errors within range of a chosen pole
     covered_weight: float
     upper_bound: float  # proven: no choice of as many poles, or within the budget, covers more weight
-    optimal: bool  # whether `covered_weight` equals the bound; of `cover_share`, `cost` its own bound
+    optimal: bool  # whether `covered_weight` equals the bound; for `cover_share`, whether `cost` equals its bound
     sensors: tuple[int, ...] = ()  # index into the sensors of each chosen pole
     cost: float = 0.0  # of the chosen
     marginal_gain: tuple[float, ...] = ()  # weight that each of the chosen alone covers: lost if it were left out
@@ -213,7 +213,7 @@ class Found:
 
     chosen: list[int]  # ascending
     bound: float  # proven: no choice covers more weight, or costs less
-    root: Relaxation  # whose dual proves a bound of its own
+    root: Relaxation  # the relaxation whose dual proves a bound
     search: float | None = None  # bound that a search states above it; None: none was made
 
 

@@ -31,7 +31,7 @@ class EffectiveTasks:
     gain: Array  # (E, 1) weight * a
     b: Array  # (E, 1)
     alpha: Array  # (E, 1)
-    own: Array  # (E, 1) worth of the samples held in a task's own region
+    own: Array  # (E, 1) worth of the samples held in a task's region
     others: Array  # (E, 1) worth of the samples held in the other regions
     drift: Array  # (E, 1) weight * drift
     k: int  # edge rounds per cloud round

@@ -58,7 +58,7 @@ class PowerTerm:
 class EffectiveTerm:
     """The inverse power gain * n^(-b) of effective samples n; its cuts are tangents.
 
-    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), of s = x[first] samples, z = x[first + 2] cloud
+    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), for s = x[first] samples, z = x[first + 2] cloud
     rounds and t = x[first + 1] + k z rounds.
     """
 
@@ -66,7 +66,7 @@ class EffectiveTerm:
     gain: float  # weight * a
     b: float
     alpha: float
-    own: float  # worth of the samples held in the own region
+    own: float  # worth of the samples held in the task's region
     others: float  # worth of the samples held in the other regions
     k: int  # edge rounds per cloud round
 
