@@ -147,8 +147,8 @@ def fit(
     points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
 
     Args:
-    history: accuracies at samples, edge rounds and cloud rounds, or the CSV file that holds them.
-    model: `Additive`, `Effective`, `Federated`, or the best one; the arguments below apply to the latter ones.
+        history: accuracies at samples, edge rounds and cloud rounds, or the CSV file that holds them.
+        model: `Additive`, `Effective`, `Federated`, or the best one; the arguments below apply to the latter ones.
         group_samples: number of samples that the vehicles hold, of all regions, or of each.
         k: number of edge rounds per cloud round.
         alpha: worth of an uploaded sample.
