@@ -1,7 +1,7 @@
 """Tracks of a traffic trace, interpolated at the task's instants and transformed into the frame of a pose.
 
 Interpolation is by cubic Hermite curves with Catmull-Rom tangents. What a network may know of the present is
-extrapolated, since a trace smooths over later states.
+extrapolated, since a trace's states are smoothed over later ones.
 """
 
 from typing import NamedTuple
@@ -37,11 +37,12 @@ def check_instants(trace: Trace, origin: str) -> None:
 
 
 def tracks_around(trace: Trace, time_s: float) -> Tracks:
-    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` depend on nothing that happens after it.
+    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` [s] depend on nothing that happens after it.
 
-    A trace's states are averages that include states up to `REACH_S` later. So points up to `time_s` are made of the
-    instants up to `REACH_S` before it: interpolated between these, and extrapolated from the last. An actor is present
-    at an extrapolated point if it is at the last instant up to that point. Points after `time_s` are the trace's.
+    A trace's states are averages that include states up to `REACH_S` later. Points up to `time_s` are therefore
+    computed from the instants up to `REACH_S` before it: interpolated between these, and extrapolated from the last
+    one. An actor is present at an extrapolated point if it is at the last instant up to that point. Points after
+    `time_s` are the trace's.
     """
     times_s = np.round(time_s + OFFSETS_S, 6)
     known = int(np.searchsorted(trace.time_s, time_s - REACH_S + 1e-6, side="right"))
@@ -56,7 +57,7 @@ def tracks_around(trace: Trace, time_s: float) -> Tracks:
 
 
 def _rebuilt(trace: Trace, times_s: Array, instant: int) -> Tracks:
-    """Return the tracks extrapolated from an instant to `times_s` (S,), of the actors that are present then."""
+    """Return the tracks, extrapolated from an instant to `times_s` (S,) [s], of the actors that are then present."""
     there = trace.present[np.searchsorted(trace.time_s, times_s + 1e-6, side="right") - 1]
     position, yaw, speed = extrapolate(trace, instant, times_s - trace.time_s[instant])
     return Tracks(
