@@ -139,7 +139,8 @@ def check_points(frame: Frame, trace: Trace | None = None, *, imported: bool = F
         return
     motions = _motions(frame, trace) if trace is not None and frame.point_times else {}
     everything, times_s = _in_world(frame, motions.get(frame.agent))
-    boxes, returns = frame.annotations.boxes, frame.annotations.returns
+    boxes = frame.annotations.boxes
+    returns = frame.annotations.returns
     if not (np.abs(boxes.array()) <= FARTHEST).all():
         return
     away = np.linalg.norm(boxes.center - frame.world_from_agent[:3, 3], axis=1)
@@ -270,7 +271,8 @@ def _fit(image: CameraImage) -> bool:
 
 def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[str]:
     """Check that the pixel counts and visible boxes of actors agree with the instance image."""
-    truth, views = frame.annotations, frame.annotations.views[name]
+    truth = frame.annotations
+    views = frame.annotations.views[name]
     assert image.instance is not None
     regions = find_actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
     for i in np.flatnonzero(views.pixels != regions.pixels[: len(truth)]):
@@ -284,7 +286,8 @@ def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[st
 
 def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) -> Iterator[str]:
     """Check that each actor's pixels lie in its 3D box when back-projected by their depth, and in its amodal box."""
-    truth, views = frame.annotations, frame.annotations.views[name]
+    truth = frame.annotations
+    views = frame.annotations.views[name]
     assert image.instance is not None
     assert image.depth_m is not None
     boxes = _boxes_at(frame, frame.calibration.offset_ms.get(name, 0.0) / 1e3)

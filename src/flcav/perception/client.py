@@ -108,7 +108,8 @@ def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Json]:
 
     `width` and `height` are in pixels, `fov_deg` is the horizontal field of view.
     """
-    mount, settings = {"x": 0.5, "z": 1.5}, {"width": width, "height": height, "fov_deg": fov_deg}
+    mount = {"x": 0.5, "z": 1.5}
+    settings = {"width": width, "height": height, "fov_deg": fov_deg}
     return {"cameras": {"camera": {"mount": mount, "settings": settings}}}
 
 
@@ -190,7 +191,8 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         correction = None
         if proximal or shift is not None:
             correction = GradientCorrection(weights if centre is None else centre, proximal, shift)
-        names, adamw = [name for name, _ in network.named_parameters()], AdamW(network, learning_rate)
+        names = [name for name, _ in network.named_parameters()]
+        adamw = AdamW(network, learning_rate)
         if optimiser:
             adamw.restore_arrays(optimiser, names)
         loss = train_steps(

@@ -182,7 +182,8 @@ def view_beside(points: Path) -> CameraView | None:
     """
     folder = points.absolute().parent.parent
     name = points.stem
-    picture, calibration = folder / "image_2" / f"{name}.png", folder / "calib" / f"{name}.txt"
+    picture = folder / "image_2" / f"{name}.png"
+    calibration = folder / "calib" / f"{name}.txt"
     if not (picture.is_file() and calibration.is_file()):
         return None
     return kitti_view(read_picture(picture), read_calibration(calibration))

@@ -165,7 +165,8 @@ def _match_arrays(
             elif detection[d] == COUNTS and (best < 0 or spare or overlap[d, g] > most):
                 best, most, spare = d, overlap[d, g], False
             elif detection[d] == IGNORED and best < 0:
-                best, spare = d, True
+                best = d
+                spare = True
         if best < 0:
             continue
         taken[best] = True

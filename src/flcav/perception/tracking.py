@@ -182,7 +182,8 @@ class Tracker:
             tracks = [track for track in self._tracks if track.label == label]
             same = np.flatnonzero(detections.label == label)
             for t, d in associate_detections([track.state for track in tracks], rows[same], variance[same], after_s):
-                track, number = tracks[t], same[d]
+                track = tracks[t]
+                number = same[d]
                 state = update_state(track.state, rows[number], variance[number])
                 track.state, track.ahead_m = head_with_motion(state, track.ahead_m, time_s - track.seen_s)
                 track.seen_s = time_s
@@ -336,7 +337,8 @@ def _moment(
     rows = rows[in_range(tracked.boxes[rows].transform(sensor_from_world), config)]
     boxes: Boxes = tracked.boxes[rows]
     objects = np.flatnonzero(wanted)
-    places, found = annotations.boxes.center[objects, :2], boxes.center[:, :2]
+    places = annotations.boxes.center[objects, :2]
+    found = boxes.center[:, :2]
     moment = TrackingFrame(
         objects=annotations.track[objects],
         places=places,

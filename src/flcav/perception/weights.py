@@ -144,7 +144,8 @@ def find_recorded_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None
     known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
     try:
         settings = next(iter(known["lidars"].values()))["settings"]
-        beams, range_m = settings["channels"], settings.get("range_m")
+        beams = settings["channels"]
+        range_m = settings.get("range_m")
     except (TypeError, KeyError, AttributeError, StopIteration):
         beams, range_m = recipe.get("beams"), recipe.get("range_m")
     span = (beams, beams) if isinstance(beams, int) else None

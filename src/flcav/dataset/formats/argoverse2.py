@@ -264,7 +264,8 @@ def _read_mounts(folder: Path) -> dict[str, Array]:
 
 def _read_lenses(folder: Path) -> dict[str, Lens]:
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
-    path, lenses = folder / "calibration" / "intrinsics.feather", {}
+    path = folder / "calibration" / "intrinsics.feather"
+    lenses = {}
     table = _read_feather(path, ("sensor_name", *names), key="sensor_name")
     for row in table.to_pylist():
         matrix = np.array([[row["fx_px"], 0, row["cx_px"]], [0, row["fy_px"], row["cy_px"]], [0, 0, 1.0]])
@@ -275,7 +276,8 @@ def _read_lenses(folder: Path) -> dict[str, Lens]:
 
 def _read_labels(folder: Path, poses: Poses) -> LogLabels:
     """Return all annotations of a log, also those of missing sweeps, from which velocities are differenced."""
-    path, sides = folder / "annotations.feather", ("length_m", "width_m", "height_m")
+    path = folder / "annotations.feather"
+    sides = ("length_m", "width_m", "height_m")
     table = _read_feather(path, ("timestamp_ns", "track_uuid", "category", *sides, *PLACED))
     size = np.column_stack([table[name].to_numpy() for name in sides])
     check_sizes(size, path)

@@ -98,7 +98,8 @@ def read_labels(path: Path) -> ActorLabels:
 
 def _decode_label(label: PickledRecord) -> tuple[str, str, Array, Array, Array]:
     """Return track, category, `world_from_actor`, `world_from_box` and size of a label."""
-    number, kind = label.state["carla_id"], label.state["label_type"]
+    number = label.state["carla_id"]
+    kind = label.state["label_type"]
     if not isinstance(number, int) or not isinstance(kind, str) or kind not in CATEGORIES:
         raise ValueError("a label without the number of an actor, or that is neither vehicle nor pedestrian")
     actor, box = (_find_record(label, *path) for path in (("transform", "transform"), ("bounding_box", "box")))

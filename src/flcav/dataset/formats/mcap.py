@@ -60,7 +60,8 @@ IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^
 
 def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
     """Return the 3D boxes of a frame, world frame, which replace earlier ones; boxes without returns are fainter."""
-    truth, boxes = frame.annotations, frame.annotations.boxes
+    truth = frame.annotations
+    boxes = frame.annotations.boxes
     entities = []
     for i, label in enumerate(boxes.label.tolist()):
         cube = CubePrimitive(
@@ -164,7 +165,8 @@ class Logged(NamedTuple):
 
 def make_messages(frame: Frame) -> Iterator[Logged]:
     """Yield the messages of a whole frame: transforms, measurements of all sensors, weather, annotations."""
-    true, spin_s = frame.calibration, frame.time_s
+    true = frame.calibration
+    spin_s = frame.time_s
 
     def looks_s(sensor: str) -> float:
         return spin_s + true.offset_ms.get(sensor, 0.0) / 1000
@@ -178,7 +180,8 @@ def make_messages(frame: Frame) -> Iterator[Logged]:
         moved = _transforms([("world", frame.agent, world_from_agent)], looks_s(name))
         yield Logged("tf", moved, looks_s(name))
     for name, points in frame.lidar.items():
-        cloud, fields = points, LIDAR_FIELDS
+        cloud = points
+        fields = LIDAR_FIELDS
         if name in frame.point_times:
             cloud, fields = np.column_stack((points, frame.point_times[name])), (*LIDAR_FIELDS, TIME_FIELD)
         yield Logged(f"{name}/points", _cloud(cloud, fields, place(name)), looks_s(name))

@@ -145,7 +145,8 @@ class DairSource(RoadsideSource):
         track, category, numbers, occlusion = [], [], [], []
         try:
             for number, row in enumerate(rows):
-                size, place = row["3d_dimensions"], row["3d_location"]
+                size = row["3d_dimensions"]
+                place = row["3d_location"]
                 values = [place[axis] for axis in "xyz"] + [size[axis] for axis in "lwh"] + [row["rotation"]]
                 numbers.append([float(value) for value in values])
                 category.append(str(row["type"]))

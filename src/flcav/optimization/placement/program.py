@@ -36,7 +36,8 @@ def maximise_coverage(
     With `limited` at most NODES nodes are searched, and the choice is None where none was found by then.
     """
     objective, rows, limits, scale = _program(instance, as_float(budget))
-    chosen, bound = None, -np.inf
+    chosen = None
+    bound = -np.inf
     for _ in range(CUTS):
         chosen, bound = _solve(instance, objective, rows, limits, limited)
         # HiGHS' tolerances may let a choice exceed the budget slightly: a cut excludes it, and it is solved again.
@@ -65,7 +66,8 @@ def minimise_cost(instance: CoverageInstance, target: int, *, limited: bool = Fa
     limits = np.r_[limits, -as_float(target) * scale]
     costs, unit = _scale(instance.cost, instance.price.tolist())
     cost = np.r_[costs, np.zeros(len(instance.weight))]
-    chosen, bound = None, -np.inf
+    chosen = None
+    bound = -np.inf
     for _ in range(CUTS):
         chosen, bound = _solve(instance, cost, rows, limits, limited)
         if chosen is None or instance.worth_of(chosen) >= target:

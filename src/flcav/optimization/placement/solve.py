@@ -391,7 +391,8 @@ def _prefer_earlier(instance: CoverageInstance, chosen: Sequence[int]) -> list[i
     for candidate in sorted(chosen):
         others = [other for other in chosen if other != candidate]
         left = np.where(reach(instance.covers, others), 0.0, instance.weight)
-        gain, taken = instance.covers @ left, {other // kinds for other in others}
+        gain = instance.covers @ left
+        taken = {other // kinds for other in others}
 
         def gain_of(index: int, left: Array = left) -> int:
             groups = instance.covered_by(index)

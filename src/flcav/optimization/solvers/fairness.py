@@ -79,7 +79,8 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
         middle = 0.5 * (unreached + bound)
         choices = choose_at_level(tasks, middle, made.budget)
         if choices.out_of_reach:
-            bound, prices = middle, choices.prices
+            bound = middle
+            prices = choices.prices
         else:
             unreached = middle
     root = bound
@@ -158,7 +159,8 @@ def _dearest_prices(joined: Array, starts: NDArray[np.intp]) -> tuple[Array, flo
         chosen = [start + int(np.argmin(priced[start:end])) for start, end in zip(starts, ends)]
         planes.append(np.r_[1.0, -joined[chosen].sum(axis=0)])
         if (total := float(priced[chosen].sum())) > most:
-            most, best = total, prices
+            most = total
+            best = prices
         model = linprog(
             np.r_[-1.0, np.zeros(budgets)],
             A_ub=np.array(planes),

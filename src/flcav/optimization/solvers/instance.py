@@ -100,7 +100,8 @@ class Instance:
 
     def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, float]:
         """Return the integers x (n,) of least Lagrangian at `multipliers` (L,), and the lower bound that they prove."""
-        problem, prices = self.separable, self.separable.prices(multipliers)
+        problem = self.separable
+        prices = self.separable.prices(multipliers)
         below = np.floor(problem.minimise_lagrangian(multipliers))
         above = np.minimum(below + 1, problem.high)
         values = [problem.error(x) + prices * x for x in (below, above)]
@@ -120,7 +121,8 @@ class Instance:
         Prices are those at `multipliers` (L,). If `slack` is the distance from the dual bound to the error of a known
         plan, no better plan has a quantity outside these bounds (Lagrangian bound tightening).
         """
-        problem, prices = self.separable, self.separable.prices(multipliers)
+        problem = self.separable
+        prices = self.separable.prices(multipliers)
         best, _ = self.minimise_lagrangian(multipliers)
         limit = problem.error(best) + prices * best + slack
 

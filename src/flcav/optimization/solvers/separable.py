@@ -186,7 +186,8 @@ def _ascend(problem: Separable, binding: list[int], start: Array) -> ContinuousO
                 break
         else:
             break
-        now, overspend = following, left
+        now = following
+        overspend = left
     return now
 
 

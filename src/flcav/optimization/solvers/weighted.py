@@ -105,7 +105,8 @@ class DriftTerm:
 
 def list_terms(instance: Instance) -> list[Term]:
     """Return the convex terms of the weighted error above the floors; together with `list_drifts` they add up to it."""
-    powers, effective = instance.separable, instance.effective
+    powers = instance.separable
+    effective = instance.effective
     of = np.arange(len(powers.a)) if powers.of is None else powers.of
     rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
     terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]

@@ -52,7 +52,8 @@ def find_reached(asked: PlacementProblem) -> list[list[NDArray[np.intp]]]:
         squared = ((asked.errors - pole) ** 2).sum(axis=1)
         covered.append([])
         for range_m in asked.ranges_m.tolist():
-            inside, doubt = squared <= range_m**2, 1e-12 * range_m * (range_m + float(np.abs(pole).max()))
+            inside = squared <= range_m**2
+            doubt = 1e-12 * range_m * (range_m + float(np.abs(pole).max()))
             for error in np.flatnonzero(np.abs(squared - range_m**2) <= doubt).tolist():
                 apart = (exact(asked.errors[error, axis]) - exact(asked.poles[number, axis]) for axis in range(3))
                 inside[error] = sum(each**2 for each in apart) <= exact(range_m) ** 2

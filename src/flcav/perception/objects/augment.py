@@ -81,7 +81,8 @@ def resize_objects(sample: Sample, factor: Array) -> Sample:
 
     The centre of an object's bottom face stays in place.
     """
-    boxes, points = sample.boxes, sample.points.copy()
+    boxes = sample.boxes
+    points = sample.points.copy()
     foot = boxes.center - boxes.size * (0, 0, 0.5)
     changed = np.flatnonzero((factor != 1).any(1))
     for row, inside in zip(changed, points_in_boxes(sample.points, boxes[changed]), strict=True):

@@ -189,7 +189,8 @@ def count_objects(
     """Return the counts of found objects and false detections of all classes by distance, see `count_by_distance`."""
     rows: list[FoundAtDistance] = []
     for label in classes:
-        scenes, rng = [truth.scene for truth in truths], stream(seed, "counts", label)
+        scenes = [truth.scene for truth in truths]
+        rng = stream(seed, "counts", label)
         rows += count_by_distance(*select_sides(detections, truths, label), scenes, label, rng)
     return tuple(rows)
 

@@ -281,7 +281,8 @@ def box_losses(output: HeadOutput, targets: Sequence[Targets]) -> tuple[Tensor, 
 
     They are smooth L1, cross-entropy and Gaussian negative log-likelihood; the last is None where none are predicted.
     """
-    device, positive = output.score.device, _positive(output, targets)
+    device = output.score.device
+    positive = _positive(output, targets)
     residual = torch.cat([target.residual for target in targets]).to(device)
     error = residual_errors(output.box.flatten(0, 1)[positive], residual)
     box = smooth_l1(error)

@@ -75,7 +75,8 @@ def find_errors(
 def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
     """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
     truth, annotations = ground_truth(frame, config), frame.annotations
-    label, wanted = truth.boxes.label, truth.target | truth.faint
+    label = truth.boxes.label
+    wanted = truth.target | truth.faint
     missed = wanted.copy()
     for name in config.classes:
         same_class, objects = np.flatnonzero(found.label == name), np.flatnonzero(wanted & (label == name))
@@ -111,7 +112,8 @@ def streets_study() -> StudyRecipe:
     Cars in those sweeps have flat ends.
     """
     recipe, drawn = read_recipe("objects"), read_recipe("streets")
-    tested, drawn_test = {"split": "test", "scenes": 10, "spins_per_scene": 4}, {"split": "test", "scenes": 10}
+    tested = {"split": "test", "scenes": 10, "spins_per_scene": 4}
+    drawn_test = {"split": "test", "scenes": 10}
     return StudyRecipe(
         network="small",
         train=(

@@ -175,7 +175,8 @@ def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
     weather = None if frame.weather is None else classify_weather(frame.weather)
     hidden = frame.annotations.occlusion[truth.target].astype(float)
     occlusion = None if np.isnan(hidden).any() else hidden
-    boxes, returns = truth.boxes, truth.returns[truth.target]
+    boxes = truth.boxes
+    returns = truth.returns[truth.target]
     sides = boxes[truth.target], boxes[neutral], boxes[truth.hidden]
     return FrameTruth(frame.scene, *sides, occlusion, weather, returns)
 

@@ -41,7 +41,8 @@ def pillar_statistics(
     inside = ((cell >= 0) & (cell < points.new_tensor((columns, rows)))).all(1)
     inside &= (points[:, 2] >= range_m[2]) & (points[:, 2] < range_m[5])
     kept = inside.nonzero()[:, 0]
-    cell, height = cell[kept], points[kept, 2] - ground_z_m
+    cell = cell[kept]
+    height = points[kept, 2] - ground_z_m
     x, y = cell.long().unbind(1)
     key = (sample[kept] * rows + y) * columns + x
     cells = samples * rows * columns

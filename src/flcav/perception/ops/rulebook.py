@@ -34,7 +34,8 @@ def find_submanifold_pairs(keys: Ints, steps: Ints) -> tuple[Ints32, Ints32, Int
     later = np.empty((half, count), dtype=np.int32)  # the neighbour at each later offset, -1 for none
     per_offset = np.zeros(2 * half + 1, dtype=np.int64)
     for k in range(half):
-        place, found = 0, 0
+        place = 0
+        found = 0
         for row in range(count):
             wanted = keys[row] + steps[k]
             while place < count and keys[place] < wanted:
@@ -200,7 +201,8 @@ def _build_submanifold_rulebook(keys: Tensor, height: int, width: int) -> Rulebo
     lines = (width, (height - 1) * width, height * width, (height + 1) * width)
     wanted = torch.stack([keys + (line - 1) for line in lines])  # (4, N): the first of three consecutive keys
     place = torch.searchsorted(keys, wanted)
-    found, where = [later[1 : count + 1] == keys + 1], [torch.arange(1, count + 1, device=keys.device)]
+    found = [later[1 : count + 1] == keys + 1]
+    where = [torch.arange(1, count + 1, device=keys.device)]
     for line in range(4):
         at = place[line]
         for step in range(3):

@@ -157,7 +157,8 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
     if (weights := prepared.out / WEIGHTS).exists():
         progress(0, 1, f"{weights} {DAMAGED}, made anew")
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
-    settings, samples = prepared.settings, prepared.samples
+    settings = prepared.settings
+    samples = prepared.samples
     network = build_network(task, prepared.config, request.seed).to(request.device)
     per_epoch = max(1, len(samples) // task.practice.batch)
     with event_files(out / EVENTS) as watch:
@@ -216,7 +217,8 @@ def _rounded(scores: Array) -> list[float]:
 
 
 def _validation(prepared: Prepared, per_epoch: int) -> Validation | None:
-    held, task = prepared.held, prepared.task
+    held = prepared.held
+    task = prepared.task
     if held is None:
         return None
 

@@ -92,7 +92,8 @@ class CrossViewEncoder(nn.Module):
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
         assert config.cameras is not None
-        settings, width = config.cameras, config.cameras.features
+        settings = config.cameras
+        width = config.cameras.features
         self.summary = 2 * config.hidden
         self.pictures = nn.Sequential(conv(3, width // 2, 2), conv(width // 2, width, 2), conv(width, width, (1, 2)))
         self.direction = nn.Linear(3, width)
@@ -228,7 +229,8 @@ class TrajectoryNetwork(nn.Module):
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
         self.config = config
-        hidden, ground = config.hidden, config.maps[1]
+        hidden = config.hidden
+        ground = config.maps[1]
         self.view = CrossViewEncoder(config) if config.cameras else RasterEncoder(config)
         self.track = nn.LSTM(TRACK, hidden, batch_first=True)
         self.context = nn.Sequential(nn.Linear(hidden + self.view.summary, 2 * hidden), nn.ReLU())

@@ -61,7 +61,8 @@ class RoadMap:
         user may have several: the nearest within `ASIDE_M` and `TURNED`, and those up to 0.5 m farther. The distance is
         `inf` where no junction follows, and for a road user on no lane.
         """
-        lanes, distance = [], np.full(len(position), np.inf)
+        lanes = []
+        distance = np.full(len(position), np.inf)
         for i, near in enumerate(self.line.query_ball_point(position, ASIDE_M)):
             near = np.array(near, dtype=np.int64)
             near = near[np.abs(wrap_angle(self.line_yaw[near] - yaw[i])) < TURNED]

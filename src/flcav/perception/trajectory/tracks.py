@@ -73,7 +73,8 @@ def extrapolate(trace: Trace, instant: int, ahead_s: Array) -> Tracks:
     distance driven is laid on an arc, which is exact at constant speed and on straight lines. Pedestrians, whom SUMO
     moves without turning them, keep their velocity. NaN where an actor is absent at the instant.
     """
-    velocity, yaw = trace.velocity[instant, :, :2], trace.yaw[instant]
+    velocity = trace.velocity[instant, :, :2]
+    yaw = trace.yaw[instant]
     walking = trace.category == "pedestrian"
     speed = np.linalg.norm(velocity, axis=1)
     gain = np.where(walking, 0.0, (trace.acceleration[instant, :, :2] * heading_vectors(yaw)).sum(axis=1))
@@ -95,7 +96,8 @@ def tracks_at(trace: Trace, times_s: Array, known: int | None = None) -> Tracks:
     Positions are on cubic Hermite curves with Catmull-Rom tangents, yaw and speed are linear. An actor is present at a
     time if it is present at both instants around it.
     """
-    knots, position = trace.time_s[:known], trace.position[:known, :, :2]
+    knots = trace.time_s[:known]
+    position = trace.position[:known, :, :2]
     if not len(knots):
         shape = (len(times_s), len(trace.actor))
         return Tracks(np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.full(shape, np.nan))

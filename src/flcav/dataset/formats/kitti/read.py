@@ -221,7 +221,8 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
     """Return scene, spin, agent and time [s] by number, from the list of an export; empty where there is none."""
     if not path.is_file():
         return {}
-    origins, numbers = {}, dict[str, str]()
+    origins = {}
+    numbers = dict[str, str]()
     check_is_file(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:

@@ -66,7 +66,8 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         if camera is None or not frame.lidar:
             exported.leave_out(frame, "no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent)
         else:
-            split, number = split_of[key.scene], f"{counts['frames']:06d}"
+            split = split_of[key.scene]
+            number = f"{counts['frames']:06d}"
             folder = out / ("testing" if split == "test" else "training")
             objects, regions, left_out = _write_frame(frame, camera, folder, number, options.min_points)
             numbers[split].append(number)

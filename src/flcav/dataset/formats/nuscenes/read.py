@@ -80,7 +80,8 @@ class NuscenesSource(LogSource):
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
         self._lost: dict[str, set[str]] = defaultdict(set)  # sample -> channels whose file is not there
-        listed, first_lost = self._tables / "sample_data.json", None
+        listed = self._tables / "sample_data.json"
+        first_lost = None
         for row in self._stream("sample_data"):
             if not row["is_key_frame"]:
                 continue
@@ -170,7 +171,8 @@ class NuscenesSource(LogSource):
         self, scenes: Mapping[str, Row], logs: Mapping[str, Row], samples: Mapping[str, Row]
     ) -> tuple[dict[str, list[Spin]], dict[str, str | None]]:
         """Return the spins by scene, ordered by time and agent, and the splits by scene."""
-        ours, names = self._tables.name == VERSION, AgentNames()
+        ours = self._tables.name == VERSION
+        names = AgentNames()
         splits = self._tables / "splits.json"
         listed = read_json(splits) if splits.is_file() else {}
         split_by_name: dict[str, str | None] = {}
@@ -264,7 +266,8 @@ class NuscenesSource(LogSource):
     def _frame(self, scene: str, spin: Spin) -> LinkedFrame:
         data = self._data[spin.sample]
         calibration = self._calibration[spin.agent]
-        mounts, kind = calibration.agent_from_sensor, {name: self._kind(row) for name, row in data.items()}
+        mounts = calibration.agent_from_sensor
+        kind = {name: self._kind(row) for name, row in data.items()}
         poses = {name: _placed(self._at(self._pose, row, "ego_pose_token")) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}

@@ -162,7 +162,8 @@ def _decode_list(file: TextIO, path: Path) -> Iterator[object]:
     if not text.startswith("["):
         read_json(path)
         raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
-    begin, at = True, 1
+    begin = True
+    at = 1
     while True:
         try:
             end = _skip(text, at)
