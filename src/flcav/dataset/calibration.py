@@ -1,4 +1,4 @@
-"""The calibration file of a dataset: true and assumed extrinsics, intrinsics and trigger times of each agent's sensors.
+"""The calibration file of a dataset: true and assumed extrinsics, intrinsics and trigger times of the sensors.
 
 JSON: agent -> `AgentEntry`. See `flcav.sensors.frame`.
 """
@@ -16,23 +16,23 @@ SHAPES = {"agent_from_sensor": (4, 4), "intrinsics": (3, 3), "distortion": (5,)}
 
 
 class Calibrations(NamedTuple):
-    """The true calibration of one agent, and the one that the agent assumes."""
+    """The true calibration of an agent, and the calibration that the agent assumes."""
 
     true: Calibration
     assumed: Calibration
 
 
 class SensorEntry(TypedDict):
-    """One sensor in the calibration file."""
+    """The entry of a sensor in the calibration file."""
 
-    agent_from_sensor: list[float]  # 16 numbers, row-major
-    offset_ms: float  # [ms]
-    intrinsics: NotRequired[list[float]]  # of a camera: 9 numbers, row-major [px]
-    distortion: NotRequired[list[float]]  # of a camera: 5 numbers
+    agent_from_sensor: list[float]  # extrinsics: 4x4 transform from the sensor to the agent frame, row-major [m]
+    offset_ms: float  # trigger time relative to the spin [ms]
+    intrinsics: NotRequired[list[float]]  # of a camera: 3x3 matrix, row-major [px]
+    distortion: NotRequired[list[float]]  # of a camera: k1, k2, p1, p2, k3
 
 
 class AgentEntry(TypedDict):
-    """One agent in the calibration file: sensor -> its true calibration, and the one that the agent assumes."""
+    """The entry of an agent in the calibration file: its sensors' true calibration, and the one that it assumes."""
 
     true: dict[str, SensorEntry]
     assumed: dict[str, SensorEntry]
@@ -50,7 +50,7 @@ def read_calibrations(path: Path, sensors: Mapping[str, set[str]]) -> dict[str, 
     agent's entry is missing or malformed, or a sensor has no mount.
     """
     values: Any = read_json(path)
-    found = {}
+    calibrations = {}
     for agent, names in sensors.items():
         try:
             both = Calibrations(*(_calibration(values[agent][which]) for which in ("true", "assumed")))
@@ -59,8 +59,8 @@ def read_calibrations(path: Path, sensors: Mapping[str, set[str]]) -> dict[str, 
         for name in sorted(names):
             if name not in both.true.agent_from_sensor or name not in both.assumed.agent_from_sensor:
                 raise InputError(f"{path}: no mount of the sensor '{name}' of '{agent}'")
-        found[agent] = both
-    return found
+        calibrations[agent] = both
+    return calibrations
 
 
 def _sensors(calibration: Calibration) -> dict[str, SensorEntry]:

@@ -1,7 +1,7 @@
-"""Checks of one frame and of its agent's calibration; each yields one sentence per problem.
+"""Checks of a frame and of its agent's calibration; each check yields one sentence per problem.
 
-Checked are ranges of values, whole LiDAR sweeps, points in boxes, agreement with the traffic, images with their 2D
-annotations, and mounts of sensors.
+They cover ranges of values, complete LiDAR sweeps, points in boxes, agreement with the traffic, images with their 2D
+annotations, and sensor mounts.
 """
 
 import math
@@ -32,7 +32,7 @@ GAP_DEG = 30.0  # widest azimuth sector without returns in a complete sweep
 STEEP_DEG, SKY_DEG = 8.0, 180.0  # tilt of a vehicle from which on its LiDARs may see the sky alone, in such a sector
 FORCE = 200.0  # limit of the specific force [m/s^2]
 RATE = 20.0  # limit of the angular rate [rad/s]
-FARTHEST = 1e9  # [m], [m/s]: beyond, squares of numbers say nothing
+FARTHEST = 1e9  # [m], [m/s]: beyond it, squares of numbers lose all precision
 STRAY_M, STRAY_DEG, SPEED_M_S = (
     5.0,
     30.0,
@@ -44,8 +44,8 @@ SAME = 1e-6  # tolerance between values that are stored twice [s], [m], [rad], [
 def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
     """Check that numbers are finite and in range, the pose is rigid, classes are known and tracks unique.
 
-    In an imported dataset velocities and occlusions may be NaN, which is unknown, classes are any, and a spin may begin
-    or end at the frame's time.
+    In an imported dataset unknown velocities and occlusions may be NaN, classes are arbitrary, and a spin may begin or
+    end at the frame's time.
     """
     truth = frame.annotations
     for name, points in frame.lidar.items():
@@ -80,7 +80,7 @@ def check_values(frame: Frame, *, imported: bool = False) -> Iterator[str]:
 
 
 def check_triggers(frame: Frame) -> Iterator[str]:
-    """Check that the agent's pose when a sensor triggers is near that at the spin, and rigid."""
+    """Check that the agent's pose when a sensor triggers is rigid, and near the pose at the spin."""
     for name, then in frame.agent_at_trigger.items():
         if not (is_rigid(then) and is_rigid(frame.world_from_agent)):
             yield f"{frame.key}: the pose of {frame.agent} when '{name}' triggers is not a rigid transform"
@@ -97,9 +97,9 @@ def check_triggers(frame: Frame) -> Iterator[str]:
 
 
 def check_sweeps(frame: Frame) -> Iterator[str]:
-    """Check that each LiDAR's sweep covers all azimuths; LiDARs with a point that is not finite are skipped.
+    """Check that the sweep of each LiDAR covers all azimuths; LiDARs with a point that is not finite are skipped.
 
-    On steep ground a LiDAR looks over the land on one side: there half of the azimuths may be without returns.
+    On steep ground a LiDAR looks over the land on one side, where half of the azimuths may have no returns.
     """
     steep = frame.world_from_agent[2, 2] < math.cos(math.radians(STEEP_DEG))
     for name, points in frame.lidar.items():
@@ -129,9 +129,9 @@ def check_measurements(frame: Frame) -> Iterator[str]:
 def check_points(frame: Frame, trace: Trace | None = None, *, imported: bool = False) -> Iterator[str]:
     """Check that each actor's enlarged box contains as many points as the annotation counts returns.
 
-    Points of a rolling LiDAR are compensated for the motion of the carrier and the actor by `trace`; those of an
-    imported dataset are as they are. The check is skipped without `trace` for a rolling LiDAR of a recording, and where
-    a point or a box is not finite or beyond `FARTHEST`.
+    Points of a rolling LiDAR are compensated for the motion of the carrier and of the actor by `trace`; those of an
+    imported dataset are taken as they are. The check is skipped for a rolling LiDAR of a recording without `trace`, and
+    where a point or a box is not finite or beyond `FARTHEST`.
     """
     if not frame.lidar or (frame.point_times and trace is None and not imported):
         return
@@ -139,23 +139,26 @@ def check_points(frame: Frame, trace: Trace | None = None, *, imported: bool = F
         return
     motions = _motions(frame, trace) if trace is not None and frame.point_times else {}
     everything, times_s = _in_world(frame, motions.get(frame.agent))
-    boxes, returns = frame.annotations.boxes, frame.annotations.returns
+    boxes = frame.annotations.boxes
+    returns = frame.annotations.returns
     if not (np.abs(boxes.array()) <= FARTHEST).all():
         return
     away = np.linalg.norm(boxes.center - frame.world_from_agent[:3, 3], axis=1)
     rain = rain_range_noise(frame.weather.rain_mm_h) if frame.weather else 0.0
     for i in np.flatnonzero(returns > 0):
-        track, label = str(frame.annotations.track[i]), boxes.label[i]
+        track = str(frame.annotations.track[i])
+        label = boxes.label[i]
         points = motions[track].bring_back(everything, times_s) if track in motions else everything
+        # In a rolling sweep the actor moves between its first and last return: bring them back to the time of the spin.
         count = int(points_in_boxes(points, boxes[[i]], MARGIN_M + RAIN_SIGMAS * rain * away[i]).sum())
         if count < POINTS_INSIDE * returns[i]:
             yield f"{frame.key}: points lie outside the box of {label} '{track}': {count} of {returns[i]} within"
 
 
 def _in_world(frame: Frame, carrier: Motion | None) -> tuple[Array, NDArray[np.float32]]:
-    """Return (N, 3) points of all LiDARs in the world frame [m], and (N,) their times [s] after the spin.
+    """Return the points (N, 3) of all LiDARs in the world frame [m], and their times (N,) after the spin [s].
 
-    `carrier` is the motion of the agent during the spin; None leaves it at its pose at the spin.
+    `carrier` is the motion of the agent during the spin; for None the agent stays at its pose at the spin.
     """
     clouds, times = [], []
     for name, points in frame.lidar.items():
@@ -166,7 +169,7 @@ def _in_world(frame: Frame, carrier: Motion | None) -> tuple[Array, NDArray[np.f
 
 
 def _motions(frame: Frame, trace: Trace) -> dict[str, Motion]:
-    """Return actor -> its motion at the time of the spin; empty where `trace` has no such instant."""
+    """Return the motions of the actors at the time of the spin, by name; empty where `trace` has no such instant."""
     motions = {}
     for instant in np.flatnonzero(np.abs(trace.time_s - frame.time_s) < SAME)[:1].tolist():
         for actor in np.flatnonzero(trace.present[instant]).tolist():
@@ -175,12 +178,13 @@ def _motions(frame: Frame, trace: Trace) -> dict[str, Motion]:
 
 
 def check_traffic(frame: Frame, trace: Trace) -> Iterator[str]:
-    """Check that the pose of the agent and all annotations agree with the traffic `trace` at the frame's time."""
+    """Check that the agent's pose and all annotations agree with the traffic `trace` at the frame's time."""
     instant = np.flatnonzero(np.abs(trace.time_s - frame.time_s) < SAME)
     if not len(instant):
         yield f"{frame.key}: the traffic of '{frame.scene}' has no instant at {frame.time_s} s"
         return
-    t, truth = int(instant[0]), frame.annotations
+    t = int(instant[0])
+    truth = frame.annotations
     centres = trace.box_centres(t)
     actor = {name: i for i, name in enumerate(trace.actor.tolist()) if trace.present[t, i]}
     if frame.agent in actor:
@@ -217,7 +221,7 @@ SIGN_STATES = {"", "off", *STATES.values()}
 def check_images(frame: Frame, *, imported: bool = False) -> Iterator[str]:
     """Check every image of a frame and its annotations of actors, signs and lights.
 
-    Images of an imported dataset have no depths, classes and instances to be checked against.
+    Images of an imported dataset have no depths, classes and instances to check against.
     """
     for name in (*frame.images, *frame.infrared):
         yield from check_views(frame.key, name, frame.annotations.views[name], imported=imported)
@@ -235,8 +239,7 @@ def check_images(frame: Frame, *, imported: bool = False) -> Iterator[str]:
 def check_views(key: str, name: str, views: Views, *, imported: bool = False) -> Iterator[str]:
     """Check that truncation and occlusion are in [0, 1] and that boxes have an area.
 
-    `key` names the frame and `name` the camera, here and below. In an imported dataset an occlusion may be NaN, which
-    is unknown.
+    `key` names the frame and `name` the camera, here and below. In an imported dataset an unknown occlusion may be NaN.
     """
     occlusion = np.where(np.isnan(views.occlusion), 0.0, views.occlusion) if imported else views.occlusion
     shares = np.column_stack((views.truncation, occlusion))
@@ -249,7 +252,7 @@ def check_views(key: str, name: str, views: Views, *, imported: bool = False) ->
 
 
 def check_planes(key: str, name: str, image: CameraImage, actors: int) -> Iterator[str]:
-    """Check that the planes of an image agree in shape, depths are positive, and instances are of its `actors`."""
+    """Check that the planes of an image agree in shape, depths are positive, and instances are among its `actors`."""
     if not _fit(image):
         yield f"{key}: the planes of '{name}' differ in shape"
         return
@@ -260,7 +263,7 @@ def check_planes(key: str, name: str, image: CameraImage, actors: int) -> Iterat
 
 
 def _fit(image: CameraImage) -> bool:
-    """Return whether the planes of an image have one height and width."""
+    """Return whether the planes of an image have the same height and width."""
     shape = image.rgb.shape[:2]
     others = (image.depth_m, image.semantic, image.instance)
     return image.rgb.shape[2:] == (3,) and all(plane is None or plane.shape == shape for plane in others)
@@ -268,12 +271,13 @@ def _fit(image: CameraImage) -> bool:
 
 def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[str]:
     """Check that the pixel counts and visible boxes of actors agree with the instance image."""
-    truth, views = frame.annotations, frame.annotations.views[name]
+    truth = frame.annotations
+    views = frame.annotations.views[name]
     assert image.instance is not None
-    found = find_actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
-    for i in np.flatnonzero(views.pixels != found.pixels[: len(truth)]):
-        yield f"{frame.key}: '{name}' shows {found.pixels[i]} pixels of '{truth.track[i]}', not {views.pixels[i]}"
-    same = np.isclose(views.visible_box, found.box[: len(truth)], equal_nan=True).all(axis=1)
+    regions = find_actor_regions(image.instance.astype(np.int32), max(len(truth), int(image.instance.max(initial=0))))
+    for i in np.flatnonzero(views.pixels != regions.pixels[: len(truth)]):
+        yield f"{frame.key}: '{name}' shows {regions.pixels[i]} pixels of '{truth.track[i]}', not {views.pixels[i]}"
+    same = np.isclose(views.visible_box, regions.box[: len(truth)], equal_nan=True).all(axis=1)
     for i in np.flatnonzero(~same):
         yield f"{frame.key}: the visible box of '{truth.track[i]}' in '{name}' is not around its pixels"
     for i in np.flatnonzero((views.pixels > 0) & np.isnan(views.amodal_box).any(axis=1)):
@@ -281,8 +285,9 @@ def check_visibility(frame: Frame, name: str, image: CameraImage) -> Iterator[st
 
 
 def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) -> Iterator[str]:
-    """Check that each actor's pixels, back-projected by their depth, lie in its 3D box, and in its amodal box."""
-    truth, views = frame.annotations, frame.annotations.views[name]
+    """Check that each actor's pixels lie in its 3D box when back-projected by their depth, and in its amodal box."""
+    truth = frame.annotations
+    views = frame.annotations.views[name]
     assert image.instance is not None
     assert image.depth_m is not None
     boxes = _boxes_at(frame, frame.calibration.offset_ms.get(name, 0.0) / 1e3)
@@ -293,6 +298,7 @@ def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) ->
             continue  # the annotated count is wrong, which `check_visibility` reports
         chosen = np.linspace(0, len(v) - 1, JUDGED).astype(int)
         v, u = v[chosen], u[chosen]
+        # `depth_m` is along the optical axis, so rays are scaled to z = depth.
         points = rays[v, u] * (image.depth_m[v, u] / rays[v, u, 2])[:, None]
         world = transform_points(frame.world_from_sensor(name), points)
         inside = np.count_nonzero(points_in_boxes(world, boxes[[i]], PIXEL_MARGIN_M))
@@ -307,7 +313,7 @@ def check_projection(frame: Frame, name: str, image: CameraImage, lens: Lens) ->
 
 
 def check_signs(key: str, name: str, signs: SignViews) -> Iterator[str]:
-    """Check that annotated signs and lights have known states, boxes with area, pixels, distances, and are unique."""
+    """Check that annotated signs and lights are unique, with known states, and valid boxes, pixels and distances."""
     if set(signs.state.tolist()) - SIGN_STATES:
         yield f"{key}: '{name}' shows a light in an unknown state; known: {', '.join(sorted(SIGN_STATES))}"
     if not (np.isfinite(signs.box).all() and (signs.box[:, 2:] > signs.box[:, :2]).all()):
@@ -326,7 +332,7 @@ def check_placed_signs(key: str, name: str, signs: SignViews, lens: Lens) -> Ite
 
 
 def _lens(frame: Frame, name: str, image: CameraImage) -> Lens:
-    """Return the lens model of a camera from its calibration; raises `InputError` where that is out of range."""
+    """Return the lens model of a camera from its calibration; raises `InputError` where values are out of range."""
     fx, fy, cx, cy = frame.calibration.intrinsics[name][[0, 1, 0, 1], [0, 1, 2, 2]].tolist()
     coefficients = zip(("k1", "k2", "p1", "p2", "k3"), frame.calibration.distortion[name].tolist())
     height, width = image.rgb.shape[:2]
@@ -335,18 +341,18 @@ def _lens(frame: Frame, name: str, image: CameraImage) -> Lens:
 
 
 def _boxes_at(frame: Frame, offset_s: float) -> Boxes:
-    """Return the annotated boxes `offset_s` after the spin, moved with constant acceleration and without turning."""
+    """Return the annotated boxes [m, world frame] at `offset_s` [s] after the spin: constant acceleration, same yaw."""
     truth = frame.annotations
     moved: Array = truth.boxes.center + offset_s * truth.velocity + offset_s**2 / 2 * truth.acceleration
     return Boxes(moved, truth.boxes.size, truth.boxes.yaw, truth.boxes.label)
 
 
-SIGMAS = 6.0  # a larger error, in standard deviations, is reported
+SIGMAS = 6.0  # standard deviations above which an error is reported
 EXACT = 1e-6  # tolerance of rounding, in the unit of each error: [m], [degrees], [px], [ms]
 
 
 def check_calibrations(calibrations: Mapping[str, Calibrations], error: CalibrationError) -> Iterator[str]:
-    """Check true and assumed calibrations by agent, and their difference against `error` of the recipe."""
+    """Check the agents' true and assumed calibrations, and their differences against the recipe's `error`."""
     for agent, (true, assumed) in calibrations.items():
         for which, calibration in (("true", true), ("assumed", assumed)):
             yield from check_calibration(f"the {which} calibration of {agent}", calibration)
@@ -354,7 +360,7 @@ def check_calibrations(calibrations: Mapping[str, Calibrations], error: Calibrat
 
 
 def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
-    """Check one calibration: rigid mounts, pinhole intrinsics without skew, finite distortion and trigger times.
+    """Check a calibration: rigid mounts, pinhole intrinsics without skew, finite distortion and trigger times.
 
     `name` names it in the sentences.
     """
@@ -362,7 +368,8 @@ def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
         if not is_rigid(mount):
             yield f"{name}: the mount of '{sensor}' is not a rigid transform"
     for sensor, matrix in calibration.intrinsics.items():
-        focal, skew = matrix[[0, 1], [0, 1]], matrix[[0, 1, 2, 2], [1, 0, 0, 1]]
+        focal = matrix[[0, 1], [0, 1]]
+        skew = matrix[[0, 1, 2, 2], [1, 0, 0, 1]]
         if not np.isfinite(matrix).all() or (focal <= 0).any() or skew.any() or matrix[2, 2] != 1:
             yield f"{name}: the intrinsics of '{sensor}' are not those of a camera"
     for sensor, coefficients in calibration.distortion.items():
@@ -376,7 +383,7 @@ def check_calibration(name: str, calibration: Calibration) -> Iterator[str]:
 def check_assumed(agent: str, true: Calibration, assumed: Calibration, error: CalibrationError) -> Iterator[str]:
     """Check that the assumed calibration of `agent` differs from the true one by at most SIGMAS standard deviations.
 
-    `error` gives the standard deviations.
+    `error` holds the standard deviations [m], [degrees], [px], [ms].
     """
     for sensor in sorted(true.agent_from_sensor.keys() & assumed.agent_from_sensor.keys()):
         if not (is_rigid(true.agent_from_sensor[sensor]) and is_rigid(assumed.agent_from_sensor[sensor])):

@@ -34,7 +34,8 @@ class DatasetGround:
         A vehicle's origin is on the ground. A pole stands on that of the town; where no town is known, as in an
         imported dataset, as high as its scene's vehicles where one comes nearest to it, and without any at 0.
         """
-        key, place = self._data.keys[i], self._data.world_from_agent(i)[:3, 3]
+        key = self._data.keys[i]
+        place = self._data.world_from_agent(i)[:3, 3]
         if not self._stands(i):
             return float(place[2])
         if self.town is not None:

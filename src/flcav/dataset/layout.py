@@ -10,10 +10,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from flcav.config import InputError, Json, describe_error, read_json
 
 FORMAT = 3  # of datasets with tilted boxes, in the table `tilts`
-LEVEL_FORMAT = 2  # of all others
+LEVEL_FORMAT = 2  # of all other datasets
 MANIFEST = "manifest.json"  # written last: a folder without it is unfinished
 CALIBRATION = "calibration.json"  # see `flcav.dataset.calibration`
-FILES = "files"  # table that lists all other files: payloads, traffic, the town's files
+FILES = "files"  # the table that lists all other files: payloads, traffic, the town's files
 TRACES = "traces"
 NAVIGATION = "navigation"
 TOWN = "town"  # contains the folder of a town that does not come with flcav
@@ -28,7 +28,7 @@ class StrictModel(BaseModel):
 
 
 class TableFile(StrictModel):
-    """Size [bytes] and SHA-256 checksum of a file listed in the manifest."""
+    """Size [bytes] and SHA-256 checksum of a file that the manifest lists."""
 
     bytes: int
     sha256: str
@@ -46,7 +46,7 @@ class DatasetCounts(StrictModel):
 
 
 class Manifest(StrictModel):
-    """The manifest of a dataset: format version, resolved recipe, package versions, counts, scenes, files of tables."""
+    """The manifest of a dataset: format version, resolved recipe, package versions, counts, scenes, table files."""
 
     format: int
     recipe: Mapping[str, Json]
@@ -63,7 +63,7 @@ class Manifest(StrictModel):
 
     @property
     def split_of(self) -> dict[str, str]:
-        """Return scene -> split of an imported dataset as its files have it; scenes of no split are not among them."""
+        """Return the splits of an imported dataset's scenes, by scene; scenes without a split are left out."""
         splits = self.recipe.get("splits")
         return {
             str(scene): split
@@ -73,19 +73,19 @@ class Manifest(StrictModel):
 
     @property
     def labels(self) -> Sequence[Json]:
-        """Return what is labelled: "objects" and "signs" of a recording, unless its recipe says `labels`."""
+        """Return what is labelled: for a recording "objects" and "signs", unless its recipe says `labels`."""
         labels = self.recipe.get("labels", () if self.imported else ("objects", "signs"))
         return labels if isinstance(labels, list | tuple) else ()
 
 
 @dataclass(frozen=True)
 class FrameKey:
-    """The identity of a frame: scene, spin and agent; and its time."""
+    """The identity of a frame: scene, spin and agent, with its time."""
 
     scene: str
     index: int  # spin number within the scene
     agent: str
-    time_s: float
+    time_s: float  # of the spin, in the scene [s]
 
 
 def table_path(name: str) -> str:
@@ -94,37 +94,37 @@ def table_path(name: str) -> str:
 
 
 def payload_path(sensor: str, key: str, suffix: str) -> str:
-    """Return the relative path of a measurement of `sensor` in the frame `key`.
+    """Return the path, relative to the dataset folder, of a measurement of `sensor` in the frame `key`.
 
-    `suffix` names its encoding, see `flcav.dataset.payloads`.
+    `suffix` is that of its encoding, see `flcav.dataset.payloads`.
     """
     return f"{sensor}/{key}.{suffix}"
 
 
 def trace_path(scene: str) -> str:
-    """Return the relative path of a scene's traffic."""
+    """Return the path of a scene's traffic, relative to the dataset folder."""
     return f"{TRACES}/{scene}.parquet"
 
 
 def navigation_path(scene: str) -> str:
-    """Return the relative path of the navigation logs of a scene's vehicles."""
+    """Return the path of the navigation logs of a scene's vehicles, relative to the dataset folder."""
     return f"{NAVIGATION}/{scene}.parquet"
 
 
 def package_versions(names: Sequence[str] = PACKAGES) -> dict[str, str]:
-    """Return package -> installed version, by default of the packages that determine the recorded bytes."""
+    """Return the installed versions of packages, by name; by default of those that determine the recorded bytes."""
     return {name: version(name) for name in names}
 
 
 def town_path(town: str) -> str:
-    """Return the relative path of the folder of a town that is copied into the dataset."""
+    """Return the path, relative to the dataset folder, of the folder of a town that is copied into the dataset."""
     return f"{TOWN}/{town}"
 
 
 def read_manifest(folder: Path) -> Manifest:
     """Return the manifest of the dataset in `folder`.
 
-    Raises `InputError` where the folder is missing, holds no finished dataset, or one of another format version.
+    Raises `InputError` where the folder is missing, or holds no finished dataset or one of another format version.
     """
     path = folder / MANIFEST
     if folder.is_file():

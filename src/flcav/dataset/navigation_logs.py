@@ -1,4 +1,4 @@
-"""Navigation logs of a scene as a Parquet file, one row per vehicle with its samples as lists, and their check."""
+"""Navigation logs of a scene as a Parquet file, with one row per vehicle and its samples as lists, and their check."""
 
 import json
 from collections.abc import Iterator, Mapping
@@ -28,7 +28,7 @@ SCHEMA = pa.schema(
 
 
 def save_logs(logs: Mapping[str, NavigationLog], path: Path) -> None:
-    """Write the logs of a scene's vehicles, by name."""
+    """Write the logs of a scene's vehicles, given by vehicle name, to the file `path`."""
     rows: list[dict[str, Any]] = [
         {
             "agent": agent,
@@ -43,7 +43,7 @@ def save_logs(logs: Mapping[str, NavigationLog], path: Path) -> None:
 
 
 def load_logs(path: Path) -> dict[str, NavigationLog]:
-    """Return vehicle -> log as `save_logs` wrote them; raises `InputError` where the file or a log is damaged."""
+    """Return the logs that `save_logs` wrote, by vehicle; raises `InputError` where the file or a log is damaged."""
     table = read_parquet(path)
     if not table.schema.equals(SCHEMA) or any(column.null_count for column in table.columns):
         raise InputError(f"{path}: not the navigation logs of a scene ({', '.join(SCHEMA.names)}, without empty cells)")
@@ -71,7 +71,7 @@ def load_logs(path: Path) -> dict[str, NavigationLog]:
 
 
 def _parse(model: type[Sheet], text: str, where: str) -> Sheet:
-    """Return a data sheet from its fields in JSON."""
+    """Return a data sheet, given its fields in JSON."""
     try:
         fields = json.loads(text)
     except (ValueError, RecursionError):
@@ -81,13 +81,13 @@ def _parse(model: type[Sheet], text: str, where: str) -> Sheet:
 
 GAP = 1.5  # longest time between two IMU samples, in periods of its rate
 FIX_GAP_S = 5.0  # longest time between two fixes
-HIGHEST_M = 1e5
+HIGHEST_M = 1e5  # greatest altitude [m]
 
 
 def check_log(log: NavigationLog) -> Iterator[str]:
-    """Check that times ascend without gaps, numbers are finite, and places and motions possible.
+    """Check that times ascend without gaps, numbers are finite, and positions and motions are possible.
 
-    Each sentence lacks its subject, the log.
+    The sentences begin with their verb: the caller names the log.
     """
     kinds = (
         ("fixes", log.fix_time_s, log.fix, FIX_GAP_S),

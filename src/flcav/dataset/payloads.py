@@ -1,10 +1,10 @@
 """Encoding and decoding of measurement files (payloads): point clouds, images, depth, radar detections.
 
-All encodings are lossless but that of depth, which rounds the mantissa to DEPTH_BITS. They were chosen by size and CPU
-time, see `benchmarks/bench_recording.py`.
+All encodings are lossless except that of depth, which rounds the mantissa to DEPTH_BITS. They were chosen by size and
+CPU time, see `benchmarks/bench_recording.py`.
 
-Pictures are upright everywhere in flcav, as the orientation in their EXIF data says (JEITA CP-3451, tag 274): a phone
-stores the rows of its sensor and how it was held.
+flcav's pictures are upright, turned by the orientation in their EXIF data (JEITA CP-3451, tag 274): a phone stores the
+rows of its sensor, and how it was held.
 """
 
 import io
@@ -30,21 +30,21 @@ PLANES = {"rgb": "webp", "depth_m": "depth.zst", "semantic": "semantic.png", "in
 PICTURES = ("webp", "png", "jpg", "jpeg")  # of colour images: recorded ones are WebP, imported ones as they were
 POINTS, TIMES, RADAR, INFRARED = "bin", "times.bin", "radar.bin", "infrared.png"
 LARGEST_PX = 8192  # sides of an image, as those of a `Lens`
-TAIL = 4096  # bytes at the end of a JPEG or PNG in which its end is marked
+TAIL = 4096  # bytes at the end of a JPEG or PNG in which its end marker is sought
 COLUMNS = {POINTS: 4, TIMES: 1, RADAR: 5}  # of little-endian float32 in row-major order
 
 
 class Payload(NamedTuple):
-    """One measurement file of a frame: its path relative to the dataset folder, and its contents."""
+    """A measurement file of a frame: its path relative to the dataset folder, and its contents."""
 
     path: str
     data: bytes | memoryview
 
 
 def encode_payloads(frame: Frame, left_out: Collection[str] = ()) -> Iterator[Payload]:
-    """Yield the encoded measurement files of a frame: of its LiDARs, cameras, infrared cameras and radars.
+    """Yield the encoded measurement files of a frame: those of its LiDARs, cameras, infrared cameras and radars.
 
-    Files of the points or the colour image of the sensors `left_out` are not among them.
+    The points and colour images of the sensors in `left_out` are left out.
     """
     for name, points in frame.lidar.items():
         if name not in left_out:
@@ -63,15 +63,15 @@ def encode_payloads(frame: Frame, left_out: Collection[str] = ()) -> Iterator[Pa
 
 
 def encode_rows(rows: NDArray[np.float32]) -> memoryview:
-    """Return (N, C) or (N,) measurements of a LiDAR or radar as little-endian float32 bytes, row-major.
+    """Return measurements (N, C) or (N,) of a LiDAR or radar as little-endian float32 bytes, row-major.
 
-    The buffer is not copied where it has this form already.
+    The buffer is not copied where it already has this form.
     """
     return np.ascontiguousarray(rows, dtype="<f4").reshape(-1).view(np.uint8).data
 
 
 def encode_plane(plane: str, pixels: NDArray) -> bytes:
-    """Return the encoded file of one of the PLANES of a `CameraImage`: WebP (lossless), Zstandard or PNG."""
+    """Return the encoded file of one of the PLANES of a `CameraImage`: lossless WebP, Zstandard or PNG."""
     if plane == "rgb":
         data = io.BytesIO()
         Image.fromarray(pixels).save(data, "webp", lossless=True, quality=0, method=0)
@@ -80,12 +80,13 @@ def encode_plane(plane: str, pixels: NDArray) -> bytes:
 
 
 def encode_depth(depth_m: NDArray[np.float32]) -> bytes:
-    """Return (H, W) depths as Zstandard-compressed bytes, the mantissa rounded to DEPTH_BITS.
+    """Return depths (H, W) [m] as Zstandard-compressed bytes, with the mantissa rounded to DEPTH_BITS.
 
     The compressed content is a NumPy .npy file of (4, H, W) uint8: the byte planes of little-endian float32, least
     significant first.
     """
     bits = np.ascontiguousarray(depth_m, dtype="<f4").view("<u4")
+    # Round half up in the integer representation; infinite depths keep their bits. Byte planes compress better.
     rounded = (bits + np.uint32(1 << (_DROPPED - 1))) & np.uint32(0xFFFFFFFF << _DROPPED & 0xFFFFFFFF)
     planes = np.where(np.isfinite(depth_m), rounded, bits).astype("<u4").view(np.uint8)
     data = io.BytesIO()
@@ -94,14 +95,14 @@ def encode_depth(depth_m: NDArray[np.float32]) -> bytes:
 
 
 def read_rows(path: Path, suffix: str, expected: int) -> NDArray[np.float32]:
-    """Return the (expected, C) float32 rows of a LiDAR or radar file; C is the entry of COLUMNS for `suffix`.
+    """Return the float32 rows (expected, C) of a LiDAR or radar file; C is the entry of COLUMNS for `suffix`.
 
     Raises `InputError` where the file is missing or of another length.
     """
     row_bytes = 4 * COLUMNS[suffix]
     try:
-        if (found := path.stat().st_size) != expected * row_bytes and not path.is_dir():
-            raise InputError(f"{path}: {found} bytes where {expected} points take {expected * row_bytes}")
+        if (size := path.stat().st_size) != expected * row_bytes and not path.is_dir():
+            raise InputError(f"{path}: {size} bytes where {expected} points take {expected * row_bytes}")
         check_is_file(path, None)
         return np.fromfile(path, "<f4", expected * COLUMNS[suffix]).reshape(-1, COLUMNS[suffix])
     except (FileNotFoundError, IsADirectoryError):
@@ -119,14 +120,14 @@ def read_plane(path: Path, plane: str) -> NDArray:
 
 
 def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArray:
-    """Return the pixels of a PNG, WebP or JPEG file as `dtype`, (H, W), or (H, W, channels) for more than one channel.
+    """Return the pixels of a PNG, WebP or JPEG file as `dtype`, (H, W), or (H, W, channels) for several channels.
 
-    They are upright. Raises `InputError` where the file is missing, not such an image, or has another number of
+    They are upright. Raises `InputError` where the file is missing, is not such an image, or has another number of
     channels.
     """
     try:
         with open_image(path) as image:
-            found = len(image.getbands())
+            bands = len(image.getbands())
             pixels = np.asarray(turn_upright(image))
     except (FileNotFoundError, IsADirectoryError):
         raise InputError(f"{path}: missing from the dataset") from None
@@ -134,17 +135,17 @@ def read_image(path: Path, dtype: type[np.generic], channels: int = 1) -> NDArra
         raise
     except (OSError, ValueError, SyntaxError, Image.DecompressionBombError) as error:
         raise InputError(f"{path}: not a readable image ({error})") from None
-    if found != channels:
-        raise InputError(f"{path}: not a readable image (it has {found} channels, not {channels})")
+    if bands != channels:
+        raise InputError(f"{path}: not a readable image (it has {bands} channels, not {channels})")
     return pixels.astype(dtype)
 
 
 def open_image(file: Path | io.BytesIO) -> Image.Image:
-    """Return a PNG, WebP or JPEG image, not decoded yet; raises `InputError` where a side exceeds LARGEST_PX."""
+    """Open a PNG, WebP or JPEG image without decoding it; raises `InputError` where a side exceeds LARGEST_PX."""
     if isinstance(file, Path) and file.exists():
         check_is_file(file)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # of images that are refused here
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # such images are refused below
         image = Image.open(file, formats=("PNG", "WEBP", "JPEG"))
     if max(image.size) > LARGEST_PX:
         image.close()
@@ -154,7 +155,7 @@ def open_image(file: Path | io.BytesIO) -> Image.Image:
 
 
 def check_image(path: Path) -> None:
-    """Raise `InputError` where an image file is missing, truncated or of no kind of PICTURES; it is not decoded.
+    """Raise `InputError` where an image file is missing, truncated or not of a kind in PICTURES, without decoding it.
 
     A PNG ends in its chunk IEND (ISO/IEC 15948, 11.2.5), a JPEG in the marker FFD9 (ITU-T T.81, B.1.1.3), after which
     some programs write more; the length of a WebP is in its header (RFC 9649, 2.3).
@@ -178,7 +179,7 @@ def check_image(path: Path) -> None:
 
 
 def _read_depth(path: Path) -> NDArray[np.float32]:
-    """Return the depths that `encode_depth` wrote; of what unfolds from the file no more is taken than they are."""
+    """Return the depths (H, W) [m] that `encode_depth` wrote; never decompress more than the header announces."""
     try:
         if path.exists():
             check_is_file(path)
@@ -220,23 +221,23 @@ ON_SIDE = (5, 6, 7, 8)  # orientations that exchange width and height
 
 
 def turn_upright(image: Image.Image) -> Image.Image:
-    """Return an image that was opened and not yet decoded, upright."""
+    """Return an opened, not yet decoded image, turned upright."""
     turn = TURNS.get(_orientation(image))
     return image if turn is None else image.transpose(turn)
 
 
 def measure_upright(image: Image.Image) -> tuple[int, int]:
-    """Return width and height [px] of the image upright; it is not decoded."""
+    """Return width and height [px] of the upright image, without decoding it."""
     width, height = image.size
     return (height, width) if _orientation(image) in ON_SIDE else (width, height)
 
 
 def _orientation(image: Image.Image) -> int:
-    """Return the EXIF orientation, 1 where there is none, or none that is read before the pixels are."""
+    """Return the EXIF orientation, or 1 where there is none that can be read without decoding the pixels."""
     if "exif" not in image.info:
         return 1
     try:
-        found = image.getexif().get(ExifTags.Base.Orientation, 1)
+        orientation = image.getexif().get(ExifTags.Base.Orientation, 1)
     except (SyntaxError, ValueError, OSError, struct.error):  # damaged; the pixels need not be
         return 1
-    return found if isinstance(found, int) else 1
+    return orientation if isinstance(orientation, int) else 1

@@ -11,13 +11,13 @@ from flcav.world.trace import CATEGORIES
 
 SIGNS = ("stop", "yield", "speed_30", "speed_60", "speed_90", "light_red", "light_yellow", "light_green")
 LIGHTS = {"red": "light_red", "red_amber": "light_red", "amber": "light_yellow", "green": "light_green"}
-HALF_PX = 0.5  # shift from a frame's pixel coordinates, whole numbers at pixel centres, to those of an image's corner
+HALF_PX = 0.5  # shift from a frame's pixel coordinates, integers at pixel centres, to those from an image's corner
 CLASSES = {"signs": SIGNS, "actors": CATEGORIES}
 
 
 @dataclass(frozen=True)
 class Rectangles:
-    """The N labelled 2D bounding boxes of one image."""
+    """The N labelled 2D bounding boxes of an image."""
 
     label: NDArray[np.int64]  # (N,) index into the chosen list of CLASSES
     box: Array  # (N, 4) left, top, right, bottom of the visible part [px], from the image's corner
@@ -32,7 +32,7 @@ def select_rectangles(frame: Frame, camera: str, labels: str, min_pixels: int) -
     """Return the 2D labels of objects with at least `min_pixels` visible pixels in the image of `camera`.
 
     `labels` is a key of CLASSES. A light that shows red and amber counts as red. Lights that are off, and signs of
-    other kinds than in SIGNS, are left out.
+    kinds that are not in SIGNS, are left out.
     """
     if labels == "actors":
         views = frame.annotations.views[camera]

@@ -1,4 +1,4 @@
-"""Frames as rows of the dataset's tables: `encode_frame` writes them, the functions `decode_*` read them."""
+"""Frames as rows of the dataset's tables: `encode_frame` writes them, `decode_*` read them."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
@@ -31,9 +31,9 @@ Columns = Mapping[str, Column]
 
 
 def encode_frame(frame: Frame) -> dict[str, Columns]:
-    """Return table -> columns of the rows of `frame`; tables of sensors that the frame lacks are left out.
+    """Return the rows of `frame` as columns, by table; tables of sensors that the frame lacks are left out.
 
-    Columns are lists or arrays of equal length by column name, see `flcav.dataset.tables.SCHEMAS`.
+    Columns are lists or arrays of equal length, by column name: see `flcav.dataset.tables.SCHEMAS`.
     """
     truth = frame.annotations
     parts = {"views": truth.views, "signs": truth.signs, "points": truth.points, "gnss": frame.gnss, "imu": frame.imu}
@@ -97,9 +97,9 @@ def _annotations(frame: Frame) -> Columns:
 def _points(frame: Frame) -> Columns:
     rows = {name: np.flatnonzero(counts) for name, counts in frame.annotations.points.items()}
     return {
-        **_named(frame, {name: len(found) for name, found in rows.items()}),
+        **_named(frame, {name: len(indices) for name, indices in rows.items()}),
         "row": _joined([*rows.values()], np.int64),
-        "points": _joined([frame.annotations.points[name][found] for name, found in rows.items()], np.int64),
+        "points": _joined([frame.annotations.points[name][indices] for name, indices in rows.items()], np.int64),
     }
 
 
@@ -108,10 +108,10 @@ def _views(frame: Frame) -> Columns:
     rows = {name: np.flatnonzero(~np.isnan(view.amodal_box).any(axis=1)) for name, view in views.items()}
 
     def column(values: Callable[[Views], np.ndarray], dtype: type) -> np.ndarray:
-        return _joined([values(views[name])[found] for name, found in rows.items()], dtype)
+        return _joined([values(views[name])[indices] for name, indices in rows.items()], dtype)
 
     return {
-        **_named(frame, {name: len(found) for name, found in rows.items()}),
+        **_named(frame, {name: len(indices) for name, indices in rows.items()}),
         "row": _joined([*rows.values()], np.int64),
         **{name: column(lambda view, i=i: view.amodal_box[:, i], np.float64) for i, name in enumerate(AMODAL_COLUMNS)},
         **{
@@ -181,7 +181,7 @@ COLUMNS: dict[str, Callable[[Frame], Columns]] = {
 
 
 def _named(frame: Frame, counts: Mapping[str, int]) -> Columns:
-    """Return the columns `frame` and `sensor`; `counts` maps each sensor to its number of rows."""
+    """Return the columns `frame` and `sensor`; `counts` holds the number of rows by sensor."""
     sensors = [name for name, count in counts.items() for _ in range(count)]
     return {"frame": [frame.key] * len(sensors), "sensor": sensors}
 
@@ -204,12 +204,13 @@ def decode_annotations(
     ranging: Iterable[str],
     cameras: Iterable[str],
 ) -> Annotations:
-    """Return the annotations of one frame from its rows in the tables that its parameters are called by.
+    """Return the annotations of a frame from its rows in the tables after which the parameters are named.
 
     `ranging` names the frame's LiDARs and radars, `cameras` its cameras, infrared ones included. Raises `InputError`
     where a row refers to an actor that is not annotated.
     """
-    count, cameras = len(rows), list(cameras)
+    count = len(rows)
+    cameras = list(cameras)
     return Annotations(
         track=_text(rows, "track"),
         boxes=replace(
@@ -226,12 +227,12 @@ def decode_annotations(
 
 
 def decode_vectors(rows: pa.Table, columns: Sequence[str]) -> dict[str, Array]:
-    """Return sensor -> (C,) values of its row in the C `columns`."""
+    """Return the values (C,) of each sensor's row in the C `columns`, by sensor."""
     return dict(zip(rows["sensor"].to_pylist(), _values_of(rows, columns)))
 
 
 def decode_weather(rows: pa.Table) -> Weather | None:
-    """Return the weather of a frame from its row, None without a row; raises `InputError` for values out of range."""
+    """Return the weather of a frame from its row, None without one; raises `InputError` for values out of range."""
     if not len(rows):
         return None
     row = rows.slice(0, 1).to_pylist()[0]
@@ -245,10 +246,11 @@ def _decode_points(rows: pa.Table, count: int) -> NDArray[np.int64]:
 
 
 def _decode_tilt(rows: pa.Table, count: int) -> Array | None:
-    """Return pitch and roll (count, 2) of the boxes; None where no box is tilted."""
+    """Return the pitch and roll (count, 2) [rad] of the boxes; None where no box is tilted."""
     if not len(rows):
         return None
-    tilt, at = np.zeros((count, 2)), rows["row"].to_numpy()
+    tilt = np.zeros((count, 2))
+    at = rows["row"].to_numpy()
     if ((at < 0) | (at >= count)).any():
         raise InputError(f"{rows['frame'][0].as_py()}: a tilt is of no annotated actor")
     tilt[at] = _values_of(rows, TILT_COLUMNS)
@@ -256,9 +258,9 @@ def _decode_tilt(rows: pa.Table, count: int) -> Array | None:
 
 
 def _actors(rows: pa.Table, count: int) -> NDArray[np.int64]:
-    """Return (R,) the indices into the frame's `count` annotations that the R `rows` of another table refer to.
+    """Return the indices (R,) into the frame's `count` annotations to which the R `rows` of another table refer.
 
-    Raises `InputError` for an index that is out of range.
+    Raises `InputError` for an index out of range.
     """
     at = rows["row"].to_numpy()
     if ((at < 0) | (at >= count)).any():

@@ -1,4 +1,4 @@
-"""Checks over several frames: blocked LiDARs, empty boxes, motion against velocity, and sweeps that are there twice."""
+"""Checks over several frames: blocked LiDARs, empty boxes, motion against velocity, and duplicated sweeps."""
 
 import contextlib
 from collections import Counter, defaultdict
@@ -20,16 +20,16 @@ from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
 CLOSE_M = 1.0  # points closer to the LiDAR are from its mount or an obstruction
-MOST, ALMOST_ALL = 0.5, 0.95  # shares of close points from which the view is blocked, and almost entirely
+MOST, ALMOST_ALL = 0.5, 0.95  # shares of close points above which the view is blocked, or almost entirely so
 LONGEST_STEP_S = 1.0  # longer steps are skipped: the velocities at both ends do not predict the motion
 DRIFT_M, DRIFT_MPS = 0.3, 2.5  # tolerance of a position predicted from velocities: constant, and per second
-NEAR_M = 40.0  # boxes within are those of which every LiDAR has points
+NEAR_M = 40.0  # distance up to which every LiDAR has points of a box
 OUT_OF_REACH_M = 1000.0  # no LiDAR measures as far
-NEAR_SIZES = 10.0  # so many times its longest side is the same for a smaller box
-LIFT_M = 0.2  # lower part of a box whose points may be the ground's
-HIDDEN = 0.5  # occlusion from which a box may be empty
-SECTOR_DEG = 2.0  # width of the azimuth sectors in which a LiDAR's range is taken
-FEWEST_BOXES, FEWEST_OBJECTS = 5, 3  # boxes of which a share is told, and objects that they are of
+NEAR_SIZES = 10.0  # the same for smaller boxes, in lengths of their longest side
+LIFT_M = 0.2  # height of a box's lower part, whose points may be the ground's [m]
+HIDDEN = 0.5  # occlusion above which a box may be empty
+SECTOR_DEG = 2.0  # width of the azimuth sectors for which a LiDAR's range is determined
+FEWEST_BOXES, FEWEST_OBJECTS = 5, 3  # boxes, and different objects among them, from which a share is judged
 
 
 class BlockedViews:
@@ -40,7 +40,7 @@ class BlockedViews:
         self._close: Counter[tuple[str, str]] = Counter()
 
     def add(self, frame: Frame) -> None:
-        """Add the points of one frame to the counts."""
+        """Add the points of a frame to the counts."""
         for name, points in frame.lidar.items():
             with np.errstate(invalid="ignore"):  # signalling NaNs, which `check_values` reports
                 close = np.linalg.norm(points[:, :3].astype(np.float64), axis=1) < CLOSE_M
@@ -48,26 +48,26 @@ class BlockedViews:
             self._close[frame.agent, name] += int(close.sum())
 
     def problems(self) -> Iterator[str]:
-        """Yield a sentence for each LiDAR with more than a share MOST of its points closer than CLOSE_M."""
+        """Yield a sentence for each LiDAR of whose points more than the share MOST is closer than CLOSE_M."""
         for (agent, name), count in self._points.items():
             share = self._close[agent, name] / max(count, 1)
-            told = f"{share:.1%} of its {plural(count, 'point')} lie within {CLOSE_M:g} m of it"
+            counts = f"{share:.1%} of its {plural(count, 'point')} lie within {CLOSE_M:g} m of it"
             if share >= ALMOST_ALL:
-                yield f"{agent}: '{name}' sees almost nothing but its own mount: {told}"
+                yield f"{agent}: '{name}' sees almost nothing but its own mount: {counts}"
             elif share > MOST:
-                yield f"{agent}: the view of '{name}' is blocked: {told}"
+                yield f"{agent}: the view of '{name}' is blocked: {counts}"
 
 
 @dataclass
 class _Tally:
-    """Boxes of an agent, or of all."""
+    """Counts of boxes, of an agent or of all."""
 
     boxes: int = 0
-    far: int = 0  # out of any LiDAR's reach
-    near: int = 0  # that a LiDAR must have points of
-    empty: int = 0  # of these without a point
+    far: int = 0  # out of reach of any LiDAR
+    near: int = 0  # boxes that a LiDAR must have points of
+    empty: int = 0  # near boxes without a point
     objects: set[tuple[str, str]] = field(default_factory=set)  # scene and track of the empty ones
-    first: str = ""  # track and frame of one that is empty, or far
+    first: str = ""  # track and frame of the first empty or far one
 
     def problem(self) -> str:
         """Return what is wrong with most of the boxes; "" where nothing is."""
@@ -86,10 +86,10 @@ class _Tally:
 
 
 class EmptyBoxes:
-    """Detector of boxes that are not where the objects are: counts the near ones without points over all frames.
+    """Detector of misplaced boxes: counts the near ones without points over all frames.
 
     A box counts within NEAR_M of a LiDAR that measures farther in its direction and has beams at its height, unless it
-    is known to be occluded. Of right boxes few are empty, with any LiDAR and in any weather; of wrong ones most are.
+    is known to be occluded. Few correct boxes are empty, with any LiDAR and in any weather; of wrong ones most are.
     """
 
     def __init__(self) -> None:
@@ -97,11 +97,13 @@ class EmptyBoxes:
         self._all = _Tally()
 
     def add(self, frame: Frame) -> None:
-        """Add the boxes of one frame to the counts; a frame with points or boxes that are not finite is skipped."""
+        """Add the boxes of a frame to the counts; a frame with points or boxes that are not finite is skipped."""
         boxes = frame.annotations.boxes
         if not len(boxes) or not np.isfinite(boxes.array()).all():
             return
-        near, away, points = np.zeros(len(boxes), bool), np.full(len(boxes), np.inf), np.zeros(len(boxes), np.int64)
+        near = np.zeros(len(boxes), bool)
+        away = np.full(len(boxes), np.inf)
+        points = np.zeros(len(boxes), np.int64)
         raised = _raise_floors(boxes)
         for name, cloud in frame.lidar.items():
             world_from_lidar = frame.world_from_sensor(name)
@@ -112,7 +114,8 @@ class EmptyBoxes:
             near |= _are_in_view(local, cloud)
             points += count_points_in_boxes(cloud, raised, world_from_lidar)
         near &= ~(frame.annotations.occlusion > HIDDEN)
-        far, empty = (away > OUT_OF_REACH_M) & np.isfinite(away), near & (points == 0)
+        far = (away > OUT_OF_REACH_M) & np.isfinite(away)
+        empty = near & (points == 0)
         for tally in (self._all, self._tallies[frame.agent]):
             tally.boxes += int(np.isfinite(away).sum())
             tally.far += int(far.sum())
@@ -123,11 +126,11 @@ class EmptyBoxes:
             tally.first = tally.first or (f"'{named[0]}' in {frame.key}" if named else "")
 
     def problems(self) -> Iterator[str]:
-        """Yield a sentence where most boxes of all agents are wrong, or else for each agent of which they are."""
-        if told := self._all.problem():
-            yield told
+        """Yield a sentence where most boxes of all agents are wrong, else one for every agent of which most are."""
+        if problem := self._all.problem():
+            yield problem
             return
-        yield from (f"{agent}: {told}" for agent, tally in self._tallies.items() if (told := tally.problem()))
+        yield from (f"{agent}: {problem}" for agent, tally in self._tallies.items() if (problem := tally.problem()))
 
 
 def _raise_floors(boxes: Boxes) -> Boxes:
@@ -139,13 +142,13 @@ def _raise_floors(boxes: Boxes) -> Boxes:
 
 
 def _are_in_view(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Return (M,) whether boxes in the LiDAR's frame are near it, with returns of `points` (N, 4) from beyond them.
+    """Return the mask (M,) of boxes in the LiDAR's frame near it, with `points` (N, 4) returned from beyond them.
 
-    Returns from beyond are in the same direction, at any height; boxes below all beams are not in view, nor are those
-    between two.
+    Returns from beyond are in the same direction, at any height; boxes below all beams or between two are not in view.
     """
     x, y, z = points[:, :3].T.astype(np.float64)
-    level, away = np.hypot(x, y), np.hypot(*boxes.center[:, :2].T)
+    level = np.hypot(x, y)
+    away = np.hypot(*boxes.center[:, :2].T)
     sectors = round(360 / SECTOR_DEG)
 
     def sector(ahead: Array, left: Array) -> NDArray[np.int64]:
@@ -154,7 +157,8 @@ def _are_in_view(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]
     reach = np.zeros(sectors)
     np.maximum.at(reach, sector(x, y), level)
     beyond = reach[sector(*boxes.center[:, :2].T)] > away + np.linalg.norm(boxes.size, axis=1) / 2
-    slopes, half = np.sort(z / np.maximum(level, 1e-9)), boxes.size[:, 2] / 2
+    slopes = np.sort(z / np.maximum(level, 1e-9))
+    half = boxes.size[:, 2] / 2
     low, high = (
         np.searchsorted(slopes, (boxes.center[:, 2] + side) / np.maximum(away, 1e-9)) for side in (-half, half)
     )
@@ -184,7 +188,7 @@ def check_motion(scene: str, trace: Trace) -> Iterator[str]:
 
 
 class CloudPlace(NamedTuple):
-    """A point cloud's place: its dataset, the scene and the split of that; the split is empty where it has none."""
+    """The place of a point cloud: its dataset, the dataset's split (empty where it has none) and the scene."""
 
     folder: Path
     split: str
@@ -192,9 +196,9 @@ class CloudPlace(NamedTuple):
 
 
 def find_copies(folders: Sequence[Path]) -> list[str]:
-    """Return a sentence for each two splits, of one dataset or of two, in which the same point clouds are.
+    """Return a sentence for each two splits, of one dataset or of two, that contain the same point clouds.
 
-    Folders that hold no whole dataset are left out: `validate` says what they lack.
+    Folders that hold no complete dataset are left out: `validate` reports what they lack.
     """
     first: dict[str, CloudPlace] = {}  # by checksum
     shared: dict[tuple[tuple[Path, str], tuple[Path, str]], list[tuple[str, str]]] = defaultdict(list)
@@ -202,7 +206,7 @@ def find_copies(folders: Sequence[Path]) -> list[str]:
         with contextlib.suppress(InputError):
             for digest, cloud in _list_clouds(folder):
                 one = first.setdefault(digest, cloud)
-                if one.split != cloud.split and one.scene != cloud.scene:  # else the name says it
+                if one.split != cloud.split and one.scene != cloud.scene:  # equal scene names are reported elsewhere
                     shared[one[:2], cloud[:2]].append((one.scene, cloud.scene))
     return [
         f"{one} (split '{split}') and {other} (split '{other_split}'): leakage, they share {len(scenes)} point clouds, "
@@ -212,13 +216,14 @@ def find_copies(folders: Sequence[Path]) -> list[str]:
 
 
 def _list_clouds(folder: Path) -> Iterator[tuple[str, CloudPlace]]:
-    """Yield checksum and place of the point clouds of a dataset, without the empty ones."""
+    """Yield the checksum and the place of all point clouds of a dataset except empty ones."""
     manifest = read_manifest(folder)
-    split_of, own = manifest.split_of, str(manifest.recipe.get("split", ""))
+    split_of = manifest.split_of
+    dataset_split = str(manifest.recipe.get("split", ""))
     frames = read_table(folder / table_path("frames"), "frames").select(["key", "scene", "lidar"]).to_pylist()
     files = read_table(folder / table_path(FILES), FILES).to_pydict()
     digests = {path: digest for path, size, digest in zip(files["path"], files["bytes"], files["sha256"]) if size}
     for row in frames:
         for lidar in row["lidar"]:
             if digest := digests.get(payload_path(lidar, row["key"], POINTS)):
-                yield digest, CloudPlace(folder, split_of.get(row["scene"], own), row["scene"])
+                yield digest, CloudPlace(folder, split_of.get(row["scene"], dataset_split), row["scene"])

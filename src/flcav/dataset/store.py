@@ -48,7 +48,7 @@ from flcav.world.map.town import PACKAGED, Town, load_town
 from flcav.world.trace import Trace
 
 KINDS = ("lidar", "radar", "cameras", "infrared")  # columns of `frames` that list sensors
-NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")  # of a frame, scene, agent or sensor
+NAME = re.compile(rf"[A-Za-z0-9_][A-Za-z0-9_.-]{{0,{LONGEST_NAME - 1}}}")  # names of frames, scenes, agents, sensors
 
 Value = TypeVar("Value")
 
@@ -130,16 +130,17 @@ class Dataset(Displayed):
         return f"Dataset({str(self.folder)!r}, {len(self)} frames, {len(self.manifest.scenes)} scenes)"
 
     def numbers(self, frames: Sequence[int] | None) -> Sequence[int]:
-        """Return `frames`, or the numbers of all frames for None."""
+        """Return `frames`, or for None the numbers of all frames."""
         return range(len(self)) if frames is None else frames
 
     def frame(self, i: int) -> Frame:
         """Return frame `i`; its images are read on first access.
 
-        Raises `InputError` where a point cloud or its recorded times are missing or not of the length in the table, and
-        on access to an image that is missing or damaged.
+        Raises `InputError` where a point cloud or its point times are missing or not of the length in the table, and on
+        access to an image that is missing or damaged.
         """
-        key, calibration = self.keys[i], self.calibrations[self.keys[i].agent]
+        key = self.keys[i]
+        calibration = self.calibrations[self.keys[i].agent]
         poses = self._tables["poses"].slice(i, 1).to_pylist()[0]
         if len(poses["world_from_agent_then"]) != 16 * len(poses["triggered"]):
             raise InputError(f"{self.folder / table_path('poses')}: '{self._name[i]}' needs 16 numbers for each pose")
@@ -177,41 +178,41 @@ class Dataset(Displayed):
         return frame
 
     def world_from_agent(self, i: int) -> Array:
-        """Return the (4, 4) pose of the agent in frame `i`, as `frame(i)` has it, without reading measurements."""
+        """Return the pose (4, 4) of the agent in frame `i` in the world frame [m], without reading measurements."""
         return np.array(self._tables["poses"]["world_from_agent"][i].as_py()).reshape(4, 4)
 
     def rows(self, name: str) -> tuple[pa.Table, NDArray[np.int64]]:
-        """Return a table of `flcav.dataset.tables`, and (rows,) the number of the frame that each row is of."""
+        """Return a table of `flcav.dataset.tables`, and the number of the frame to which each row belongs (rows,)."""
         table = self._tables[name]
         if name not in self._first:
             return table, np.arange(len(self))
         return table, np.repeat(np.arange(len(self)), np.diff(self._first[name]))
 
     def plane(self, i: int, camera: str, plane: str) -> NDArray:
-        """Return one plane ("rgb", "depth_m", "semantic" or "instance") of an image of frame `i`: see `CameraImage`.
+        """Return a plane ("rgb", "depth_m", "semantic" or "instance") of an image of frame `i`: see `CameraImage`.
 
         Raises `InputError` where its file is missing or damaged.
         """
         return read_plane(self.plane_path(i, camera, plane), plane)
 
     def plane_path(self, i: int, camera: str, plane: str) -> Path:
-        """Return the path of the file of one plane of an image of frame `i`."""
+        """Return the path of the file with a plane of an image of frame `i`."""
         suffixes = PICTURES if plane == "rgb" and self.manifest.imported else (PLANES[plane],)
         paths = [payload_path(camera, self._name[i], suffix) for suffix in suffixes]
         return self.folder / next((path for path in paths if path in self._files), paths[0])
 
     def trace(self, scene: str) -> Trace | None:
-        """Return the traffic of a scene, None if it was not recorded; raises `InputError` if its file is damaged."""
+        """Return the traffic of a scene, None if it was not recorded; raises `InputError` where its file is damaged."""
         path = self.folder / trace_path(scene)
         return Trace.load(path) if path.is_file() else None
 
     def navigation_logs(self, scene: str) -> dict[str, NavigationLog]:
-        """Return vehicle -> its navigation log of a scene; empty if none were recorded. `InputError` as `trace`."""
+        """Return the navigation logs of a scene by vehicle, empty without any; raises `InputError` as `trace` does."""
         path = self.folder / navigation_path(scene)
         return load_logs(path) if path.is_file() else {}
 
     def town(self) -> Town | None:
-        """Return the town of the dataset, from its own folder or from flcav; None where neither has it."""
+        """Return the town of the dataset, from the dataset's folder or from flcav; None where neither has it."""
         name = str(self.manifest.recipe.get("town", ""))
         if not name:  # imported
             return None
@@ -246,7 +247,7 @@ class Dataset(Displayed):
         ]
 
     def name(self, i: int) -> str:
-        """Return the key of frame `i` as text: `Frame.key`."""
+        """Return the key of frame `i` as text, see `Frame.key`."""
         return self._name[i]
 
     def lidars(self, i: int) -> list[str]:
@@ -279,7 +280,7 @@ class Dataset(Displayed):
         }
 
     def _point_times(self, i: int) -> dict[str, NDArray[np.float32]]:
-        """Return LiDAR -> (N,) the times of its points [s], for LiDARs with such a file, the rolling ones."""
+        """Return the times (N,) [s] of the points by LiDAR, for LiDARs with a file of them, the rolling ones."""
         timed = {
             sensor: count
             for sensor, count in self._lidar[i].items()
@@ -289,7 +290,7 @@ class Dataset(Displayed):
 
     @cached_property
     def _files(self) -> frozenset[str]:
-        """Return the relative paths of all files but the manifest and the tables."""
+        """Return the relative paths of all files except the manifest and the tables."""
         return frozenset(read_table(self.folder / table_path(FILES), FILES)["path"].to_pylist())
 
     def _image(self, i: int, camera: str) -> CameraImage:
@@ -343,7 +344,7 @@ def _check_frames(frames: pa.Table, path: Path) -> None:
 
 
 def _find_wrong_names(frames: pa.Table) -> Iterator[str]:
-    """Yield a sentence for each frame whose key does not match its row, or whose time is not finite."""
+    """Yield a sentence for each frame whose key does not match its row or whose time is not finite."""
     for row in frames.to_pylist():
         if row["key"] != format_key(row["scene"], row["index"], row["agent"]):
             yield f"'{row['key']}' is not spin {row['index']} of {row['agent']} in '{row['scene']}'"
@@ -352,9 +353,9 @@ def _find_wrong_names(frames: pa.Table) -> Iterator[str]:
 
 
 def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int64]:
-    """Return (F + 1,) offsets: the rows of frame i in `table` are [offset i, offset i + 1).
+    """Return offsets (F + 1,): the rows of frame i in `table` are [offset i, offset i + 1).
 
-    Raises `InputError` where a row belongs to no frame, or rows are not in the order of the frames.
+    Raises `InputError` where a row belongs to no frame, or the rows are not in the order of the frames.
     """
     number = pc.call_function(
         "index_in", [table["frame"]], pc.SetLookupOptions(value_set=frames["key"].combine_chunks())
@@ -365,9 +366,9 @@ def _first_rows(table: pa.Table, frames: pa.Table, path: Path) -> NDArray[np.int
 
 
 def _sensors(frames: pa.Table) -> dict[str, set[str]]:
-    """Return agent -> names of its LiDARs, radars, cameras and infrared cameras."""
-    found: dict[str, set[str]] = defaultdict(set)
+    """Return the names of the LiDARs, radars, cameras and infrared cameras, by agent."""
+    sensors: dict[str, set[str]] = defaultdict(set)
     for kind in KINDS:
         for agent, names in zip(frames["agent"].to_pylist(), frames[kind].to_pylist()):
-            found[agent].update(names)
-    return found
+            sensors[agent].update(names)
+    return sensors

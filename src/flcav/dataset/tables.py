@@ -99,9 +99,9 @@ def write_rows(table: pa.Table, path: Path) -> None:
 
 
 def join_tables(parts: Iterable[Path], schema: pa.Schema, path: Path) -> int:
-    """Concatenate the Parquet files `parts`, of the same `schema`, into the file `path`; return the number of rows.
+    """Concatenate the Parquet files `parts`, all of `schema`, into the file `path`; return the number of rows.
 
-    Equal rows give equal bytes. At most a row group and one part are in memory.
+    Equal rows give equal bytes, however they are divided into parts. At most a row group and one part are in memory.
     """
     rows = 0
     waiting = schema.empty_table()
@@ -119,7 +119,7 @@ def join_tables(parts: Iterable[Path], schema: pa.Schema, path: Path) -> int:
 def read_table(path: Path, name: str) -> pa.Table:
     """Return the table `name` from the file `path`.
 
-    Raises `InputError` that names the file where it is missing or damaged, has other columns, or has null values.
+    Raises `InputError`, naming the file, where it is missing or damaged, has other columns, or has null values.
     """
     table = read_parquet(path)
     schema = SCHEMAS.get(name, FILES_SCHEMA)
@@ -131,9 +131,9 @@ def read_table(path: Path, name: str) -> pa.Table:
 
 
 def list_files(folder: Path, manifest: Manifest) -> dict[str, tuple[int, str]]:
-    """Return path -> (bytes, SHA-256) of every file that the dataset in `folder` lists, all but the manifest.
+    """Return the size [bytes] and SHA-256 checksum of all files that a dataset lists, by path, except the manifest.
 
-    Where the listing is damaged, these are the files of the tables, of which it is one.
+    Where the listing is damaged, only the files of the tables, the listing among them, are returned.
     """
     listed = {name: (entry.bytes, entry.sha256) for name, entry in manifest.tables.items()}
     with contextlib.suppress(InputError):

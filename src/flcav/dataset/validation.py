@@ -81,7 +81,7 @@ def validate(path: Path | str, *, progress: Report = print_progress) -> list[str
 
 
 def _log_problems(dataset: Dataset, damaged: Collection[str]) -> Iterator[str]:
-    """Yield a sentence for each navigation log that cannot be read, or ends before its vehicle's last frame."""
+    """Yield a sentence for each navigation log that cannot be read or does not cover its vehicle's frames."""
     for scene in dataset.manifest.scenes:
         if navigation_path(scene) in damaged:
             continue
@@ -102,7 +102,7 @@ def _log_problems(dataset: Dataset, damaged: Collection[str]) -> Iterator[str]:
 def _frame_problems(frame: Frame, trace: Trace | None, *, imported: bool) -> Iterator[str]:
     yield from check_values(frame, imported=imported)
     yield from check_triggers(frame)
-    if not imported:  # KITTI has the camera's view alone of each spin
+    if not imported:  # KITTI has only the part of each spin that the camera sees
         yield from check_sweeps(frame)
     yield from check_points(frame, trace, imported=imported)
     yield from check_measurements(frame)
@@ -112,9 +112,9 @@ def _frame_problems(frame: Frame, trace: Trace | None, *, imported: bool) -> Ite
 
 
 def check_order(keys: Sequence[FrameKey]) -> list[str]:
-    """Return a sentence for each frame out of order.
+    """Return a sentence for each frame that is out of order.
 
-    Within a scene, spins and times increase together, and each agent has one frame per spin.
+    Within a scene spins and times increase together, and an agent has one frame per spin.
     """
     problems = []
     agents: dict[tuple[str, int], set[str]] = defaultdict(set)
@@ -167,31 +167,31 @@ def _trace(dataset: Dataset, scene: str, damaged: Collection[str]) -> Trace | No
 
 
 def find_leaks(manifests: Mapping[str, Manifest]) -> list[str]:
-    """Return a sentence for each pair of datasets of different splits that share traffic; `manifests` is by name.
+    """Return a sentence for each pair of datasets of different splits that share traffic; `manifests` are by name.
 
-    Frames of one scene show the same cars at the same places, so a scene belongs in one split. So does a traffic seed
-    of a town, which gives the same traffic in every recipe, and an imported recording, by the name of its folder: for
-    each of them in several splits of one dataset, there is a sentence, too.
+    Frames of a scene show the same cars at the same places, so a scene belongs in one split. The same holds for a
+    traffic seed of a town, which gives the same traffic in every recipe, and for an imported recording, identified by
+    its folder's name. A sentence is also returned for each recording that is in several splits of one dataset.
     """
     repeated = [sentence for name, manifest in manifests.items() for sentence in _repeated(name, manifest)]
     return repeated + [sentence for pair in combinations(manifests.items(), 2) for sentence in _shared(*pair)]
 
 
 def _recordings(manifest: Manifest) -> dict[str, list[str]]:
-    """Return recording -> scenes of a dataset: a scene is one, of its own name or, where imported, of its folder's."""
+    """Return the scenes of a dataset by recording: the scene itself or, for an imported one, its folder's name."""
     folders = manifest.recipe.get("folders")
-    found: dict[str, list[str]] = defaultdict(list)
+    recordings: dict[str, list[str]] = defaultdict(list)
     for scene in manifest.scenes:
-        found[str(folders.get(scene, scene)) if isinstance(folders, Mapping) else scene].append(scene)
-    return found
+        recordings[str(folders.get(scene, scene)) if isinstance(folders, Mapping) else scene].append(scene)
+    return recordings
 
 
 def _repeated(name: str, manifest: Manifest) -> Iterator[str]:
     split_of = manifest.split_of
     for recording, scenes in _recordings(manifest).items():
         if len(splits := {split_of.get(scene, "") for scene in scenes}) > 1:
-            told = " and ".join(f"'{split}'" for split in sorted(splits))
-            yield f"{name}: leakage, '{recording}' is in the splits {told}, as the scenes {', '.join(scenes)}"
+            quoted = " and ".join(f"'{split}'" for split in sorted(splits))
+            yield f"{name}: leakage, '{recording}' is in the splits {quoted}, as the scenes {', '.join(scenes)}"
 
 
 def _shared(one: tuple[str, Manifest], other: tuple[str, Manifest]) -> Iterator[str]:

@@ -1,21 +1,22 @@
-"""Labels by federated distillation: what vehicles report to the edge server, and what they learn from the road average.
+"""Labels by federated distillation: vehicles send boxes to the edge server, and learn from the road average.
 
 Wang et al. (IEEE Network 37(3), 2023): road sensors and vehicles send boxes with their uncertainties to the edge
 server, which averages them over a window of spins (`flcav.fusion.average`); each vehicle learns from the average at
-the time of its own frame. The window is centred on the frame: labels are made after the drive. Nobody knows ground
-truth, and vehicles know poses and times by their own navigation alone.
+the time of its own frame. The window is centred on the frame, since labels are made after the drive. Ground truth is
+not available, and a vehicle's pose and time are those of its navigation.
 
-- A box of the average is a label where a road sensor has it in half of its spins or more, or where two vehicles do,
-  each with a score that reaches the threshold of pseudo-labels in the mean of its spins, 0 in those without the box.
-  Vehicles run one network and see one street: that two of them are half sure of a wall is no evidence of a car.
-- What one vehicle alone is sure of is ignored in the loss: it is not unlearned, nor does a network confirm itself.
-- What vehicles alone report is dropped where road sensors saw free ground, or have a box of their own.
-- An anchor is a negative only where a road sensor saw free ground.
+- A box of the average is a label if a road sensor has it in half of its spins or more, or if two vehicles do, each with
+  a score that reaches the threshold of pseudo-labels in the mean of its spins, 0 in those without the box. Vehicles run
+  the same network in the same street, so that their false detections are correlated: two scores below the threshold do
+  not add up to a label.
+- A box of which one vehicle alone is sure is ignored in the loss: it is not unlearned, and no network confirms itself.
+- A box that only vehicles report is dropped where road sensors observed free ground, or have another box.
+- An anchor is a negative only where a road sensor observed free ground.
 
-The map corrects headings and classes: lanes say which way cars face, crossings who walks there. A car on a lane follows
-its direction within a few degrees, so that the lane is one more measurement of its heading, joined by inverse variance.
-Front and back of a car differ by few returns, and the lane decides. A slow road user on a sidewalk or crossing is
-a pedestrian, one on a lane elsewhere a cyclist; detectors mistake one for the other.
+The map corrects headings and classes by the direction of lanes and the place of crossings. A car on a lane follows its
+direction within a few degrees, so that the lane is one more measurement of its heading, joined by inverse variance.
+The returns hardly distinguish front and back of a car, and the lane decides. A slow road user on a sidewalk or crossing
+is a pedestrian, a fast one on a lane a cyclist; detectors confuse the two.
 """
 
 from collections.abc import Mapping, Sequence
@@ -55,7 +56,7 @@ from flcav.world.map.layers import MapLane, MapLayers
 
 STEP_M = 1.0  # between two points of a lane's centre line
 LANE_RAD = np.radians(4.0)  # standard deviation of a car's heading about its lane's
-ALONG_RAD = np.radians(30.0)  # a car that is turned farther from every lane does not follow one: it turns, or is parked
+ALONG_RAD = np.radians(30.0)  # a car turned by more from every lane follows none: it turns, or is parked
 WALKING_MPS = 2.5  # fastest pedestrian
 CARS = ("car", "van", "Car")
 PEDESTRIAN, CYCLIST = ("pedestrian", "Pedestrian"), ("bicycle", "Cyclist")
@@ -63,11 +64,11 @@ PEDESTRIAN, CYCLIST = ("pedestrian", "Pedestrian"), ("bicycle", "Cyclist")
 
 @dataclass(frozen=True)
 class MapContext:
-    """The parts of a town's map that labels are snapped to."""
+    """The parts of a town's map by which labels are corrected."""
 
-    points: KDTree  # (Q, 2) points of the centre lines of driving lanes
-    yaw: Array  # (Q,) direction of driving there [rad]
-    half_width_m: Array  # (Q,)
+    points: KDTree  # (Q, 2) points of the centre lines of driving lanes [m], world frame
+    yaw: Array  # (Q,) direction of driving at each point [rad]
+    half_width_m: Array  # (Q,) of the lane
     walked: STRtree  # sidewalks and crossings
 
 
@@ -77,14 +78,15 @@ def build_context(layers: MapLayers) -> MapContext:
     if not parts:
         raise ValueError("the map has no driving lane")
     rows = np.concatenate(parts)
-    areas = [Polygon(outline) for outline in (*layers.sidewalks, *(each.outline for each in layers.crossings))]
+    areas = [Polygon(outline) for outline in (*layers.sidewalks, *(crossing.outline for crossing in layers.crossings))]
     return MapContext(KDTree(rows[:, :2]), rows[:, 2], rows[:, 3], STRtree(areas))
 
 
 def snap_to_map(boxes: Boxes, velocity: Array, context: MapContext) -> Boxes:
-    """Return the boxes (N,), world frame, with headings of cars on lanes and classes of people snapped to the map.
+    """Return the boxes (N,), world frame, with headings of cars and classes of vulnerable road users by the map.
 
-    velocity: (N, 2) [m/s]. Of several lanes at a place, as on a junction, the one nearest to the box's axis counts.
+    velocity: (N, 2) [m/s], world frame. Of several lanes at a place, as on a junction, the one nearest to the box's
+    axis counts.
     """
     yaw, variance, label = boxes.yaw.copy(), variance_of(boxes), boxes.label.tolist()
     for row in np.flatnonzero(np.isin(boxes.label, CARS)):
@@ -96,10 +98,11 @@ def snap_to_map(boxes: Boxes, velocity: Array, context: MapContext) -> Boxes:
         axis = np.abs((context.yaw[near] - yaw[row] + np.pi / 2) % np.pi - np.pi / 2)
         if not len(near) or axis.min() > ALONG_RAD:
             continue
+        # Inverse-variance mean of the heading and the lane's direction, modulo half a turn: the lane sets which way.
         lane = context.yaw[near[axis.argmin()]]
-        off = (yaw[row] - lane + np.pi / 2) % np.pi - np.pi / 2
+        deviation = (yaw[row] - lane + np.pi / 2) % np.pi - np.pi / 2
         share = LANE_RAD**2 / (LANE_RAD**2 + variance[row, YAW])
-        yaw[row] = wrap_angle(lane + share * off)
+        yaw[row] = wrap_angle(lane + share * deviation)
         variance[row, YAW] *= share
     people = np.flatnonzero(np.isin(boxes.label, (*PEDESTRIAN, *CYCLIST)))
     walked = np.zeros(len(people), dtype=bool)
@@ -113,7 +116,7 @@ def snap_to_map(boxes: Boxes, velocity: Array, context: MapContext) -> Boxes:
 
 
 def _sample(lane: MapLane) -> Array:
-    """Return (Q, 4) points of a lane: x, y, direction, half the width."""
+    """Return points (Q, 4) of a lane's centre line: x, y [m], direction [rad], half the width [m]."""
     steps = np.diff(lane.centre_line, axis=0)
     lengths = np.hypot(*steps.T)
     counts = np.maximum(np.ceil(lengths / STEP_M).astype(int), 1)
@@ -125,9 +128,9 @@ def _sample(lane: MapLane) -> Array:
 
 
 TOLD = 0.1  # lowest score of a detection that a vehicle reports
-FREE = 0.5  # what vehicles alone report is dropped where road sensors saw more than this share of its footprint free
-PARTS = (8, 4)  # of a footprint, along and across, by which that share is measured
-RETURNS_M = 0.3  # margin around a box within which a vehicle's returns are the object's: poses are off
+FREE = 0.5  # a box of vehicles alone is dropped where road sensors saw more than this share of its footprint as free
+PARTS = (8, 4)  # points along and across a footprint by which that share is estimated
+RETURNS_M = 0.3  # margin around a box within which returns are the object's, since poses have errors
 
 
 class Distillation(Config):
@@ -148,22 +151,22 @@ class Guidance:
     """Message of the edge server on one frame of a vehicle: the road average, in the vehicle's frame."""
 
     boxes: Boxes  # (K,) label = detection class, or the actor category of a lookalike; with scores and variances
-    confirmed: Mask  # (K,) whether a road sensor has the box, or two sure vehicles; others are ignored
-    world_from_agent: Array  # (4, 4) the vehicle's pose as the edge server has it
+    confirmed: Mask  # (K,) whether a road sensor has the box, or two vehicles are sure of it; others are ignored
+    world_from_agent: Array  # (4, 4) [m] the vehicle's pose as the edge server estimates it
 
     def message(self) -> bytes:
-        """Return it as the message to the vehicle."""
+        """Return the message to the vehicle; boxes in single precision."""
         return pack_arrays({"pose": self.world_from_agent, "confirmed": self.confirmed, **_pack_boxes(self.boxes)})
 
     @classmethod
     def from_message(cls, message: bytes) -> "Guidance":
-        """Return what is in a message: the inverse of `message` up to single precision."""
+        """Return the guidance in a message: the inverse of `message` up to single precision."""
         arrays = unpack_arrays(message)
         return cls(_unpack_boxes(arrays), arrays["confirmed"], arrays["pose"])
 
 
 def pack_sighting(seen: Sighting) -> bytes:
-    """Return a vehicle's sighting as its message to the edge server: pose and its accuracy, boxes, posts."""
+    """Return a vehicle's sighting as its message to the edge server: time, pose and its accuracy, boxes, posts."""
     known = seen.navigation
     assert known is not None  # vehicles alone send messages: road sensors are wired
     about = {"time_s": np.array(seen.time_s), "accuracy": np.array((known.position_m, known.heading_rad))}
@@ -198,61 +201,67 @@ def average_spin(
     context: MapContext | None = None,
     around: Sequence[Sighting] = (),
 ) -> list[Guidance]:
-    """Return what the edge server sends each vehicle about a spin, in the order of the vehicles among the sightings.
+    """Return the edge server's guidance of each vehicle for a spin, in the order of the vehicles among the sightings.
 
     sightings: of vehicles, and of road sensors with actor categories as labels; views: of the road sensors. posts:
-    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: as reported.
-    context: the map that headings and classes are snapped to; None: they are as averaged. around: sightings of other
-    spins in the window, before and after, averaged with those of this one. Without any all speeds count as 0.
+    (P, 2) feet of the posts on the map [m], by which a pose graph corrects poses and clocks; None: no correction.
+    context: map by which headings and classes are corrected; None: no correction. around: sightings of other spins in
+    the window, before and after, averaged with those of this one; without any all speeds are 0.
     """
-    reported = [_classify(each, config) if each.navigation is None else each for each in (*sightings, *around)]
-    times_s = [each.time_s for each in sightings]
-    surveyed_s = [each.time_s for each in sightings if each.navigation is None]
+    reported = [
+        _classify(sighting, config) if sighting.navigation is None else sighting for sighting in (*sightings, *around)
+    ]
+    times_s = [sighting.time_s for sighting in sightings]
+    surveyed_s = [sighting.time_s for sighting in sightings if sighting.navigation is None]
     at_s = float(np.median(surveyed_s or times_s or [0.0]))
     if posts is not None:
         reported = correct_poses(reported, posts, at_s)
-    average = average_boxes([report_boxes(each) for each in reported], at_s)
+    average = average_boxes([report_boxes(sighting) for sighting in reported], at_s)
     boxes = average.boxes if context is None else snap_to_map(average.boxes, average.velocity, context)
     road, sure = _count_votes(reported, average, threshold)
     kept = select_labels(boxes, road, views, threshold)
     confirmed = (road | (sure > 1))[kept]
-    asking = [each for each in reported[: len(sightings)] if each.navigation is not None]
-    moved = [average.velocity[kept] * (each.time_s - at_s) for each in asking]
-    return [place_in(_shift(boxes[kept], by), confirmed, each) for each, by in zip(asking, moved, strict=True)]
+    # Every vehicle gets the objects at the time of its own frame.
+    vehicles = [sighting for sighting in reported[: len(sightings)] if sighting.navigation is not None]
+    moved = [average.velocity[kept] * (vehicle.time_s - at_s) for vehicle in vehicles]
+    return [place_in(_shift(boxes[kept], by), confirmed, vehicle) for vehicle, by in zip(vehicles, moved, strict=True)]
 
 
 def _count_votes(reported: Sequence[Sighting], average: RoadAverage, threshold: float) -> tuple[Mask, Ints]:
-    """Return (K,) whether a road sensor has each object, (K,) how many vehicles are sure of it, over a window."""
+    """Return (K,) whether a road sensor has each object, and (K,) the number of vehicles sure of it, over a window."""
     count = len(average.boxes)
-    road, sure = np.zeros(count, dtype=bool), np.zeros(count, dtype=np.int64)
-    for agent in {each.agent for each in reported}:
-        own = [(each, member) for each, member in zip(reported, average.member, strict=True) if each.agent == agent]
-        seen, score = np.zeros(count), np.zeros(count)
-        for each, member in own:  # an object has at most one box of a sighting
+    road = np.zeros(count, dtype=bool)
+    sure = np.zeros(count, dtype=np.int64)
+    for agent in {sighting.agent for sighting in reported}:
+        of_agent = [(one, member) for one, member in zip(reported, average.member, strict=True) if one.agent == agent]
+        seen = np.zeros(count)
+        score = np.zeros(count)
+        for sighting, member in of_agent:  # an object has at most one box of a sighting
             seen[member] += 1
-            score[member] += 1.0 if each.boxes.score is None else each.boxes.score
-        if own[0][0].navigation is None:
-            road |= (seen > 0) & (2 * seen >= len(own))
+            score[member] += 1.0 if sighting.boxes.score is None else sighting.boxes.score
+        if of_agent[0][0].navigation is None:
+            road |= (seen > 0) & (2 * seen >= len(of_agent))
         else:
-            sure += (seen > 0) & (score / len(own) >= threshold)
+            sure += (seen > 0) & (score / len(of_agent) >= threshold)
     return road, sure
 
 
 def _shift(boxes: Boxes, xy_m: Array) -> Boxes:
-    """Return boxes (N,) moved by (N, 2) along x and y [m]."""
+    """Return boxes (N,) moved by `xy_m` (N, 2) along x and y [m]."""
     return replace(boxes, center=boxes.center + np.column_stack((xy_m, np.zeros(len(boxes)))))
 
 
 def _classify(seen: Sighting, config: SecondConfig) -> Sighting:
-    """Return a road sensor's sighting with detection classes for actor categories; lookalikes keep theirs."""
+    """Return a road sensor's sighting with detection classes instead of actor categories; lookalikes keep theirs."""
     category = seen.boxes.label
-    named, lookalike = detection_labels(category, config.classes), is_lookalike(category, config.classes)
+    named = detection_labels(category, config.classes)
+    lookalike = is_lookalike(category, config.classes)
     label = np.where(lookalike, category, named)
     return replace(seen, boxes=replace(seen.boxes, label=label)[label != ""])
 
 
 def select_labels(boxes: Boxes, road: Mask, views: Sequence[RoadView], threshold: float) -> Mask:
-    """Return (N,) which boxes of an average are sent to vehicles; `road` (N,): whether a road sensor has the box."""
+    """Return (N,) which boxes of an average the vehicles get; `road` (N,): whether a road sensor has the box."""
     assert boxes.score is not None
     seen = boxes[road]
     near = np.linalg.norm(boxes.center[:, None, :2] - seen.center[None, :, :2], axis=2) < seen.size[None, :, 0] / 2
@@ -261,7 +270,7 @@ def select_labels(boxes: Boxes, road: Mask, views: Sequence[RoadView], threshold
 
 
 def share_of_free_ground(boxes: Boxes, views: Sequence[RoadView]) -> Array:
-    """Return (N,) the share of the footprint of each box, world frame, that road sensors saw as free ground."""
+    """Return (N,) the share of each box's footprint, world frame, that road sensors observed as free ground."""
     xy = spread_over_footprints(boxes, *PARTS)
     free = np.zeros(xy.shape[:2], dtype=bool)
     for view in views:
@@ -270,7 +279,7 @@ def share_of_free_ground(boxes: Boxes, views: Sequence[RoadView]) -> Array:
 
 
 def place_in(boxes: Boxes, confirmed: Mask, seen: Sighting) -> Guidance:
-    """Return the boxes, world frame, as guidance of a vehicle: in its frame, with the variance of its pose added."""
+    """Return boxes, world frame, as guidance of a vehicle: in its frame, with the variance of its pose added."""
     placed = add_pose_variance(boxes, seen).transform(inverse(seen.world_from_agent))
     return Guidance(placed, confirmed, seen.world_from_agent)
 
@@ -280,15 +289,15 @@ def distil_sample(
 ) -> Sample:
     """Return a vehicle's frame with the labels of federated distillation; network's frame.
 
-    own: the vehicle's detections, LiDAR frame; views: of the road sensors at the spin. Boxes to find are the confirmed
-    ones with returns of the vehicle; others, and lookalikes, are ignored in the loss. `free` holds the cell centres
-    that a road sensor saw as free ground, by the pose and mount that the vehicle knows.
+    own: the vehicle's detections, LiDAR frame; views: of the road sensors at the spin. Targets are the confirmed boxes
+    with returns of the vehicle; others, and lookalikes, are ignored in the loss. `free` holds the cell centres that a
+    road sensor observed as free ground, by the vehicle's estimated pose and assumed mount.
     """
     mount = frame.assumed.agent_from_sensor[lidar]
     points = crop_to_range(frame.lidar[lidar], config)
     boxes = guidance.boxes.transform(inverse(mount))
-    asked = np.isin(boxes.label, config.classes)
-    targets = asked & guidance.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
+    of_classes = np.isin(boxes.label, config.classes)
+    targets = of_classes & guidance.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)
     cells = cell_centers(config)
     below = np.column_stack((cells, np.full(len(cells), -mount[2, 3])))
     world = transform_points(guidance.world_from_agent @ mount, below)[:, :2]

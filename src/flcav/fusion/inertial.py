@@ -1,21 +1,21 @@
-"""Inertial navigation of a car aided by satellites: an error-state Kalman filter over a drive, smoothed backwards.
+"""GNSS-aided inertial navigation of a car: an error-state Kalman filter over a drive, and an RTS smoother.
 
 The nominal state (position and velocity of the IMU, attitude of the vehicle, biases) is integrated from the IMU's
 samples by the midpoint rule; the error state has 18 components: position and velocity in the world, attitude in the
 vehicle's axes, biases of specific force and angular rate, and the GNSS receiver's bias (Solà, "Quaternion kinematics
 for the error-state Kalman filter", 2017, eq. 235-238 and 260-270). Measurements, `RATE_HZ` times a second:
 
-- a fix: where the antenna is, and the receiver's bias, a first-order Gauss-Markov process. Of position and bias only
-  the sum is seen: what is left of the bias is in the covariance, and nearly the same in frames soon after one another;
-- a car neither slips aside nor leaves the road: across and upwards the velocity of its origin is 0 (Dissanayake et al.,
-  "The aiding of a low-cost strapdown inertial measurement unit using vehicle model constraints for land vehicle
-  applications", IEEE T-RA 17(5), 2001). In SUMO it is a car's middle that moves along its heading, as of a real car
-  its rear axle does;
-- at rest velocity and angular rate are 0 (Groves, "Principles of GNSS, inertial, and multisensor integrated navigation
-  systems", 2nd ed. 2013, 15.3): where the IMU is quiet and the filter's speed small;
-- the map: the car stands on its ground, whose height is known but on and below bridges.
+- a fix: position of the antenna plus the receiver's bias, a first-order Gauss-Markov process. Only the sum of position
+  and bias is observable: the remaining bias is in the covariance, and nearly the same in consecutive frames;
+- non-holonomic constraints: lateral and vertical velocity of the vehicle's origin are 0 (Dissanayake et al., "The
+  aiding of a low-cost strapdown inertial measurement unit using vehicle model constraints for land vehicle
+  applications", IEEE T-RA 17(5), 2001). In SUMO a car's middle moves along its heading, as the rear axle of a real car
+  does;
+- zero-velocity updates: at rest velocity and angular rate are 0 (Groves, "Principles of GNSS, inertial, and multisensor
+  integrated navigation systems", 2nd ed. 2013, 15.3), where the IMU's variation and the filter's speed are small;
+- the map: the car stands on the ground, whose height is known except on and below bridges.
 
-Labels are made after the drive, so a pose may use what was measured after it: Rauch, Tung and Striebel, "Maximum
+Labels are made after the drive, so that a pose may depend on later measurements: Rauch, Tung and Striebel, "Maximum
 likelihood estimates of linear dynamic systems", AIAA Journal 3(8), 1965. The Earth is flat and does not turn.
 """
 
@@ -34,26 +34,26 @@ from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.geodesy import convert_to_map
 from flcav.world.map.parameters import GeoReference
 
-STATES = 18  # position, velocity, attitude, biases of force and rate, bias of the receiver: 3 each
-ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's velocity across and upwards, its own axes
+STATES = 18  # position, velocity, attitude, biases of force, of rate, and of the receiver: 3 each
+ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's lateral and vertical velocity, vehicle's axes
 REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
-SLOW_MPS = 1.0  # at rest a vehicle is slower
-QUIET_S, QUIET = 1.0, 2.0  # and its IMU varies by at most so many standard deviations, so long before and after
+SLOW_MPS = 1.0  # greatest speed of a vehicle that may be at rest
+QUIET_S, QUIET = 1.0, 2.0  # and the greatest variation of its IMU, in standard deviations, this time before and after
 HEIGHT_M = 0.5  # standard deviation of the height of the map's ground below a fix
-HEADINGS = 8  # directions of the vehicle at the beginning that are tried
-BACKWARDS_M = 1.0  # no car drives farther backwards, all in all
-LEAST_WEIGHT = 1e-4  # of a direction beside the likeliest that counts
-BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD = 10.0, 2.0, 0.08  # standard deviations at the beginning
+HEADINGS = 8  # initial headings that are tried
+BACKWARDS_M = 1.0  # greatest net distance that a car drives backwards
+LEAST_WEIGHT = 1e-4  # of an initial heading that counts, relative to all
+BEGIN_M, BEGIN_MPS, BEGIN_TILT_RAD = 10.0, 2.0, 0.08  # initial standard deviations
 LEAST_SAMPLE, LEAST_FIX_M = (3e-3, 1e-4), 0.01  # least noise of an IMU's samples, [m/s^2] and [rad/s], and of fixes
-LEAST_BIAS = 1e-6  # standard deviation at the beginning, [m/s^2], [rad/s] or [m], of a sensor said to have none
-IMPOSSIBLE = 10.0  # mean of fixes' normalised squared innovations, of 3 dimensions: fixes and IMU are not of one drive
+LEAST_BIAS = 1e-6  # least initial standard deviation of a bias, [m/s^2], [rad/s] or [m]
+IMPOSSIBLE = 10.0  # mean normalised squared innovation of fixes, in 3 dimensions, above which fixes and IMU disagree
 
 
 @dataclass(frozen=True)
 class MotionEstimate:
     """Estimated poses of a vehicle at T times, and their covariance."""
 
-    world_from_agent: Array  # (T, 4, 4)
+    world_from_agent: Array  # (T, 4, 4) [m]
     covariance: Array  # (T, 6, 6) of position [m], world frame, and attitude [rad], vehicle's axes
 
     @property
@@ -65,31 +65,31 @@ class MotionEstimate:
 
 
 class Mounts(NamedTuple):
-    """Places of a vehicle's sensors in its frame, as it assumes them."""
+    """Mounts of a vehicle's sensors in its frame, as it assumes them."""
 
-    agent_from_gnss: Array  # (4, 4)
-    agent_from_imu: Array  # (4, 4)
+    agent_from_gnss: Array  # (4, 4) [m]
+    agent_from_imu: Array  # (4, 4) [m]
 
 
 class _States(NamedTuple):
-    """The states at E epochs: nominal ones, and covariances of their errors."""
+    """The states at E epochs: nominal states, and the covariances of their errors."""
 
-    position: Array  # (E, 3) of the IMU [m]
-    velocity: Array  # (E, 3) of the IMU [m/s]
+    position: Array  # (E, 3) of the IMU [m], world frame
+    velocity: Array  # (E, 3) of the IMU [m/s], world frame
     turn: Array  # (E, 3, 3) world from vehicle
-    bias: Array  # (E, 9) of force, rate and receiver
+    bias: Array  # (E, 9) of force [m/s^2] and rate [rad/s], vehicle's axes, and of the receiver [m], world axes
     covariance: Array  # (E, STATES, STATES)
 
 
 def estimate_drive(
     log: NavigationLog, mounts: Mounts, geo: GeoReference, ground: Callable[[Array, Array], Array], at_s: Array
 ) -> MotionEstimate:
-    """Return the poses of a vehicle at the times `at_s` (T,) within its log, by all of the log.
+    """Return the poses of a vehicle at the times `at_s` (T,) [s] within its log, smoothed over the whole log.
 
-    geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. Of the
-    heading at the beginning nothing is known: `HEADINGS` are tried, and of those with which the car drives forwards the
-    likeliest is taken, with the spread of those that are nearly as likely in its covariance. Raises `InputError` where
-    a time is not within the log, or the log's fixes and IMU are not of one drive.
+    geo: position of the map's origin. ground: heights [m] of the map at x, y (M,) [m]; NaN where it has several. The
+    initial heading is unknown: `HEADINGS` are tried, and of those with which the car drives forwards the likeliest is
+    taken; the deviations of those that are nearly as likely are in its covariance. Raises `InputError` where a time is
+    not within the log, or the log's fixes and IMU contradict each other.
     """
     if (off := at_s[~log.covers(at_s)]).size:
         raise InputError(
@@ -106,21 +106,21 @@ def estimate_drive(
     for turn in rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)):
         begin = (position, velocity, turn, covariance)
         tried.append(_filter(log.imu_time_s, inertia, (epochs, fixes, rest), levers, _sigmas(log), begin))
-    forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both, *_ in tried]
-    likelihood = np.nan_to_num(np.where(forwards, [each[-1] for each in tried], -np.inf), nan=-np.inf)
+    forwards = [_measure_way(log.imu_time_s[epochs], states) > -BACKWARDS_M for states, *_ in tried]
+    likelihood = np.nan_to_num(np.where(forwards, [result[-1] for result in tried], -np.inf), nan=-np.inf)
     best = int(likelihood.argmax())
     if not np.nanmean(tried[best][2]) < IMPOSSIBLE or not np.isfinite(tried[best][0][-1]).all():
         raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
     weights = np.exp(likelihood - likelihood[best])
-    kept = [(weight, *each[:2]) for weight, each in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
-    state = _mix([(weight, _smooth(both, transition)) for weight, both, transition in kept])
-    asked = _nearest(log.imu_time_s, at_s)
-    state = _States(*(each[np.searchsorted(epochs, asked)] for each in state))
-    return _of_agent(state, inertia[asked, 3:], at_s - log.imu_time_s[asked], levers[1])
+    kept = [(weight, *result[:2]) for weight, result in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
+    state = _mix([(weight, _smooth(states, transition)) for weight, states, transition in kept])
+    rows = _nearest(log.imu_time_s, at_s)
+    state = _States(*(values[np.searchsorted(epochs, rows)] for values in state))
+    return _of_agent(state, inertia[rows, 3:], at_s - log.imu_time_s[rows], levers[1])
 
 
 def _measure_way(times_s: Array, both: tuple[Array, ...]) -> float:
-    """Return how far [m] a vehicle drives forwards, by its updated states at these times."""
+    """Return the net distance [m] that a vehicle drives forwards, by its updated states, of index 0, at these times."""
     _, velocity, turn, *_ = both
     return float(np.einsum("ei,ei->e", velocity[0], turn[0, :, :, 0]) @ np.gradient(times_s))
 
@@ -130,12 +130,14 @@ def _list_epochs(
 ) -> tuple[Ints, Array]:
     """Return the IMU samples (E,) nearest to fixes and to `at_s`, and the fixes (E, 5), NaN where there are none.
 
-    A fix is x, y, z, how long after the sample it is, and the height of the ground there. places: (M, 3) of all fixes.
+    A fix is x, y, z [m], its time after the sample [s], and the height of the ground there [m]. places: (M, 3) of all
+    fixes [m].
     """
     used = np.flatnonzero(log.covers(log.fix_time_s))
     near = _nearest(log.imu_time_s, log.fix_time_s[used])
     epochs = np.unique(np.concatenate((near, _nearest(log.imu_time_s, at_s))))
-    fixes, row = np.full((len(epochs), 5), np.nan), np.searchsorted(epochs, near)
+    fixes = np.full((len(epochs), 5), np.nan)
+    row = np.searchsorted(epochs, near)
     x, y, _ = places[used].T
     fixes[row] = np.column_stack((places[used], log.fix_time_s[used] - log.imu_time_s[near], ground(x, y)))
     return epochs, fixes
@@ -148,18 +150,24 @@ def _nearest(times_s: Array, at_s: Array) -> Ints:
 
 
 def _sigmas(log: NavigationLog) -> Array:
-    """Return the data sheets as an array: deviations of samples, walks, and white noise and bias of fixes."""
+    """Return the noise of the sensors' data sheets, (9,), at least `LEAST_SAMPLE` and `LEAST_FIX_M`.
+
+    In order: standard deviations of a sample of force and rate, random walks of their biases, white noise of a fix
+    horizontally and vertically, the receiver's bias horizontally and vertically, and its correlation time [s].
+    """
     unit, receiver = log.unit, log.receiver
     samples = np.sqrt(unit.rate_hz / 2) * np.array((unit.force_noise, unit.rate_noise))
-    walks, white = (unit.force_walk, unit.rate_walk), np.array((receiver.noise_m, receiver.noise_up_m))
+    walks = (unit.force_walk, unit.rate_walk)
+    white = np.array((receiver.noise_m, receiver.noise_up_m))
     bias = (receiver.bias_m, receiver.bias_up_m, receiver.bias_s)
     return np.concatenate((np.maximum(samples, LEAST_SAMPLE), walks, np.maximum(white, LEAST_FIX_M), bias))
 
 
 def _begin(log: NavigationLog, places: Array, lever: Array) -> tuple[Array, Array, Array]:
-    """Return position, velocity and covariance at the first fix, of a level vehicle, `lever` (3,) to its antenna.
+    """Return initial position, velocity and covariance at the first fix, of a level vehicle; world frame.
 
-    The velocity is that of the first second. Raises `InputError` where there is but one fix while the IMU measures.
+    places: (M, 3) of all fixes [m]. lever: (3,) from the IMU to the antenna [m]. The velocity is the mean over the
+    first second. Raises `InputError` where there are fewer than two fixes while the IMU measures.
     """
     receiver, unit, times_s = log.receiver, log.unit, log.fix_time_s
     used = np.flatnonzero(log.covers(times_s))
@@ -181,9 +189,9 @@ def _begin(log: NavigationLog, places: Array, lever: Array) -> tuple[Array, Arra
 
 
 def _find_rest(log: NavigationLog, inertia: Array, epochs: Ints) -> Mask:
-    """Return (E,) whether the IMU varies no more around an epoch than by its white noise."""
-    aside = max(round(QUIET_S * log.unit.rate_hz), 2)
-    around = np.clip(epochs[:, None] + np.arange(-aside, aside + 1), 0, len(inertia) - 1)
+    """Return (E,) whether the IMU's variation around an epoch is within its white noise."""
+    half_width = max(round(QUIET_S * log.unit.rate_hz), 2)
+    around = np.clip(epochs[:, None] + np.arange(-half_width, half_width + 1), 0, len(inertia) - 1)
     sigma = np.repeat((log.unit.force_noise, log.unit.rate_noise), 3) * np.sqrt(log.unit.rate_hz / 2)
     return (inertia[around].std(axis=1) <= QUIET * np.maximum(sigma, LEAST_BIAS)).all(axis=1)
 
@@ -206,19 +214,23 @@ def _exp(v):
 
 @compiled
 def _filter(times_s, inertia, measured, levers, sigmas, begin):
-    """Return the updated and the predicted states (2, E, ...), transitions between epochs, and how well all this fits.
+    """Return the updated and the predicted states (2, E, ...), transitions between epochs, and measures of fit.
 
-    measured: epochs (E,), fixes (E, 5), see `_list_epochs`, and whether at rest (E,). levers: (2, 3) of antenna and
-    vehicle's origin from the IMU, vehicle's axes. sigmas: see `_sigmas`. begin: position, velocity, turn, covariance.
-    How well: normalised squared innovations (E,) of fixes, and the logarithm of the likelihood of all measurements but
-    rest, which each nominal state assumes at times of its own.
+    measured: epochs (E,), fixes (E, 5), see `_list_epochs`, and whether at rest (E,). levers: (2, 3) from the IMU to
+    antenna and vehicle's origin, vehicle's axes [m]. sigmas: see `_sigmas`. begin: position, velocity, turn,
+    covariance. Measures of fit: normalised squared innovations (E,) of fixes, and the log-likelihood of all
+    measurements but zero-velocity updates, since which epochs have these depends on the nominal state.
     """
     epochs, fixes, rest = measured
     position, velocity, turn, p = begin
     count, bias, likelihood = len(epochs), np.zeros(9), 0.0
-    positions, velocities, turns = np.zeros((2, count, 3)), np.zeros((2, count, 3)), np.zeros((2, count, 3, 3))
-    biases, covariances = np.zeros((2, count, 9)), np.zeros((2, count, STATES, STATES))
-    transition, misfit = np.zeros((count, STATES, STATES)), np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
+    positions = np.zeros((2, count, 3))
+    velocities = np.zeros((2, count, 3))
+    turns = np.zeros((2, count, 3, 3))
+    biases = np.zeros((2, count, 9))
+    covariances = np.zeros((2, count, STATES, STATES))
+    transition = np.zeros((count, STATES, STATES))
+    misfit = np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
     for e in range(count):
         phi = np.eye(STATES)
         for k in range(epochs[max(e - 1, 0)], epochs[e]):
@@ -236,18 +248,22 @@ def _filter(times_s, inertia, measured, levers, sigmas, begin):
 
         state = (position, velocity, turn, bias)
         h, r, noise, common = _measure(state, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas)
-        off = np.zeros(STATES)
-        for i in range(len(r)):  # one after another, since their noise is independent
+        shift = np.zeros(STATES)
+        for i in range(len(r)):  # sequential updates by scalars, since the measurements' noise is independent
             seen = p @ h[i]
-            variance, missed = (seen * h[i]).sum() + noise[i], r[i] - (h[i] * off).sum()
-            off += seen * (missed / variance)
+            variance = (seen * h[i]).sum() + noise[i]
+            missed = r[i] - (h[i] * shift).sum()
+            shift += seen * (missed / variance)
             p = p - np.outer(seen, seen / variance)
             if i < common:
                 likelihood -= (missed**2 / variance + np.log(variance)) / 2
             if i < 3 and np.isfinite(fixes[e, 0]):
                 misfit[e] += missed**2 / variance
-        p = (p + p.T) / 2
-        position, velocity, turn, bias = position + off[:3], velocity + off[3:6], turn @ _exp(off[6:9]), bias + off[9:]
+        p = (p + p.T) / 2  # symmetric despite rounding
+        position = position + shift[:3]
+        velocity = velocity + shift[3:6]
+        turn = turn @ _exp(shift[6:9])
+        bias = bias + shift[9:]
         covariances[0, e] = p
         positions[0, e], velocities[0, e], turns[0, e], biases[0, e] = position, velocity, turn, bias
     return (positions, velocities, turns, biases, covariances), transition, misfit, likelihood
@@ -255,7 +271,7 @@ def _filter(times_s, inertia, measured, levers, sigmas, begin):
 
 @compiled
 def _transit(turn, bias, sample, dt, sigmas):
-    """Return the transition of the error state over a sample, and the variance (STATES,) that it adds."""
+    """Return the transition of the error state over one sample interval, and the added process noise (STATES,)."""
     force, rate = sample[:3] - bias[:3], sample[3:] - bias[3:6]
     middle = turn @ _exp(rate * dt / 2)
     step, spread = np.eye(STATES), np.zeros(STATES)
@@ -274,14 +290,16 @@ def _transit(turn, bias, sample, dt, sigmas):
 
 @compiled
 def _measure(state, sample, fix, rests, levers, sigmas):
-    """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements.
+    """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements, and a count.
 
-    They are across and upwards velocity, before them the fix and the height of the ground where there are any, after
-    them velocity and angular rate at rest; also the number of those before the latter. sample: (3,) angular rate.
+    In order: the fix and the height of the ground, where there are any; lateral and vertical velocity; velocity and
+    angular rate, at rest. The count is that of the measurements before the last group. sample: (3,) angular rate
+    [rad/s].
     """
     position, velocity, turn, bias = state
     h, r, noise, rows = np.zeros((12, STATES)), np.zeros(12), np.zeros(12), 0
-    rate, back = sample - bias[3:6], turn.T @ velocity
+    rate = sample - bias[3:6]
+    back = turn.T @ velocity
     if np.isfinite(fix[0]):
         h[:3, :3], h[:3, 3:6], h[:3, 15:] = np.eye(3), np.eye(3) * fix[3], np.eye(3)
         h[:3, 6:9] = -turn @ _skew(levers[0])
@@ -292,7 +310,7 @@ def _measure(state, sample, fix, rests, levers, sigmas):
         h[rows, 6:9] = -(turn @ _skew(levers[1]))[2]
         r[rows], noise[rows] = fix[4] - position[2] - (turn @ levers[1])[2], HEIGHT_M**2
         rows += 1
-    along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, its own axes
+    along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, vehicle's axes
     for axis in range(1, 3):
         h[rows, 3:6] = turn[:, axis]
         h[rows, 6:9] = _skew(back)[axis]
@@ -309,15 +327,15 @@ def _measure(state, sample, fix, rests, levers, sigmas):
 
 
 def _smooth(both: tuple[Array, ...], transition: Array) -> _States:
-    """Return the smoothed states: each updated one, corrected by what the next one's prediction missed.
+    """Return the smoothed states: each updated state, corrected by the smoothed next one (Rauch-Tung-Striebel).
 
     both: the updated and the predicted states (2, E, ...).
     """
-    updated, predicted = (_States(*(each[i] for each in both)) for i in range(2))
-    smoothed = _States(*(each.copy() for each in updated))
+    updated, predicted = (_States(*(values[i] for values in both)) for i in range(2))
+    smoothed = _States(*(values.copy() for values in updated))
     for k in range(len(transition) - 2, -1, -1):
-        then = predicted.covariance[k + 1]
-        gain = np.linalg.solve(then, transition[k + 1] @ updated.covariance[k]).T
+        predicted_covariance = predicted.covariance[k + 1]
+        gain = np.linalg.solve(predicted_covariance, transition[k + 1] @ updated.covariance[k]).T
         missed = np.concatenate(
             (
                 smoothed.position[k + 1] - predicted.position[k + 1],
@@ -326,25 +344,25 @@ def _smooth(both: tuple[Array, ...], transition: Array) -> _States:
                 smoothed.bias[k + 1] - predicted.bias[k + 1],
             )
         )
-        off = gain @ missed
-        smoothed.position[k] += off[:3]
-        smoothed.velocity[k] += off[3:6]
-        smoothed.turn[k] = updated.turn[k] @ _exp(off[6:9])
-        smoothed.bias[k] += off[9:]
-        smoothed.covariance[k] += gain @ (smoothed.covariance[k + 1] - then) @ gain.T
+        shift = gain @ missed
+        smoothed.position[k] += shift[:3]
+        smoothed.velocity[k] += shift[3:6]
+        smoothed.turn[k] = updated.turn[k] @ _exp(shift[6:9])
+        smoothed.bias[k] += shift[9:]
+        smoothed.covariance[k] += gain @ (smoothed.covariance[k + 1] - predicted_covariance) @ gain.T
     return smoothed
 
 
 def _mix(states: list[tuple[float, _States]]) -> _States:
-    """Return the likeliest of several states; the others' positions and headings spread its covariance."""
-    likeliest = max(states, key=lambda each: each[0])[1]
+    """Return the likeliest of several states, with the others' deviations in position and heading in its covariance."""
+    likeliest = max(states, key=lambda weighted: weighted[0])[1]
     covariance = likeliest.covariance.copy()
     for weight, other in states:
-        away = other.position - likeliest.position
+        deviation = other.position - likeliest.position
         across = np.einsum("eij,eij->e", likeliest.turn[:, :2, 1:2], other.turn[:, :2, :1])
         along = np.einsum("eij,eij->e", likeliest.turn[:, :2, :1], other.turn[:, :2, :1])
         heading = np.arctan2(across, along)[:, None] * likeliest.turn[:, 2]  # about the vertical, vehicle's axes
-        covariance[:, :3, :3] += weight * away[:, :, None] * away[:, None]
+        covariance[:, :3, :3] += weight * deviation[:, :, None] * deviation[:, None]
         covariance[:, 6:9, 6:9] += weight * heading[:, :, None] * heading[:, None]
     return likeliest._replace(covariance=covariance)
 
@@ -358,7 +376,7 @@ def _log(turn: Array) -> Array:
 
 
 def _of_agent(state: _States, rate: Array, after_s: Array, lever: Array) -> MotionEstimate:
-    """Return the poses of the vehicle's origin, `lever` from the IMU, so long after each state (T,)."""
+    """Return the poses of the vehicle's origin, `lever` (3,) [m] from the IMU, `after_s` (T,) [s] after the states."""
     count = len(after_s)
     poses, covariance = np.zeros((count, 4, 4)), np.zeros((count, 6, 6))
     for i in range(count):

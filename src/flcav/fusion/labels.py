@@ -1,12 +1,12 @@
-"""Pseudo-labels of a vehicle's LiDAR sweep: detections of its own frozen network, fused with roadside labels.
+"""Pseudo-labels of a vehicle's LiDAR sweep: detections of its frozen network, fused with roadside labels.
 
-- A roadside box replaces the vehicle's own detection of the same object.
-- A detection where the roadside sensor saw the ground or other returns and labelled no object is dropped.
-- An anchor is a negative only where the vehicle saw free ground, or the roadside sensor free ground or returns;
+- A roadside box replaces the vehicle's detection of the same object.
+- A detection is dropped where the roadside sensor observed the ground or other returns and labelled no object.
+- An anchor is a negative only where the vehicle observed free ground, or the roadside sensor free ground or returns;
   elsewhere it is ignored.
-- Beside a roadside sensor, the vehicle's own detections teach classification alone, not size and pose: the network
-  would only learn its own output again, against the roadside boxes. Without one they teach both, which keeps boxes
-  from drifting.
+- Where there is a roadside sensor, the vehicle's detections train classification alone, not size and pose: against the
+  roadside boxes the network would only learn its own output again. Without one they train both, which keeps boxes from
+  drifting.
 """
 
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ from flcav.perception.objects.truth import detection_labels, is_lookalike, netwo
 from flcav.sensors.frame import Frame
 from flcav.world.map.relief import Relief
 
-CONTRADICTED = 0.5  # a detection is dropped where the roadside sensors observed more than this share of its footprint
+CONTRADICTED = 0.5  # a detection is dropped where roadside sensors observed more than this share of its footprint
 SAME_OBJECT_M = 1.0  # boxes of roadside sensors with centres at most this far apart are of one object
 
 
@@ -39,11 +39,11 @@ def label_sample(
     """Return a training sample of a vehicle's `frame`, labelled without ground truth; network's frame.
 
     `detections`: those of the frozen network above its score threshold, LiDAR frame. `views`: of the roadside sensors
-    at the same spin, world frame; without any, the detections are the only labels. Boxes to find are the roadside boxes
-    of the network's classes from which the vehicle has returns, then the detections that the road does not contradict.
-    Roadside boxes without a return, and of lookalike classes (trucks, buses), are ignored in the loss. `free` holds the
-    cell centres that the vehicle saw as free ground or a roadside sensor observed; `exact` marks the roadside boxes.
-    `relief` are the heights of the ground, world frame; None where it is level.
+    at the same spin, world frame; without any, the detections are the only labels. Targets are the roadside boxes of
+    the network's classes from which the vehicle has returns, then the detections that no view contradicts. Roadside
+    boxes without a return, and of lookalike classes (trucks, buses), are ignored in the loss. `free` holds the cell
+    centres that the vehicle observed as free ground or a roadside sensor observed; `exact` marks the roadside boxes.
+    `relief`: heights of the ground, world frame; None where it is level.
     """
     world_from_lidar = frame.world_from_sensor(lidar)
     points = crop_to_range(frame.lidar[lidar], config)
@@ -60,12 +60,12 @@ def label_sample(
     looked = np.zeros(len(cells), dtype=bool)
     for view in views:
         looked |= view.at(view.ground, cells_world) | view.at(view.occupied, cells_world)
-    own = detections[~_contradicted(detections, roadside, cells, looked)]
+    remaining = detections[~_contradicted(detections, roadside, cells, looked)]
     above = points[:, 2] + height
     if relief is not None:
         above = relief.above(transform_points(world_from_lidar, points[:, :3].astype(np.float64)))
     known = _free_ground(points, above, cells) | looked
-    boxes = concatenate([road[targets], own])
+    boxes = concatenate([road[targets], remaining])
     exact = np.arange(len(boxes)) < targets.sum() if views else None
     sample = Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
     return move_sample(sample, network_from_lidar(frame, config, lidar))
@@ -81,9 +81,9 @@ def label_by_tracks(
 ) -> Sample:
     """Return a training sample of a vehicle's `frame`, labelled by the tracks of its drive; network's frame.
 
-    Boxes to find are the tracks (LiDAR frame) that score `threshold` or more and from which this sweep has returns;
-    others, and boxes of lookalike classes in the `views` of roadside sensors, are ignored in the loss. Elsewhere there
-    is nothing: what no sweep of the drive has a track of, however faint, is background.
+    Targets are the tracks (LiDAR frame) that score `threshold` or more and from which this sweep has returns; others,
+    and boxes of lookalike classes in the `views` of roadside sensors, are ignored in the loss. Elsewhere is background,
+    since tracks of low score are kept, too.
     """
     assert tracks.score is not None
     points = crop_to_range(frame.lidar[lidar], config)
@@ -95,7 +95,7 @@ def label_by_tracks(
 
 
 def _distinct(boxes: Boxes) -> Ints:
-    """Return the indices of boxes that are no duplicates of an earlier one: two poles may label the same car."""
+    """Return the indices of boxes that do not duplicate an earlier one, as when two poles label the same car."""
     kept: list[int] = []
     for i, center in enumerate(boxes.center):
         if all(np.hypot(*(center - boxes.center[j])[:2]) > SAME_OBJECT_M for j in kept):
@@ -106,17 +106,19 @@ def _distinct(boxes: Boxes) -> Ints:
 def cell_centers(config: SecondConfig) -> Array:
     """Return the centres (K, 2) of the cells of `CELL_M` over the detector's range, x first, LiDAR frame [m]."""
     x0, y0, _, x1, y1, _ = config.range_m
-    x, y = np.arange(x0 + CELL_M / 2, x1, CELL_M), np.arange(y0 + CELL_M / 2, y1, CELL_M)
+    x = np.arange(x0 + CELL_M / 2, x1, CELL_M)
+    y = np.arange(y0 + CELL_M / 2, y1, CELL_M)
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 
 
 def _contradicted(detections: Boxes, roadside: Boxes, cells: NDArray, looked: Mask) -> Mask:
-    """Return (N,): whether the road labelled an object at a detection's place, or observed the place.
+    """Return (N,) whether a roadside sensor labelled an object at a detection's place, or observed the place.
 
-    `roadside` are the boxes of roadside sensors, `cells` (K, 2) cell centres, both in the LiDAR frame; `looked` (K,)
-    says which cells these sensors observed.
+    `roadside` are the boxes of roadside sensors, `cells` (K, 2) cell centres [m], both in the LiDAR frame; `looked`
+    (K,) marks the cells that these sensors observed.
     """
     flat = [1.0, 1.0, 0.0]
+    # In the plane: the boxes at height 0, one metre high.
     footprints = Boxes(detections.center * flat, detections.size * flat + [0, 0, 1], detections.yaw, detections.label)
     inside = points_in_boxes(np.c_[cells, np.zeros(len(cells))], footprints)
     seen = (inside & looked).sum(axis=1) > CONTRADICTED * np.maximum(inside.sum(axis=1), 1)
@@ -125,7 +127,7 @@ def _contradicted(detections: Boxes, roadside: Boxes, cells: NDArray, looked: Ma
 
 
 def _free_ground(points: Array32, above: NDArray, cells: Array) -> Mask:
-    """Return (K,): whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
+    """Return (K,) whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
     `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `above` (N,) are the points' heights over the
     ground [m].
@@ -134,12 +136,14 @@ def _free_ground(points: Array32, above: NDArray, cells: Array) -> Mask:
     shape = np.round((cells[-1] - cells[0]) / CELL_M).astype(int) + 1
     index = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64)
     inside = ((index >= 0) & (index < shape)).all(axis=1)
-    index, z = index[inside], above[inside]
+    index = index[inside]
+    z = above[inside]
 
     def hit(returns: Mask) -> Mask:
         grid = np.zeros(shape, dtype=bool)
         grid[index[returns, 0], index[returns, 1]] = True
         return grid
 
-    ground, standing = hit((z > GROUND_M[0]) & (z < GROUND_M[1])), hit((z >= GROUND_M[1]) & (z < TOP_M))
+    ground = hit((z > GROUND_M[0]) & (z < GROUND_M[1]))
+    standing = hit((z >= GROUND_M[1]) & (z < TOP_M))
     return find_free_cells(ground, standing).ravel()

@@ -1,15 +1,15 @@
 """Poses and clocks of vehicles corrected by a pose graph over shared objects and landmarks (GTSAM, extra `fusion`).
 
-Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the objects that agents reported. Factors are the
-vehicles' navigation, boxes as poses of objects seen from vehicles and from road sensors, whose poses are surveyed, and
-posts segmented from LiDAR as points that the map knows (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE ITS
-Magazine 2(4), 2010). A post is a thin upright column of returns with nothing beside it: a lamp, the mast of a sensor or
-a signal, the post of a sign. The Huber kernel bounds the weight of wrong associations.
+Nodes are the poses (x, y, yaw) of vehicles at each spin and those of the reported objects. Factors are the vehicles'
+navigation, boxes as poses of objects observed by vehicles and by road sensors, whose poses are surveyed, and posts
+segmented from LiDAR as landmarks of known position on the map (Grisetti et al., "A Tutorial on Graph-Based SLAM", IEEE
+ITS Magazine 2(4), 2010). A post is a thin upright column of returns that stands by itself: a lamp, the mast of a sensor
+or a signal, the post of a sign. The Huber kernel bounds the weight of wrong associations.
 
-Clocks are set before. A vehicle whose clock is fast reports a moving object where it was a little earlier than the time
-that it states. Road sensors, whose clocks are exact, see many of the same objects and the vehicle itself; the offset is
-the one at which both agree, by the likelihood over a grid of offsets with a share of outliers. Only moving objects
-determine it.
+Clocks are corrected before. A vehicle whose clock is fast reports a moving object where it was a little earlier than
+the time stated. Road sensors, whose clocks are exact, observe many of the same objects and the vehicle itself; the
+offset is the one at which both agree, by the likelihood over a grid of offsets with a share of outliers. Only moving
+objects determine it.
 """
 
 from collections.abc import Sequence
@@ -27,34 +27,37 @@ from flcav.interface.wording import format_install_command
 from flcav.world.map.town import Town
 
 POST_M = 0.15  # standard deviation of a post's foot
-POST_GATE_M = 1.5  # farthest a post may lie from its place on the map, beside the error of the pose
+POST_GATE_M = 1.5  # farthest that an observed post may lie from its place on the map
 HUBER = 1.345  # where the kernel turns from quadratic to linear [standard deviations]
-PASSES = 2  # of association and correction
+PASSES = 2  # alternations of association and optimisation
 
 
 def correct_poses(sightings: Sequence[Sighting], posts: Array, at_s: float) -> list[Sighting]:
     """Return the sightings of a window of spins with the poses and clocks of vehicles corrected.
 
-    posts: (P, 2) x, y of the posts on the map [m]. Road sensors stay as they are. Raises `InputError` where GTSAM is
-    not installed.
+    posts: (P, 2) x, y of the posts on the map [m]. at_s: time at which objects of different spins are associated [s].
+    Sightings of road sensors are unchanged. Raises `InputError` where GTSAM is not installed.
     """
     corrected = list(sightings)
     for _ in range(PASSES):
         corrected = set_clocks(corrected, at_s)
-        found = average_boxes([report_boxes(each) for each in corrected], at_s)
-        corrected = _optimise(sightings, corrected, found, posts)
+        average = average_boxes([report_boxes(sighting) for sighting in corrected], at_s)
+        corrected = _optimise(sightings, corrected, average, posts)
     return corrected
 
 
 def _optimise(
     stated: Sequence[Sighting], latest: Sequence[Sighting], found: RoadAverage, posts: Array
 ) -> list[Sighting]:
-    """Return the sightings with the poses of the graph's optimum; `latest` are the estimates to associate and start by.
+    """Return the sightings with the poses of the graph's optimum.
 
-    The objects of each instant are nodes of their own, so that nothing is assumed about their motion between spins.
+    `stated` has the navigation's poses, the priors; `latest` the estimates to associate and start with; `found` the
+    objects, posts (P, 2) [m] the landmarks. The objects of each instant are separate nodes, so that nothing is assumed
+    about their motion between spins.
     """
     gtsam = _import_gtsam()
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph = gtsam.NonlinearFactorGraph()
+    start = gtsam.Values()
     robust = gtsam.noiseModel.mEstimator.Huber.Create(HUBER)
 
     def noise(variance: Array) -> Any:
@@ -66,14 +69,14 @@ def _optimise(
     for number, seen in enumerate(_share_objects(latest, found)):
         key = gtsam.symbol("o", number)
         start.insert(key, gtsam.Pose2(*seen[0].place))
-        for each in seen:
-            reported = latest[each.sighting]
+        for observation in seen:
+            reported = latest[observation.sighting]
             if reported.navigation is None:
-                graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(*each.place), noise(each.variance)))
+                graph.add(gtsam.PriorFactorPose2(key, gtsam.Pose2(*observation.place), noise(observation.variance)))
             else:
-                own = planar(reported.world_from_agent).between(gtsam.Pose2(*each.place))
-                vehicle = gtsam.symbol("v", each.sighting)
-                graph.add(gtsam.BetweenFactorPose2(vehicle, key, own, noise(each.variance)))
+                relative = planar(reported.world_from_agent).between(gtsam.Pose2(*observation.place))
+                vehicle = gtsam.symbol("v", observation.sighting)
+                graph.add(gtsam.BetweenFactorPose2(vehicle, key, relative, noise(observation.variance)))
     landmarks = 0
     for number, (first, reported) in enumerate(zip(stated, latest, strict=True)):
         if reported.navigation is None or first.navigation is None:
@@ -87,12 +90,13 @@ def _optimise(
                 key, planar(first.world_from_agent), gtsam.noiseModel.Diagonal.Sigmas(np.maximum(sigmas, 1e-3))
             )
         )
-        for own, place in match_posts(reported, posts):
+        for observed, place in match_posts(reported, posts):
             point = gtsam.symbol("l", landmarks)
             landmarks += 1
             start.insert(point, place)
             graph.add(gtsam.PriorFactorPoint2(point, place, gtsam.noiseModel.Isotropic.Sigma(2, 0.01)))
-            bearing, range_m = gtsam.Rot2.fromAngle(np.arctan2(own[1], own[0])), float(np.hypot(*own))
+            bearing = gtsam.Rot2.fromAngle(np.arctan2(observed[1], observed[0]))
+            range_m = float(np.hypot(*observed))
             spread = np.array((POST_M / max(range_m, 1.0), POST_M)) ** 2
             graph.add(gtsam.BearingRangeFactor2D(key, point, bearing, range_m, noise(spread)))
     best = gtsam.LevenbergMarquardtOptimizer(graph, start).optimize()
@@ -111,7 +115,7 @@ def _optimise(
 
 
 def match_posts(reported: Sighting, posts: Array) -> list[tuple[Array, Array]]:
-    """Return pairs of a post as observed (2,), agent's frame, and on the map (2,), each used once, nearest first."""
+    """Return pairs of a post as observed (2,), agent's frame, and on the map (2,) [m]: each once, nearest first."""
     if not len(reported.posts) or not len(posts):
         return []
     feet = transform_points(
@@ -129,32 +133,33 @@ def match_posts(reported: Sighting, posts: Array) -> list[tuple[Array, Array]]:
 
 
 class _Seen(NamedTuple):
-    """An object as one agent saw it, moved to a common instant."""
+    """An object as one agent observed it, moved to a common instant."""
 
-    sighting: int
-    place: Array  # (3,) x, y, yaw, world frame by the agent's latest pose
-    variance: Array  # (3,) of the box, without that of the pose
+    sighting: int  # index
+    place: Array  # (3,) x, y [m], yaw [rad], world frame by the agent's latest pose
+    variance: Array  # (3,) of the box [m^2, m^2, rad^2], without that of the pose
 
 
 def _share_objects(sightings: Sequence[Sighting], found: RoadAverage) -> list[list[_Seen]]:
-    """Return the objects that several agents report at about one instant, each as these agents saw it.
+    """Return the objects that several agents report at about one instant, as the observations of each.
 
     The instants are those of the road sensors, or of all agents where there are none. A box is moved to the nearest
     instant by its object's velocity, and turned by 180 degrees where it faces against the object.
     """
-    surveyed = [each.time_s for each in sightings if each.navigation is None]
-    instants = np.unique(np.round(surveyed or [each.time_s for each in sightings], 3))
+    surveyed = [report.time_s for report in sightings if report.navigation is None]
+    instants = np.unique(np.round(surveyed or [report.time_s for report in sightings], 3))
     seen: dict[tuple[int, int], list[_Seen]] = {}
     for sighting, (reported, member) in enumerate(zip(sightings, found.member, strict=True)):
         instant = int(np.abs(instants - reported.time_s).argmin())
-        rows, variance = reported.boxes.transform(reported.world_from_agent).array(), variance_of(reported.boxes)
+        rows = reported.boxes.transform(reported.world_from_agent).array()
+        variance = variance_of(reported.boxes)
         for box, number in enumerate(member.tolist()):
             place = rows[box, [0, 1, YAW]]
             place[:2] += found.velocity[number] * (instants[instant] - reported.time_s)
             if np.cos(place[2] - found.boxes.yaw[number]) < 0:
                 place[2] = wrap_angle(place[2] + np.pi)
             seen.setdefault((number, instant), []).append(_Seen(sighting, place, variance[box, [0, 1, YAW]]))
-    return [each for each in seen.values() if len({sightings[one.sighting].agent for one in each}) > 1]
+    return [views for views in seen.values() if len({sightings[view.sighting].agent for view in views}) > 1]
 
 
 def check_gtsam() -> None:
@@ -170,56 +175,59 @@ def _import_gtsam() -> Any:
     return gtsam
 
 
-CLOCK_S = 0.3  # standard deviation of an offset, before anything is seen
-OFFSETS_S: Array = np.linspace(-0.9, 0.9, 91)  # within three of these
-LEAST_SPEED_MPS = 2.0  # slower objects say little about clocks
-TRACE_M = 0.2  # standard deviation of a trace, and of a vehicle's origin from the middle of its body
-BEYOND_S = 0.6  # farthest a trace is continued before its first and after its last instant
-OUTLIERS = 0.05  # share of places that belong to no trace
-LEAST_EVIDENCE = 2.0  # log-likelihood that an offset has above none: two standard deviations
+CLOCK_S = 0.3  # standard deviation of an offset, a priori
+OFFSETS_S: Array = np.linspace(-0.9, 0.9, 91)  # tried: within three standard deviations
+LEAST_SPEED_MPS = 2.0  # slower objects hardly determine clocks
+TRACE_M = 0.2  # standard deviation of a path, and of a vehicle's origin from the middle of its body
+BEYOND_S = 0.6  # longest extrapolation of a path before its first and after its last instant
+OUTLIERS = 0.05  # share of places that belong to no path
+LEAST_EVIDENCE = 2.0  # log-likelihood of an offset above that of none: two standard deviations
 
 
 @dataclass(frozen=True)
 class ObjectPath:
-    """The path of an object by road sensors alone."""
+    """The path of an object, by road sensors alone."""
 
     times_s: Array  # (T,) increasing, two or more
     places: Array  # (T, 2) x, y, world frame [m]
 
     def place_at(self, times_s: Array) -> Array:
-        """Return places (..., 2) at times (...): on straight lines between instants; infinite beyond `BEYOND_S`."""
-        known, at = self.times_s, np.asarray(times_s)
+        """Return places (..., 2) [m] at times (...) [s], by linear interpolation; infinite beyond `BEYOND_S`."""
+        known = self.times_s
+        at = np.asarray(times_s)
         before = np.clip(np.searchsorted(known, at) - 1, 0, len(known) - 2)
         share = (at - known[before]) / (known[before + 1] - known[before])
-        found = self.places[before] + (self.places[before + 1] - self.places[before]) * share[..., None]
-        found[(at < known[0] - BEYOND_S) | (at > known[-1] + BEYOND_S)] = np.inf
-        return found
+        places = self.places[before] + (self.places[before + 1] - self.places[before]) * share[..., None]
+        places[(at < known[0] - BEYOND_S) | (at > known[-1] + BEYOND_S)] = np.inf
+        return places
 
 
 def set_clocks(sightings: Sequence[Sighting], at_s: float) -> list[Sighting]:
-    """Return the sightings with the times of vehicles set to the clock of the road sensors, where these see them move.
+    """Return the sightings with vehicles' times on the clock of the road sensors, where these observe them moving.
 
-    at_s: time at which objects of different spins are associated [s]. Offsets that explain no more than none, by
-    `LEAST_EVIDENCE`, are left.
+    at_s: time at which objects of different spins are associated [s]. Times stay as stated where the offset does not
+    exceed `LEAST_EVIDENCE` over none.
     """
-    traces = trace_objects([each for each in sightings if each.navigation is None], at_s)
+    traces = trace_objects([sighting for sighting in sightings if sighting.navigation is None], at_s)
     offset = {
-        agent: estimate_offset([each for each in sightings if each.agent == agent], traces)
-        for agent in {each.agent for each in sightings if each.navigation is not None}
+        agent: estimate_offset([sighting for sighting in sightings if sighting.agent == agent], traces)
+        for agent in {sighting.agent for sighting in sightings if sighting.navigation is not None}
     }
-    return [replace(each, time_s=each.time_s - offset.get(each.agent, 0.0)) for each in sightings]
+    return [replace(sighting, time_s=sighting.time_s - offset.get(sighting.agent, 0.0)) for sighting in sightings]
 
 
 def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[ObjectPath]:
     """Return the paths of moving objects that road sensors report at two instants or more."""
-    found: dict[int, dict[float, list[tuple[Array, float]]]] = {}
-    reported = [report_boxes(each) for each in surveyed]
-    for each, member in zip(reported, average_boxes(reported, at_s).member, strict=True):
-        certain = 1 / variance_of(each.boxes)[:, :2].mean(axis=1)
-        for number, place, weight in zip(member.tolist(), each.boxes.center[:, :2], certain.tolist(), strict=True):
-            found.setdefault(number, {}).setdefault(round(each.time_s, 3), []).append((place, weight))
+    by_object: dict[int, dict[float, list[tuple[Array, float]]]] = {}
+    reported = [report_boxes(sighting) for sighting in surveyed]
+    for report, member in zip(reported, average_boxes(reported, at_s).member, strict=True):
+        information = 1 / variance_of(report.boxes)[:, :2].mean(axis=1)
+        for number, place, weight in zip(
+            member.tolist(), report.boxes.center[:, :2], information.tolist(), strict=True
+        ):
+            by_object.setdefault(number, {}).setdefault(round(report.time_s, 3), []).append((place, weight))
     traces = []
-    for seen in found.values():
+    for seen in by_object.values():
         times = np.array(sorted(seen))
         places = np.array([_average(seen[time]) for time in times.tolist()])
         if len(times) > 1 and np.linalg.norm(places[-1] - places[0]) >= LEAST_SPEED_MPS * (times[-1] - times[0]):
@@ -228,27 +236,28 @@ def trace_objects(surveyed: Sequence[Sighting], at_s: float) -> list[ObjectPath]
 
 
 def _average(seen: Sequence[tuple[Array, float]]) -> Array:
-    """Return the mean (2,) of places by their weights."""
+    """Return the weighted mean (2,) of places [m]."""
     places, weights = (np.array(column) for column in zip(*seen, strict=True))
     return weights @ places / weights.sum()
 
 
 def estimate_offset(own: Sequence[Sighting], traces: Sequence[ObjectPath]) -> float:
-    """Return by how much a vehicle's clock is fast [s]; 0 where `traces` do not determine it.
+    """Return the offset by which a vehicle's clock is fast [s]; 0 where `traces` do not determine it.
 
-    own: what the vehicle reports, with its poses.
+    own: the vehicle's sightings, with corrected poses or as navigation states them.
     """
     if not traces:
         return 0.0
     evidence = -0.5 * (OFFSETS_S / CLOCK_S) ** 2
-    for each in own:
-        assert each.navigation is not None
-        boxes = report_boxes(each).boxes
-        places = np.vstack((boxes.center[:, :2], each.world_from_agent[:2, 3]))
-        variance = np.append(variance_of(boxes)[:, :2].mean(axis=1), each.navigation.position_m**2) + TRACE_M**2
+    for sighting in own:
+        assert sighting.navigation is not None
+        boxes = report_boxes(sighting).boxes
+        places = np.vstack((boxes.center[:, :2], sighting.world_from_agent[:2, 3]))
+        variance = np.append(variance_of(boxes)[:, :2].mean(axis=1), sighting.navigation.position_m**2) + TRACE_M**2
         weight = np.append(np.ones(len(boxes)) if boxes.score is None else boxes.score, 1.0)
-        expected = np.stack([trace.place_at(each.time_s - OFFSETS_S) for trace in traces])
+        expected = np.stack([trace.place_at(sighting.time_s - OFFSETS_S) for trace in traces])
         apart = np.linalg.norm(places[:, None, None] - expected[None], axis=3).min(axis=1)  # (places, offsets)
+        # A mixture of a Gaussian about the nearest path and a uniform share of outliers, which bounds the evidence.
         evidence += weight @ np.log(OUTLIERS + np.exp(-0.5 * apart**2 / variance[:, None]))
     best = int(evidence.argmax())
     return float(OFFSETS_S[best]) if evidence[best] - evidence[len(OFFSETS_S) // 2] > LEAST_EVIDENCE else 0.0
@@ -263,13 +272,14 @@ LEAST_RETURNS = 4
 
 
 def segment_posts(points: Array32, height_m: float) -> Array:
-    """Return the feet (L, 2) x, y [m] of the posts in a sweep (N, >= 3), in the frame of the points.
+    """Return the feet (L, 2) x, y [m] of the posts in a sweep (N, >= 3) [m], in the frame of the points.
 
-    height_m: of the frame's origin above the road. Columns touch where their cells do, also at corners.
+    height_m: of the frame's origin above the road [m]. Cells are joined to columns in an 8-neighbourhood.
     """
     z = points[:, 2] + height_m
     near = (z > BAND_M[0]) & (z < BAND_M[1]) & (np.abs(points[:, :2]) < REACH_M).all(axis=1)
-    xy, z = points[near, :2].astype(np.float64), z[near].astype(np.float64)
+    xy = points[near, :2].astype(np.float64)
+    z = z[near].astype(np.float64)
     cells = round(2 * REACH_M / CELL_M)
     at = np.minimum(((xy + REACH_M) / CELL_M).astype(np.int64), cells - 1)
     grid = np.zeros((cells, cells), dtype=bool)
@@ -280,7 +290,8 @@ def segment_posts(points: Array32, height_m: float) -> Array:
     returns = np.bincount(number, minlength=count)
 
     def extent(values: Array) -> tuple[Array, Array]:
-        low, high = np.full(count, np.inf), np.full(count, -np.inf)
+        low = np.full(count, np.inf)
+        high = np.full(count, -np.inf)
         np.minimum.at(low, number, values)
         np.maximum.at(high, number, values)
         return low, high

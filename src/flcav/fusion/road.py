@@ -1,13 +1,13 @@
 """Roadside perception of one LiDAR spin: object boxes, and grids of free and occupied cells, sent to the vehicles.
 
-The boxes come from the trained detector, or from an *ideal* one: it labels exactly the objects from which its LiDAR has
-at least `MIN_RETURNS` returns. Every figure that uses the ideal one is an upper bound.
+The boxes are those of the trained detector, or of an *ideal* one: it labels exactly the objects from which its LiDAR
+has at least `MIN_RETURNS` returns. Every result with the ideal detector is an upper bound.
 
-The trained detector is SECOND on the returns that stand in front of a pole's static background. Its weights come with
-the package (the network "road" of the task objects). It was trained in the towns `TRAINED_IN`; its score threshold was
-fixed there, on frames of other scenes. A sensor that stands still knows the map around it, and what it takes for a car
-off the drivable surface is none. Where the map has heights, it sees the street flattened: each return as high above the
-sensor's foot as it is above the ground below it, since the network knows level streets. How well it works elsewhere is
+The trained detector is SECOND on the returns in front of a pole's static background. Its weights are shipped with the
+package (the network "road" of the task objects). It was trained in the towns `TRAINED_IN`; its score threshold was
+chosen there, on frames of other scenes. A stationary sensor knows the map around it, and its detections of cars off the
+drivable surface are dropped. Where the map has heights, the network gets flattened returns, each as high above the
+sensor's foot as it is above the ground below it, since it was trained on level streets. Its accuracy in other towns is
 in `reproductions/road-detector`.
 """
 
@@ -37,11 +37,11 @@ from flcav.perception.weights import find_shipped, load_network
 from flcav.sensors.frame import Frame
 from flcav.world.map.relief import Relief
 
-MIN_RETURNS = 10  # an object with fewer returns from the roadside LiDAR is not labelled
+MIN_RETURNS = 10  # least number of returns from the roadside LiDAR of an object that is labelled
 CELL_M = 0.4  # edge of a cell of the free and occupied grids
 REACH = np.ones((5, 5), dtype=bool)  # structuring element: a return counts for the cells up to two away
 GROUND_M = (-0.3, 0.3)  # a return between these heights above the road is ground (kerbs are 0.12)
-TOP_M = 3.0  # higher returns (crowns, signs, walls) are ignored: they say nothing about the road below
+TOP_M = 3.0  # higher returns (crowns, signs, walls) are ignored: they are no evidence about the road below
 
 
 @dataclass(frozen=True)
@@ -50,11 +50,11 @@ class RoadView:
 
     boxes: Boxes  # labelled objects; label = actor category
     origin: Array  # (2,) world x, y of the corner of cell (0, 0) [m]
-    ground: Mask  # (X, Y) cells of CELL_M that were seen to be free ground
+    ground: Mask  # (X, Y) cells of CELL_M that were observed as free ground
     occupied: Mask  # (X, Y) cells with returns above the ground
 
     def at(self, cells: Mask, xy: NDArray) -> Mask:
-        """Return (K,): the value of the grid `cells` (`ground` or `occupied`) at each world position `xy` (K, 2) [m].
+        """Return (K,) the value of the grid `cells` (`ground` or `occupied`) at each world position `xy` (K, 2) [m].
 
         It is False outside the grid.
         """
@@ -96,15 +96,16 @@ def label_ideally(frame: Frame) -> Boxes:
 def build_road_view(
     frame: Frame, boxes: Boxes, lidar: str = "lidar", relief: Relief | None = None, ground_m: float = 0.0
 ) -> RoadView:
-    """Return the view of the roadside sensor that recorded `frame`: its LiDAR `lidar`, and what its detector found.
+    """Return the view of the roadside sensor that recorded `frame`: its detected `boxes`, and grids of its LiDAR.
 
-    `boxes`: world frame, label = actor category. The grids cover the returns of the sweep; `relief` are the heights of
-    the ground; None where it is level, at `ground_m` [m] in the world.
+    `boxes`: world frame, label = actor category. The grids cover the returns of the sweep. `relief`: heights of the
+    ground; None where it is level, at `ground_m` [m] in the world.
     """
     points = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(np.float64))
     origin = np.floor(points[:, :2].min(axis=0) / CELL_M) * CELL_M
     shape = tuple(np.floor((points[:, :2].max(axis=0) - origin) / CELL_M).astype(int) + 1)
-    ground, occupied = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    ground = np.zeros(shape, dtype=bool)
+    occupied = np.zeros(shape, dtype=bool)
     x, y = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64).T
     above = points[:, 2] - ground_m if relief is None else relief.above(points)
     low = (above > GROUND_M[0]) & (above < GROUND_M[1])
@@ -119,7 +120,7 @@ def find_free_cells(ground: Mask, standing: Mask) -> Mask:
     return np.asarray(binary_dilation(ground, REACH)) & ~np.asarray(binary_dilation(standing, REACH), dtype=bool)
 
 
-ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects; of pictures, to that of signs
+ROAD = "shipped/road.safetensors"  # relative to the folder of the task objects; for cameras, to that of signs
 TRAINED_IN = ("arterial", "suburb")  # towns
 THRESHOLD = 0.7  # lowest score of a label
 PICTURE_THRESHOLD = 0.07  # lowest score of a car in a picture: chosen in the town `ring`
@@ -135,15 +136,15 @@ def load_road_network() -> Second:
 
 @lru_cache(maxsize=1)
 def load_picture_network() -> SignDetector:
-    """Return the package's network that finds cars in pictures of roadside cameras, trained in the same towns."""
+    """Return the package's network that detects cars in pictures of roadside cameras, trained in the same towns."""
     return load_network(SIGNS, find_shipped(SIGNS, ROAD))
 
 
 def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int], Boxes]:
-    """Return the function that detects objects in a roadside frame of `data` by its number.
+    """Return the function that detects objects in the roadside frame of `data` with a given number.
 
     It returns boxes in the world frame with actor category, score of `threshold` or more, and variances. Without a map,
-    as of an imported dataset, boxes anywhere are returned.
+    as of an imported dataset, boxes off the road are returned, too.
     """
     network, town = load_road_network(), data.town()
     read = frame_reader(data, network.config.foreground)
@@ -153,12 +154,13 @@ def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int]
     def find(number: int) -> Boxes:
         frame = read(number)
         lidar = choose_lidar(frame)
-        points, world_from_lidar = frame.lidar[lidar], frame.world_from_sensor(lidar)
+        points = frame.lidar[lidar]
+        world_from_lidar = frame.world_from_sensor(lidar)
         if relief is not None:
             points = flatten_ground(points, world_from_lidar, relief)
-        found = detect(network, points, score_threshold=threshold)
-        category = np.array([CATEGORY[str(name)] for name in found.label], dtype=np.str_)
-        boxes = replace(found, label=category).transform(world_from_lidar)
+        detections = detect(network, points, score_threshold=threshold)
+        category = np.array([CATEGORY[str(name)] for name in detections.label], dtype=np.str_)
+        boxes = replace(detections, label=category).transform(world_from_lidar)
         if relief is not None:
             boxes = replace(boxes, center=boxes.center + rise_from(world_from_lidar, boxes.center, relief))
         return boxes if surface is None else keep_on_surface(boxes, surface)
@@ -167,9 +169,9 @@ def road_detector(data: Dataset, threshold: float = THRESHOLD) -> Callable[[int]
 
 
 def flatten_ground(points: Array32, world_from_lidar: Array, relief: Relief) -> Array32:
-    """Return points (N, >= 3) [m], LiDAR frame, as they would lie if all ground were as high as that below the sensor.
+    """Return points (N, >= 3) [m], LiDAR frame, as if all ground were at the height of that below the sensor.
 
-    Each keeps its place on the map and its height above the ground there.
+    A point keeps its place on the map and its height above the ground there.
     """
     world = transform_points(world_from_lidar, points[:, :3].astype(np.float64))
     level = transform_points(inverse(world_from_lidar), world - rise_from(world_from_lidar, world, relief))
@@ -177,7 +179,7 @@ def flatten_ground(points: Array32, world_from_lidar: Array, relief: Relief) -> 
 
 
 def rise_from(world_from_lidar: Array, places: Array, relief: Relief) -> Array:
-    """Return (N, 3) how far the ground rises from the sensor's foot to below `places` (N, 3), world frame [m]."""
+    """Return (N, 3) the rise of the ground from the sensor's foot to below `places` (N, 3), world frame [m]."""
     rise = relief.heights(*places[:, :2].T) - relief.heights(*world_from_lidar[:2, 3])
     return np.column_stack((np.zeros((len(places), 2)), rise))
 

@@ -1,4 +1,4 @@
-"""The network: sizes of messages, the price of a plan, the ledger of budgets, radio links, the clock of rounds."""
+"""Network: message sizes, uplink traffic of a plan, ledger of budgets, radio links, simulated clock of rounds."""
 
 from typing import TYPE_CHECKING
 

@@ -1,6 +1,6 @@
 """Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces.
 
-Messages on a link: arrays as bytes and back, and sending them through a ledger.
+Messages on a link: conversion of arrays to bytes and back, and sending through a ledger.
 
 A message is a safetensors file: names, types and shapes of its arrays in JSON, then their values; nothing is unpickled.
 """
@@ -28,18 +28,18 @@ BYTES_PER_MB = 1_000_000
 
 
 class BudgetExceeded(InputError):
-    """Raised for an uplink message that is larger than what is left of the budget of its link."""
+    """Raised for an uplink message that is larger than the remaining budget of its link."""
 
 
 @dataclass(frozen=True)
 class LinkMegabytes:
-    """Megabytes on each uplink: a budget, a price, or what was sent [MB; 1 MB = 10^6 bytes]."""
+    """Megabytes on each uplink: a budget, a price, or the traffic sent [MB; 1 MB = 10^6 bytes]."""
 
     wireless_mb: float  # from vehicles to edge servers
     wireline_mb: float  # from edge servers to the cloud
 
     def bytes_on(self, link: Link) -> int:
-        """Return the bytes on `link`."""
+        """Return the bytes on `link`, rounded to a whole number."""
         return round((self.wireless_mb if link == "wireless" else self.wireline_mb) * BYTES_PER_MB)
 
 
@@ -104,7 +104,8 @@ class Ledger:
     def check(self, entry: LedgerEntry) -> None:
         """Raise `BudgetExceeded` if `entry` is an uplink message over the budget."""
         if entry.direction == "up":
-            used, budget = self._up[entry.link], self.budget.bytes_on(entry.link)
+            used = self._up[entry.link]
+            budget = self.budget.bytes_on(entry.link)
             if used + entry.bytes > budget:
                 raise BudgetExceeded(
                     f"{entry.link} uplink budget exceeded: {entry.client} wants {_mb(entry.bytes)} MB for round "
@@ -187,7 +188,7 @@ def unpack_arrays(message: bytes) -> dict[str, NDArray]:
 
 
 def from_names(names: Iterable[str]) -> Bytes:
-    """Return names without line breaks as an array for a message: UTF-8, each ends with a line break."""
+    """Return names without line breaks as an array for a message: UTF-8, with a line break after each."""
     return np.frombuffer(bytearray("".join(f"{name}\n" for name in names), "utf-8"), dtype=np.uint8)
 
 
@@ -197,7 +198,7 @@ def to_names(array: Bytes) -> Words:
 
 
 def carry(message: bytes) -> bytes:
-    """Return a message as it is received at the other end of its link: in a simulation, the same bytes."""
+    """Return a message as received at the other end of its link: in a simulation, the same bytes."""
     return message
 
 
@@ -212,7 +213,7 @@ def send_message(
     client: str,
     round_: int = 0,
 ) -> bytes:
-    """Send a message of a client, up, or to it, down; return its bytes as they are received.
+    """Send a message of a client, up, or to it, down; return its bytes as received.
 
     It is entered in the ledger first, see `LedgerEntry`. Raises `BudgetExceeded`, and then nothing is sent.
     """

@@ -11,8 +11,8 @@ class MessageSizes:
 
     sample_mb: float  # one labelled sample
     model_mb: float  # one model update
-    exchange_mb: float | None = None  # what a vehicle sends to be combined in a round; None: a model update
-    labels_mb: float | None = None  # what it sends to have its samples labelled; None: nothing
+    exchange_mb: float | None = None  # a vehicle's upload to be combined in a round; None: a model update
+    labels_mb: float | None = None  # its upload to have its samples labelled; None: nothing
 
 
 @dataclass(frozen=True)
@@ -28,16 +28,16 @@ class StagePlan:
     """
 
     samples: int  # stage I: labelled samples uploaded vehicle -> edge -> cloud
-    edge_rounds: int  # stage II rounds, in every region
-    cloud_rounds: int  # stage III rounds
+    edge_rounds: int  # rounds of stage II, in every region
+    cloud_rounds: int  # rounds of stage III
     edge_groups: tuple[int, ...]  # vehicles per edge server
-    edge_rounds_per_cloud_round: int = 1  # k: stage III
-    called: int | None = None  # vehicles of each edge server in rounds of stage II, at most; None: all
+    edge_rounds_per_cloud_round: int = 1  # k of stage III
+    called: int | None = None  # greatest number of vehicles per edge server in a round of stage II; None: all
 
     @property
     def edge_vehicles(self) -> int:
         """Number of vehicles in a round of stage II."""
-        return sum(self.edge_groups if self.called is None else (min(self.called, own) for own in self.edge_groups))
+        return sum(self.edge_groups if self.called is None else (min(self.called, size) for size in self.edge_groups))
 
 
 def price(plan: StagePlan, sizes: MessageSizes) -> LinkMegabytes:
@@ -57,7 +57,8 @@ def price(plan: StagePlan, sizes: MessageSizes) -> LinkMegabytes:
     >>> price(plan, MessageSizes(sample_mb=0.5, model_mb=1.0, exchange_mb=0.01, labels_mb=0.02))
     LinkMegabytes(wireless_mb=101.61, wireline_mb=106.0)
     """
-    uploaded, vehicles = plan.samples * sizes.sample_mb, sum(plan.edge_groups)
+    uploaded = plan.samples * sizes.sample_mb
+    vehicles = sum(plan.edge_groups)
     of_edge = plan.edge_rounds * plan.edge_vehicles
     updates = of_edge + plan.edge_rounds_per_cloud_round * plan.cloud_rounds * vehicles
     labellings = of_edge + (plan.cloud_rounds > 0) * vehicles

@@ -3,7 +3,7 @@
 It is the graph of the article's Fig. 3a, in three layers of edges:
 
 - Layer 1 joins each task to its network. Tasks with the same network are a cluster: one resource serves them all, and
-  the cluster's loss is the weighted sum of theirs. A task may have its own learning curve.
+  the cluster's loss is the weighted sum of theirs. A task's learning curve overrides its network's.
 - Layer 2 joins a network to the modalities that it reads, with the size of one sample [MB].
 - Layer 3 joins a modality to the vehicles that record it, with the number and the quality of the samples they hold.
 
@@ -35,7 +35,7 @@ class TaskNode(Quantities):
 
 
 class NetworkNode(Quantities):
-    """A network: its messages, its modalities, limits, and the learning curve of tasks that have none of their own."""
+    """A network: message sizes, modalities, limits, and the learning curve of those of its tasks that state none."""
 
     model_mb: Positive  # one model update
     exchange_mb: Annotated[Positive | None, LEFT_OUT] = None  # as of `AllocationTask`
@@ -110,7 +110,7 @@ def _known(field: str, name: str, among: Mapping[str, Any]) -> None:
 def build_graph(layers: Layers) -> nx.Graph:
     """Return the graph of `layers`: nodes (kind, name), edges with attribute `layer` 1, 2 or 3.
 
-    Node attributes are `kind` and the node's own numbers; edge attributes `weight` (layer 1), `sample_mb` (layer 2),
+    Node attributes are `kind` and the node's fields; edge attributes `weight` (layer 1), `sample_mb` (layer 2),
     `samples` and `quality` (layer 3). Budgets, k and the horizon are attributes of the graph.
     """
     graph = nx.Graph(
@@ -122,8 +122,8 @@ def build_graph(layers: Layers) -> nx.Graph:
         graph.add_node(("task", name), kind="task", curve=task.model_dump(mode="json")["curve"])
         graph.add_edge(("task", name), ("network", task.network), layer=1, weight=task.weight)
     for name, network in layers.networks.items():
-        own = network.model_dump(mode="json", exclude={"modalities"})
-        graph.add_node(("network", name), kind="network", **own)
+        attributes = network.model_dump(mode="json", exclude={"modalities"})
+        graph.add_node(("network", name), kind="network", **attributes)
         for modality in network.modalities:
             sample_mb = layers.modalities[modality].sample_mb
             graph.add_edge(("network", name), ("modality", modality), layer=2, sample_mb=sample_mb)
@@ -258,27 +258,27 @@ def to_problem(graph: nx.Graph) -> Problem:
 def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> dict[str, Any]:
     """Return the learning curve of a cluster's weighted mean error; a plain curve where all its tasks have the same."""
     shared = layers.networks[network].curve
-    own = {name: layers.tasks[name].curve or shared for name in tasks}
+    curves = {name: layers.tasks[name].curve or shared for name in tasks}
     members = [
         {"name": name, "weight": tasks[name], "curve": curve.model_dump()}
-        for name, curve in own.items()
+        for name, curve in curves.items()
         if curve is not None
     ]
-    if all(curve == own[members[0]["name"]] for curve in own.values()):
+    if all(curve == curves[members[0]["name"]] for curve in curves.values()):
         return members[0]["curve"]
     return {"model": "shared", "members": members}
 
 
 def _named(fleet: Mapping[str, VehicleNode], held: Mapping[str, Sequence[Holding]], train_s: float) -> dict[str, Any]:
-    """Return the fields of a cluster that name its vehicles; where a link is not known, only the time to train."""
+    """Return the fields of a cluster that name its vehicles; only the training time where a link is not known."""
     links = {key: each.uplink_mbps.model_dump() for key, each in fleet.items() if each.uplink_mbps is not None}
     times = {key: train_s / each.speed for key, each in fleet.items()}
     if len(links) < len(fleet):
         return {"train_s": max(times.values())}
-    counted = {key: [each.samples for each in own if each.samples is not None] for key, own in held.items()}
+    counted = {key: [each.samples for each in holdings if each.samples is not None] for key, holdings in held.items()}
     return {
         "uplink_mbps": links,
         "vehicle_train_s": times if train_s > 0 else {},
         "samples_held": {key: min(samples) for key, samples in counted.items() if samples},
-        "data_quality": {key: min(each.quality for each in own) for key, own in held.items()},
+        "data_quality": {key: min(each.quality for each in holdings) for key, holdings in held.items()},
     }

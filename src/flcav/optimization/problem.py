@@ -36,7 +36,7 @@ Objective = Literal["weighted", "max-min", "area"]
 
 
 class Quantities(Config):
-    """Base of the parts of an allocation problem: numbers other than 0 are from 1e-9 to 1e9 in size."""
+    """Base of the parts of an allocation problem: numbers are 0, or from 1e-9 to 1e9 in size."""
 
     magnitudes: ClassVar[tuple[float, float]] = (1e-9, 1e9)
 
@@ -73,7 +73,7 @@ class Learner(NamedTuple):
 
 
 class Measured(Config):
-    """The largest of each quantity in the curve's history; a plan beyond it extrapolates and has a warning."""
+    """The largest value of each quantity in the history that a curve was fitted to; plans beyond it extrapolate."""
 
     samples: NonNegative | None = None  # most samples in the history
     edge_rounds: NonNegative | None = None  # most edge rounds in the history
@@ -115,7 +115,7 @@ class AllocationTask(Quantities):
 
     @property
     def learners(self) -> tuple[Learner, ...]:
-        """The learning curves of the task or of its cluster's members, with weights that sum to the task's."""
+        """The learning curves of the task or of its cluster's members; their weights sum to the task's weight."""
         if not isinstance(self.curve, SharedCurve):
             return (Learner(self.name, self.weight, self.curve),)
         total = sum(member.weight for member in self.curve.members)
@@ -125,25 +125,25 @@ class AllocationTask(Quantities):
 
     @property
     def vehicles(self) -> tuple[str, ...]:
-        """Names of the vehicles, in the order of the edge groups; none where they are not named."""
+        """Names of the vehicles, in the order of the edge groups; empty where the vehicles are not named."""
         return tuple(self.vehicle_train_s if self.uplink_mbps is None else self.uplink_mbps)
 
     @property
     def sizes(self) -> MessageSizes:
-        """Sizes of the messages."""
+        """Sizes of the task's messages [MB]."""
         return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
 
     def weigh_groups(self, called: int) -> tuple[float, ...]:
-        """Return the worth of the data of each edge server's vehicles where so many of them are called."""
+        """Return the worth of the data at each edge server where at most `called` of its vehicles are called."""
         worth = self.worth or (1.0,) * max(self.edge_groups)
-        return tuple(sum(worth[: min(called, own)]) for own in self.edge_groups)
+        return tuple(sum(worth[: min(called, size)]) for size in self.edge_groups)
 
     def sample_s(self, vehicle: str) -> float:
-        """Return the time in which a vehicle sends one sample [s]; 0 where its link is not known."""
+        """Return the time that a vehicle takes to send one sample [s]; 0 where its link is not known."""
         return self._sending_s(vehicle, self.sample_mb)
 
     def round_s(self, vehicle: str) -> float:
-        """Return the time in which a vehicle trains in one round and sends its messages [s], labels included."""
+        """Return the time that a vehicle needs for one round [s]: to train, and to send its update and any labels."""
         sent_mb = (self.exchange_mb or self.model_mb) + (self.labels_mb or 0.0)
         return self.vehicle_train_s.get(vehicle, self.train_s) + self._sending_s(vehicle, sent_mb)
 
@@ -201,6 +201,7 @@ class AllocationTask(Quantities):
                     if most == 0 and decay.infinite_at_0:
                         raise ValueError(f"{field}.{stage}.x0 of task {self.name!r} is 0: its error at 0 is infinite")
                 least = [float(low) for low, _ in ranges]
+                # A power law without an offset is infinite at 0 rounds: one round is its least finite case.
                 for stage, decay in enumerate(decays):
                     least[stage] = max(least[stage], decay.infinite_at_0)
                 with np.errstate(over="ignore"):

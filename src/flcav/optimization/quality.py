@@ -25,8 +25,8 @@ def label_distribution_distance(counts: ArrayLike, reference: ArrayLike | None =
     if not (np.all(numbers >= 0) and np.all(whole >= 0) and whole.sum() > 0):
         raise ValueError("label counts must be at least 0, and those of the reference not all 0")
     totals = numbers.sum(axis=1, keepdims=True)
-    own = np.divide(numbers, totals, out=np.zeros_like(numbers), where=totals > 0)
-    return np.where(totals[:, 0] > 0, 0.5 * np.abs(own - whole / whole.sum()).sum(axis=1), 1.0)
+    shares = np.divide(numbers, totals, out=np.zeros_like(numbers), where=totals > 0)
+    return np.where(totals[:, 0] > 0, 0.5 * np.abs(shares - whole / whole.sum()).sum(axis=1), 1.0)
 
 
 def visible_objects(objects: ArrayLike, samples: ArrayLike) -> Array:

@@ -1,8 +1,7 @@
-"""Frames of a dataset by agent, and as a network sees them.
+"""Selection of a dataset's frames by agent, and frames as a network sees them.
 
 Frames are selected by agent: all, vehicles, poles (roadside units), or agents by name. Of a roadside LiDAR some
-networks see only the returns in front of the static background, which is learned from the pole's own sweeps of the same
-dataset.
+networks see only the returns in front of the static background, which is learned from the pole's sweeps in the dataset.
 """
 
 from collections import Counter
@@ -25,8 +24,8 @@ class FrameSelection:
     frames: tuple[int, ...]  # frame numbers
     agents: tuple[str, ...]  # names of their agents, in the order of the frames
     used: Mapping[str, int]  # kind of agent, vehicle or pole -> number of selected frames
-    left_out: Mapping[str, int]  # the same of the frames that are not selected
-    rig: str = ""  # how their sensors differ from those of the network's training, in words; "" where they do not
+    left_out: Mapping[str, int]  # the same for the frames that are not selected
+    rig: str = ""  # how their sensors differ from those that the network was trained with; "" where they do not
 
     @property
     def sentence(self) -> str:
@@ -50,18 +49,18 @@ def choose_frames(
 ) -> FrameSelection:
     """Select the frames of the agents `wanted`: "all", "vehicles", "poles" or names, separated by commas.
 
-    None selects the frames whose sensors are mounted as a network of `config` expects them (`RigBound.fitting`), and
-    all frames if the task is not bound to a rig. trained: the LiDAR that the network was trained with; None: nothing is
-    known of it. Raises `InputError` for an agent that the dataset lacks, and what `RigBound.fitting` raises.
+    None selects the frames whose sensors are mounted as a network of `config` expects them (`RigBound.fitting`), or all
+    frames if the task is not bound to a rig. `trained` is the LiDAR that the network was trained with, None where it is
+    unknown. Raises `InputError` for an agent that the dataset lacks, and what `RigBound.fitting` raises.
     """
     if wanted is not None:
         frames = data.select(agents=_agents(data, wanted))
     else:
         frames = task.fitting(data, config) if isinstance(task, RigBound) else range(len(data))
-    every, own = ([data.keys[i].agent for i in numbers] for numbers in (range(len(data)), frames))
-    used = Counter(map(kind_of, own))
+    every, selected = ([data.keys[i].agent for i in numbers] for numbers in (range(len(data)), frames))
+    used = Counter(map(kind_of, selected))
     rig = task.compare_rig(data, config, frames, trained or KnownLidar()) if isinstance(task, KnowsRig) else ""
-    return FrameSelection(tuple(frames), tuple(dict.fromkeys(own)), used, Counter(map(kind_of, every)) - used, rig)
+    return FrameSelection(tuple(frames), tuple(dict.fromkeys(selected)), used, Counter(map(kind_of, every)) - used, rig)
 
 
 def kind_of(agent: str) -> str:
@@ -72,13 +71,13 @@ def kind_of(agent: str) -> str:
 def _agents(data: Dataset, wanted: str) -> set[str]:
     known = list(dict.fromkeys(key.agent for key in data.keys))
     groups = {"all": known} | {f"{kind}s": [a for a in known if kind_of(a) == kind] for kind in ("vehicle", POLE)}
-    found: set[str] = set()
+    agents: set[str] = set()
     for name in wanted.split(","):
-        own = groups.get(name, [name] if name in known else [])
-        if not own:
+        members = groups.get(name, [name] if name in known else [])
+        if not members:
             raise InputError(f"agents '{wanted}': {data.folder} has none called '{name}', but {', '.join(known)}")
-        found.update(own)
-    return found
+        agents.update(members)
+    return agents
 
 
 def _frames(counts: Mapping[str, int]) -> str:
@@ -86,13 +85,14 @@ def _frames(counts: Mapping[str, int]) -> str:
     return f"{' and '.join(f'{count} {kind}' for kind, count in counts.items())} {noun}"
 
 
-MOST_SWEEPS = 100  # of each pole, evenly spread over the dataset, that its background is learned from
+MOST_SWEEPS = 100  # sweeps per pole, evenly spread over the dataset, from which its background is learned
 
 
 def frame_reader(data: Dataset, foreground: bool) -> Callable[[int], Frame]:
     """Return the function that reads a frame by its number as a network sees it.
 
-    For a network of foregrounds (`foreground`), the sweeps of poles lack their background; other agents' are whole.
+    For a network of foregrounds (`foreground`), the sweeps of poles lack their background; those of others are
+    complete.
     """
     if not foreground:
         return data.frame

@@ -33,7 +33,7 @@ ANNOTATED = "annotated"  # kind of labels: the ground truth of the recording
 
 @runtime_checkable
 class Shared(Protocol):
-    """A task with its own settings for federated training: recording, kinds of labels, messages of samples."""
+    """A task with settings for federated training: recording, kinds of labels, messages of samples."""
 
     @property
     def recording(self) -> Mapping[str, Json]:
@@ -46,20 +46,20 @@ class Shared(Protocol):
         ...
 
     def pack_samples(self, data: Dataset, config: Any, frames: Sequence[int]) -> Iterator[bytes]:
-        """Yield the message by which a vehicle uploads each frame with its labels.
+        """Yield the messages by which a vehicle uploads frames with their labels, one per frame.
 
         Raises `InputError` for frames that have no samples of the task.
         """
         ...
 
     def unpack_samples(self, messages: Sequence[bytes], config: Any) -> Sequence[Any] | None:
-        """Return the training samples in messages of `pack_samples`; None where they are taken from the recording."""
+        """Return the training samples in messages of `pack_samples`; None where they are read from the recording."""
         ...
 
 
 @runtime_checkable
 class ForVehicles(Protocol):
-    """A task some of whose networks cannot be trained by vehicles."""
+    """A task with networks that vehicles cannot train."""
 
     def check_for_vehicles(self, config: Any) -> None:
         """Raise `InputError` if vehicles cannot train a network of `config`."""
@@ -67,7 +67,7 @@ class ForVehicles(Protocol):
 
 
 class WholeFrames:
-    """Default settings of a task without its own: whole frames are uploaded, labelled with their ground truth."""
+    """Default settings of a task without `Shared`: whole frames are uploaded, labelled with their ground truth."""
 
     recording: Mapping[str, Json] = {}
     labels = (ANNOTATED,)
@@ -77,24 +77,24 @@ class WholeFrames:
         return (pack_whole_frame(data, i) for i in frames)
 
     def unpack_samples(self, messages: Sequence[bytes], config: Any) -> None:
-        """Return None: what a task makes of a whole frame it reads from the recording."""
+        """Return None: the task reads its samples of whole frames from the recording."""
         return
 
 
 def as_shared(task: Task) -> Shared:
-    """Return the task's settings for federated training: its own, or `WholeFrames`."""
+    """Return the task itself if it is `Shared`, otherwise `WholeFrames`."""
     return task if isinstance(task, Shared) else WholeFrames()
 
 
 def check_network(task: Task, network: str | None) -> None:
-    """Raise `InputError` where a task has no network of that name (None: its first), or one for no vehicle."""
+    """Raise `InputError` where a task has no network of that name (None: its first), or vehicles cannot train it."""
     config = find_configuration(task, network)
     if isinstance(task, ForVehicles):
         task.check_for_vehicles(config)
 
 
 def pack_whole_frame(data: Dataset, i: int) -> bytes:
-    """Return a whole frame as a message: point clouds, image files as recorded, and annotated boxes in the world."""
+    """Return a frame's message: point clouds, image files as recorded, and annotated boxes in the world frame."""
     frame = data.frame(i)
     boxes = frame.annotations.boxes
     labels = {"boxes": boxes.array(), "boxes.label": from_names(boxes.label.tolist())}
@@ -108,23 +108,24 @@ def camera_ahead(width: int, height: int, fov_deg: float) -> Mapping[str, Json]:
 
     `width` and `height` are in pixels, `fov_deg` is the horizontal field of view.
     """
-    mount, settings = {"x": 0.5, "z": 1.5}, {"width": width, "height": height, "fov_deg": fov_deg}
+    mount = {"x": 0.5, "z": 1.5}
+    settings = {"width": width, "height": height, "fov_deg": fov_deg}
     return {"cameras": {"camera": {"mount": mount, "settings": settings}}}
 
 
 @dataclass(frozen=True)
 class TrainedWeights:
-    """Result of local training."""
+    """Result of local training in a federated round."""
 
     weights: dict[str, NDArray[np.number]]  # by name of parameter or buffer
     samples: int  # number of distinct samples trained on
     loss: float  # mean over the steps; 0 without steps
     gradient: dict[str, NDArray[np.number]] = field(default_factory=dict)  # mean over the steps, with a `shift`
-    optimiser: dict[str, NDArray[np.number]] = field(default_factory=dict)  # its state, where it was given
+    optimiser: dict[str, NDArray[np.number]] = field(default_factory=dict)  # its state after training, where given
 
 
 class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
-    """A federated client: local training of a task's network on the client's own samples.
+    """A federated client: local training of a task's network on the client's samples.
 
     It satisfies the protocol `Trainable` of `flcav.federation`, which this layer does not import. Raises `InputError`
     without samples.
@@ -180,8 +181,8 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
             shift: added to the gradient, by name of parameter; None: nothing.
             layers: patterns of the names of parameters that are trained; empty: all.
             centre: weights of the proximal term; None: `weights`.
-            optimiser: state of the optimiser after an earlier training, empty for a new one, which the result then has
-                after this one; None: a new one, whose state is not returned.
+            optimiser: state of the optimiser after an earlier training, or empty for a new one; the result then has its
+                state after this training. None: a new one, whose state is not returned.
         """
         use_threads(self.threads)
         network = self.task.build(self.config)
@@ -190,7 +191,8 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
         correction = None
         if proximal or shift is not None:
             correction = GradientCorrection(weights if centre is None else centre, proximal, shift)
-        names, adamw = [name for name, _ in network.named_parameters()], AdamW(network, learning_rate)
+        names = [name for name, _ in network.named_parameters()]
+        adamw = AdamW(network, learning_rate)
         if optimiser:
             adamw.restore_arrays(optimiser, names)
         loss = train_steps(
@@ -214,7 +216,7 @@ class TaskClient(Generic[ConfigT, NetworkT, SampleT]):
 
 
 def freeze_others(network: nn.Module, layers: Sequence[str]) -> None:
-    """Leave out of training all parameters whose names match none of the patterns `layers`; () leaves out none.
+    """Exclude from training all parameters whose names match none of the patterns `layers`; () excludes none.
 
     Raises `InputError` where none is left.
     """
@@ -225,7 +227,7 @@ def freeze_others(network: nn.Module, layers: Sequence[str]) -> None:
 
 
 class GradientCorrection:
-    """Correction of gradients in local training, g + proximal (w - centre) + shift, which sums up the g it sees."""
+    """Correction of gradients in local training, g + proximal (w - centre) + shift, which accumulates the g it sees."""
 
     def __init__(
         self,
@@ -235,7 +237,9 @@ class GradientCorrection:
     ) -> None:
         self._centre = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in centre.items()}
         self._shift = {name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in (shift or {}).items()}
-        self._proximal, self._sum, self._steps = proximal, {}, 0
+        self._proximal = proximal
+        self._sum = {}
+        self._steps = 0
 
     @torch.no_grad()
     def __call__(self, network: nn.Module) -> None:
@@ -255,13 +259,13 @@ class GradientCorrection:
         return {name: (total / self._steps).numpy() for name, total in self._sum.items()}
 
 
-PROBABILITIES = "probabilities"  # name of the one array that is sent
-SAME = 1e-6  # difference up to which probabilities teach nothing
+PROBABILITIES = "probabilities"  # name of the only array that is sent
+SAME = 1e-6  # difference up to which probabilities are equal, and nothing is to be learned
 Arrays = Mapping[str, NDArray[np.number]]
 NOTHING: Arrays = {}
 NetworkT_contra = TypeVar("NetworkT_contra", contravariant=True, default=Any)  # a network
 SampleT_contra = TypeVar("SampleT_contra", contravariant=True, default=Any)  # a sample
-Part = tuple[Any, Array32]  # a sample, and the class probabilities (rows, classes) of what it shows
+Part = tuple[Any, Array32]  # a sample, and the class probabilities (rows, classes) of its contents
 
 
 @runtime_checkable
@@ -269,7 +273,7 @@ class Imitates(Protocol[NetworkT_contra, SampleT_contra]):
     """A task whose networks can learn from class probabilities of samples: of pictures, or of what is seen in them."""
 
     def class_probabilities(self, network: NetworkT_contra, samples: Sequence[SampleT_contra]) -> list[Array32]:
-        """Return the class probabilities (rows, classes) of each sample; the number of rows is the sample's alone."""
+        """Return the class probabilities (rows, classes) of each sample; rows depend on the sample alone."""
         ...
 
     def imitation_loss(
@@ -281,7 +285,7 @@ class Imitates(Protocol[NetworkT_contra, SampleT_contra]):
 
 @dataclass(frozen=True)
 class _Imitation:
-    """The parts of a task that training uses, with samples `Part`."""
+    """The interface of a task that training uses, for samples `Part`."""
 
     task: Task
 
@@ -306,13 +310,13 @@ class SentOutputs:
 
     weights: Arrays  # `PROBABILITIES`
     samples: int  # number of distinct samples trained on
-    loss: float  # mean over the steps on own samples
-    own: Arrays = field(default_factory=dict)  # the network
+    loss: float  # mean over the steps on the client's samples
+    own: Arrays = field(default_factory=dict)  # the network that stays on the client
 
 
 @dataclass(frozen=True)
 class SharedSamples(Generic[ConfigT, NetworkT, SampleT]):
-    """Samples that clients and server share, to say what their networks see in them and to learn from the mean."""
+    """Samples that clients and server share: they exchange their networks' outputs on them, and learn from the mean."""
 
     task: Task[ConfigT, NetworkT, SampleT]  # which `Imitates`
     config: ConfigT  # of all networks
@@ -331,7 +335,7 @@ class SharedSamples(Generic[ConfigT, NetworkT, SampleT]):
         return {PROBABILITIES: np.concatenate(rows).astype(np.float32)}
 
     def imitate(self, weights: Arrays, outputs: Arrays, *, steps: int, learning_rate: float, seed: int) -> Arrays:
-        """Return the weights after local steps towards `outputs`; those given where they say the same already."""
+        """Return the weights after local steps towards `outputs`; unchanged where the network's outputs equal them."""
         now = cast(Imitates, self.task).class_probabilities(network := self._build(weights), self.samples)
         wanted = np.asarray(outputs[PROBABILITIES], np.float32)
         if np.allclose(np.concatenate(now), wanted, rtol=0.0, atol=SAME):
@@ -345,11 +349,11 @@ class SharedSamples(Generic[ConfigT, NetworkT, SampleT]):
 
 @dataclass(frozen=True)
 class OutputClient:
-    """A federated client that sends class probabilities on shared samples, and keeps a network of its own."""
+    """A federated client that sends class probabilities on shared samples, and keeps a personal network."""
 
     client: TaskClient
     shared: SharedSamples
-    start: Arrays  # the network that it begins with
+    start: Arrays  # the initial network
 
     def train(
         self,
@@ -361,9 +365,9 @@ class OutputClient:
         own: Arrays = NOTHING,
         imitation_steps: int = 1,
     ) -> SentOutputs:
-        """Return the probabilities by its network after learning from the mean, `weights`, and from its own samples.
+        """Train the client's network on the mean outputs `weights`, then on its samples, and return its outputs.
 
-        `own` is the network that it kept, empty at first.
+        `own` is the network that the client kept from its last round, empty at first.
         """
         how: Any = {"learning_rate": learning_rate, "steps": imitation_steps, "seed": derive_seed(seed, "imitation")}
         taught = self.shared.imitate(own or self.start, weights, **how)

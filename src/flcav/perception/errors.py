@@ -1,7 +1,7 @@
-"""The error registry: a network's mistakes with their positions in a town, each registered once.
+"""The error registry: a network's mistakes with their positions in a town, without duplicates.
 
-Sensors are placed by it. Each task's `register_errors` defines what a mistake is; this module holds the records,
-removes duplicates, and reads and writes files.
+Roadside sensors are placed by it. Each task's `register_errors` defines what a mistake is; this module holds the
+records, removes duplicates, and reads and writes files.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
     from flcav.perception.agents import FrameSelection
 
-SAME_PLACE_M = 2.0  # false positives of one scene this near to one another are duplicates
+SAME_PLACE_M = 2.0  # false positives of one scene this close to one another are duplicates
 
 THRESHOLD = 0.3  # default score threshold of a detection
 MISS, FALSE_POSITIVE, FINAL_ERROR = "miss", "false_positive", "final_error"
@@ -35,9 +35,9 @@ CLASS = "class"  # name of the column of `PerceptionError.label` in files
 
 @dataclass(frozen=True)
 class PerceptionError:
-    """One registered mistake: a missed object, a false positive, or a forecast with a large final error."""
+    """A registered mistake: a missed object, a false positive, or a forecast with a large final error."""
 
-    x: float  # world [m]; of an object its geometric centre
+    x: float  # world frame [m]; for an object its geometric centre
     y: float
     z: float
     weight: float  # gain of covering it with a sensor
@@ -56,14 +56,14 @@ class Registry(Displayed):
     errors: tuple[PerceptionError, ...]
     dropped: int = 0  # number of false positives without a position in the town
     chosen: "FrameSelection | None" = None  # the frames that were tested, if known
-    found: Mapping[int, Sequence[PerceptionError]] | None = None  # by frame, with duplicates; None: not known
-    standing: bool = False  # whether what is missed stands in the town, the same in every scene
+    found: Mapping[int, Sequence[PerceptionError]] | None = None  # by frame, with duplicates; None: unknown
+    standing: bool = False  # whether missed objects are fixed in the town, and so the same in every scene
 
     @classmethod
     def of(
         cls, found: Mapping[int, Sequence[PerceptionError]], *, dropped: int = 0, standing: bool = False
     ) -> "Registry":
-        """Return the registry of the mistakes of each frame, in the order of `found`, each registered once."""
+        """Return the registry of the mistakes in all frames, in the order of `found`, without duplicates."""
         every = [error for errors in found.values() for error in errors]
         if standing:
             missed: dict[str, PerceptionError] = {}
@@ -81,7 +81,7 @@ class Registry(Displayed):
 
     @property
     def positions(self) -> Array:
-        """Return the positions of the mistakes, (N, 3) x, y, z in the world [m]."""
+        """Return the positions (N, 3) of the mistakes: x, y, z in the world frame [m]."""
         return np.array([(error.x, error.y, error.z) for error in self.errors]).reshape(-1, 3)
 
     @property
@@ -117,7 +117,7 @@ class RegistersErrors(Protocol):
 def keep_first(errors: Iterable[PerceptionError]) -> tuple[PerceptionError, ...]:
     """Return the mistakes without duplicates: the first of each group, in order, false positives numbered per scene.
 
-    Duplicates are mistakes of the same track and scene, and false positives of one scene, of whatever class, within
+    Duplicates are mistakes with the same track and scene, and false positives of one scene, of whatever class, within
     `SAME_PLACE_M` of one that is kept.
     """
     kept: dict[tuple[str, str], PerceptionError] = {}

@@ -1,7 +1,7 @@
 """Camera images: read from datasets and folders, checked, resized; and projection of points into them.
 
-A `CameraView` is the image of a camera beside a LiDAR, with the calibration that projects points of the LiDAR's sweep
-and corners of boxes into it.
+A `CameraView` is the image of a camera mounted near a LiDAR, with the calibration that projects points of the LiDAR's
+sweep and corners of boxes into it.
 """
 
 import io
@@ -76,8 +76,8 @@ def pack_pictures(data: Dataset, number: int) -> dict[str, Bytes]:
 def unpack_pictures(arrays: Mapping[str, Bytes]) -> dict[str, Picture]:
     """Return the images in the arrays of a message by camera: the inverse of `pack_pictures`."""
     cameras = to_names(arrays["cameras"]).tolist()
-    files = {each: open_image(io.BytesIO(arrays[f"picture.{each}"].tobytes())) for each in cameras}
-    return {each: np.asarray(turn_upright(file)) for each, file in files.items()}
+    files = {camera: open_image(io.BytesIO(arrays[f"picture.{camera}"].tobytes())) for camera in cameras}
+    return {camera: np.asarray(turn_upright(file)) for camera, file in files.items()}
 
 
 def read_picture(path: Path) -> Picture:
@@ -119,27 +119,28 @@ def recoloured(picture: Picture, gain: float, saturation: float) -> Picture:
 
 @dataclass(frozen=True)
 class CameraView:
-    """A camera image with its calibration relative to the frame of the points: a LiDAR's, or the world's.
+    """A camera image with its calibration relative to the frame of the points: a LiDAR's, or the world frame.
 
     The camera's frame is optical: x right, y down, z forward; the centre of the first pixel is at (0, 0).
     """
 
     picture: Picture  # (H, W, 3) sRGB
-    camera_from_points: Array  # (4, 4)
+    camera_from_points: Array  # (4, 4) [m]
     intrinsics: Array  # (3, 3) [px]
     distortion: Array  # (5,) Brown-Conrady k1 k2 p1 p2 k3, as `flcav.sensors.lens`
 
     def project(self, points: NDArray) -> Array:
-        """Return pixel coordinates (N, 2) u, v of points (N, 3) [m]; NaN behind the near plane or far off the image."""
+        """Return pixel coordinates u, v (N, 2) of points (N, 3) [m]; NaN behind the near plane or far off the image."""
         seen = transform_points(self.camera_from_points, np.asarray(points, np.float64))
         seen[seen[:, 2] < NEAREST_M] = np.nan
+        # Far outside the image the distortion polynomial folds back into it: only points near the image are distorted.
         straight = project_points(self.intrinsics, np.zeros(5), seen)
         size = np.array(self.picture.shape[1::-1])
         near = np.all((straight > -BESIDE * size) & (straight < (1 + BESIDE) * size), axis=1)
         return project_points(self.intrinsics, self.distortion, np.where(near[:, None], seen, np.nan))
 
     def shows(self, points: NDArray) -> Mask:
-        """Return (N,) whether each point (N, 3) [m] projects into the image; occlusion is not considered."""
+        """Return the mask (N,) of points (N, 3) [m] that project into the image; occlusion is not considered."""
         pixels = self.project(points) + 0.5
         return np.all((pixels >= 0) & (pixels < self.picture.shape[1::-1]), axis=1)
 
@@ -175,12 +176,14 @@ def kitti_view(picture: Picture, calibration: KittiCalibration) -> CameraView:
 
 
 def view_beside(points: Path) -> CameraView | None:
-    """Return the view of a point cloud in a KITTI folder, from `image_2` and `calib`; None if either file is missing.
+    """Return the view of a point cloud in a KITTI folder, from `image_2` and `calib`; None where either is missing.
 
     Raises `InputError` if one of them cannot be read.
     """
-    folder, name = points.absolute().parent.parent, points.stem
-    picture, calibration = folder / "image_2" / f"{name}.png", folder / "calib" / f"{name}.txt"
+    folder = points.absolute().parent.parent
+    name = points.stem
+    picture = folder / "image_2" / f"{name}.png"
+    calibration = folder / "calib" / f"{name}.txt"
     if not (picture.is_file() and calibration.is_file()):
         return None
     return kitti_view(read_picture(picture), read_calibration(calibration))

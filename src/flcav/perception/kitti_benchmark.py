@@ -1,11 +1,11 @@
-"""Evaluation as KITTI's object benchmark counts it: easy, moderate and hard, AP|R40 of images, ground and space.
+"""Evaluation by the rules of KITTI's object benchmark: easy, moderate and hard; AP|R40 in image, bird's eye and 3D.
 
 Geiger, Lenz, Urtasun, "Are we ready for Autonomous Driving?", CVPR 2012, and `evaluate_object.cpp` of the benchmark's
 development kit; 40 recall positions by Simonelli et al., "Disentangling Monocular 3D Object Detection", ICCV 2019.
 
-An object counts at a level by the height of its rectangle in the image, its occlusion and truncation; one that does not
-is ignored, and so are objects of the similar class. Detections lower than the level's height are ignored. In the image,
-detections in a DontCare region are ignored, too; such a region has no place in space.
+An object counts at a level by the height of its rectangle in the image, its occlusion and truncation; an object that
+does not is ignored, and so are objects of the similar class. Detections lower than the level's height are ignored. In
+the image, detections in a DontCare region are ignored, too; such a region has no position in space.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -43,7 +43,7 @@ from flcav.sensors.views import BOX_EDGES, NEAR_M, clip_in_front
 from flcav.storage.records import LEFT_OUT, Class
 
 COUNTS, IGNORED, OTHER = 0, 1, -1  # state of an object or a detection for a class at a level
-RECALLS = 41  # positions of recall, of which the first, 0, is left out of the mean
+RECALLS = 41  # positions of recall; the first, 0, is left out of the mean
 SIMILAR = {"Car": "Van", "Pedestrian": "Person_sitting"}
 
 
@@ -64,11 +64,11 @@ LEVELS: Mapping[str, Difficulty] = {
 
 @dataclass(frozen=True)
 class ClassFrame:
-    """The detections and objects of one frame for a class, a level and a kind of overlap."""
+    """The detections and objects of a frame for one class, level and kind of overlap."""
 
     score: Array  # (D,)
     detection: Ints  # (D,) COUNTS, IGNORED or OTHER
-    label: Ints  # (G,) of objects, the same
+    label: Ints  # (G,) COUNTS, IGNORED or OTHER of the objects
     overlap: Array  # (D, G) IoU
     excused: Mask  # (D,) lies in a DontCare region
 
@@ -76,22 +76,23 @@ class ClassFrame:
 def label_states(
     name: str, labels: Words, height_px: Array, occlusion: Ints, truncation: Array, level: Difficulty
 ) -> Ints:
-    """Return (G,) whether each of a frame's objects counts for the class `name` at a level."""
+    """Return the state (G,) of a frame's objects for the class `name` at a level: COUNTS, IGNORED or OTHER."""
     hard = (occlusion > level.occlusion) | (truncation > level.truncation) | (height_px <= level.height_px)
-    own, similar = labels == name, labels == SIMILAR.get(name, "")
-    return np.where(own & ~hard, COUNTS, np.where(own | similar, IGNORED, OTHER)).astype(np.int64)
+    same = labels == name
+    similar = labels == SIMILAR.get(name, "")
+    return np.where(same & ~hard, COUNTS, np.where(same | similar, IGNORED, OTHER)).astype(np.int64)
 
 
 def detection_states(name: str, labels: Words, height_px: Array, level: Difficulty) -> Ints:
-    """Return (D,) whether each of a frame's detections counts for the class `name` at a level."""
+    """Return the state (D,) of a frame's detections for the class `name` at a level: COUNTS, IGNORED or OTHER."""
     return np.where(height_px < level.height_px, IGNORED, np.where(labels == name, COUNTS, OTHER)).astype(np.int64)
 
 
 def average_precision_r40(frames: Sequence[ClassFrame], limit: float) -> float | None:
     """Return the AP|R40 in [0, 1] of frames of one class, level and kind; None where no object counts.
 
-    limit: IoU above which a detection is of an object. At each of the scores that reach a further fortieth of recall,
-    detections and objects are matched anew; precision is made to fall with recall, and its mean is taken.
+    `limit` is the IoU above which a detection matches an object. At each score that reaches a further fortieth of
+    recall, detections and objects are matched anew; precision is made non-increasing in recall, and its mean is taken.
     """
     targets = sum(int((frame.label == COUNTS).sum()) for frame in frames)
     if not targets:
@@ -109,30 +110,31 @@ def average_precision_r40(frames: Sequence[ClassFrame], limit: float) -> float |
 
 
 def count_matches(frame: ClassFrame, limit: float, threshold: float) -> tuple[int, int]:
-    """Return the numbers of true and of false positives of a frame, among detections of `threshold` or more."""
+    """Return the numbers of true and false positives of a frame among detections that score at least `threshold`."""
     return _match(frame, limit, threshold, True)[:2]
 
 
 def find_thresholds(scores: Array, targets: int) -> list[float]:
-    """Return the scores, from the highest on, at which recall comes nearest to each next fortieth, RECALLS at most.
+    """Return the scores, from the highest on, at which recall is nearest to each further fortieth, at most RECALLS.
 
-    scores: of the detections that match one of `targets` objects.
+    `scores` are those of the detections that match one of `targets` objects.
     """
     ordered = np.sort(scores)[::-1].tolist()
-    found: list[float] = []
+    thresholds: list[float] = []
     recall = 0.0
     for rank, score in enumerate(ordered, start=1):
-        here, last = rank / targets, rank == len(ordered)
+        here = rank / targets
+        last = rank == len(ordered)
         further = here if last else (rank + 1) / targets
         if further - recall < recall - here and not last:
             continue
-        found.append(score)
+        thresholds.append(score)
         recall += 1 / (RECALLS - 1)
-    return found[:RECALLS]
+    return thresholds[:RECALLS]
 
 
 def _match(frame: ClassFrame, limit: float, threshold: float, counted: bool) -> tuple[int, int, Array]:
-    """Return `_match_arrays` of a frame."""
+    """Return `_match_arrays` for a frame."""
     arrays = (frame.score, frame.detection, frame.label, frame.overlap, frame.excused)
     return _match_arrays(arrays, limit, threshold, counted)
 
@@ -141,10 +143,10 @@ def _match(frame: ClassFrame, limit: float, threshold: float, counted: bool) -> 
 def _match_arrays(
     frame: tuple[Array, Ints, Ints, Array, Mask], limit: float, threshold: float, counted: bool
 ) -> tuple[int, int, Array]:
-    """Return true positives, false positives, and the scores (T,) of the true ones, among scores from `threshold` on.
+    """Return true positives, false positives, and the scores (T,) of the true ones, for scores from `threshold` on.
 
-    Objects take detections in their order: with `counted` that of highest overlap, one that counts before an ignored
-    one; without, which is how thresholds are found, that of highest score.
+    Objects take detections in their order: with `counted` the one of highest overlap, preferring one that counts over
+    an ignored one; otherwise, to find thresholds, the one of highest score.
     """
     score, detection, label, overlap, excused = frame
     taken = np.zeros(len(score), np.bool_)
@@ -163,7 +165,8 @@ def _match_arrays(
             elif detection[d] == COUNTS and (best < 0 or spare or overlap[d, g] > most):
                 best, most, spare = d, overlap[d, g], False
             elif detection[d] == IGNORED and best < 0:
-                best, spare = d, True
+                best = d
+                spare = True
         if best < 0:
             continue
         taken[best] = True
@@ -179,8 +182,8 @@ def _match_arrays(
 
 BenchmarkKind = Literal["image", "bev", "3d"]  # rectangles in the image, footprints, boxes
 
-LIMITS = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}  # IoU above which a detection is of an object
-LOOSE = {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}  # beside them, on the ground and in space: that of OpenPCDet
+LIMITS = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}  # IoU above which a detection matches an object
+LOOSE = {"Car": 0.5, "Pedestrian": 0.25, "Cyclist": 0.25}  # OpenPCDet's, in addition, on the ground and in space
 COMPARED: tuple[tuple[Mapping[str, float], BenchmarkKind], ...] = (
     (LIMITS, "image"),
     (LIMITS, "bev"),
@@ -190,16 +193,16 @@ COMPARED: tuple[tuple[Mapping[str, float], BenchmarkKind], ...] = (
 )
 MOUNT = pose(0.0, 0.0, HEIGHT_M)  # of KITTI's LiDAR
 NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}  # -> class
-VALIDATION = "val"  # list of the frames that are evaluated, where there is one
+VALIDATION = "val"  # list of the frames to evaluate, where it exists
 
 
 @dataclass(frozen=True)
 class BenchmarkScore:
-    """AP|R40 of one class by one kind of overlap, in [0, 1]; None where no object counts at a level."""
+    """AP|R40 of a class by one kind of overlap, in [0, 1]; None where no object counts at a level."""
 
     label: Class
     kind: BenchmarkKind
-    iou: float  # above which a detection is of an object
+    iou: float  # above which a detection matches an object
     easy: float | None
     moderate: float | None
     hard: float | None
@@ -213,10 +216,10 @@ class BenchmarkEvaluation(Evaluated):
     split: str | None  # list of `ImageSets` that names the frames; None: all that have labels
     targets: Mapping[str, Mapping[str, int]]  # class -> level -> number of objects that count
     benchmark: tuple[BenchmarkScore, ...]  # class by class, at the benchmark's limit of IoU and at `LOOSE`
-    false_positives: Mapping[str, int]  # class -> detections of no object, in space at `LOOSE` and the level hard
+    false_positives: Mapping[str, int]  # class -> unmatched detections, in space at `LOOSE` and the level hard
     threshold: float  # lowest score of those detections
-    bare: int  # frames without an image: it is taken to be as large as most
-    labelled: Annotated[tuple[Score, ...] | None, LEFT_OUT] = None  # of every labelled object, whatever its height
+    bare: int  # frames without an image: the usual size is assumed
+    labelled: Annotated[tuple[Score, ...] | None, LEFT_OUT] = None  # of all labelled objects, whatever their height
     counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # of the same; None in earlier results
 
     @property
@@ -236,9 +239,9 @@ class BenchmarkEvaluation(Evaluated):
         if self.bare:
             lines.append(f"{self.bare} of them without an image, taken as {ASSUMED_SIZE[1]} x {ASSUMED_SIZE[0]} pixels")
         for row in self.benchmark:
-            each = "  ".join("    -" if ap is None else f"{ap:.3f}" for ap in (row.easy, row.moderate, row.hard))
+            precisions = "  ".join("    -" if ap is None else f"{ap:.3f}" for ap in (row.easy, row.moderate, row.hard))
             counted = ", ".join(str(number) for number in self.targets[row.label].values())
-            lines.append(f"{row.label:<11}{row.kind:>6} IoU {row.iou:<4g}  {each}  (objects: {counted})")
+            lines.append(f"{row.label:<11}{row.kind:>6} IoU {row.iou:<4g}  {precisions}  (objects: {counted})")
         for name, wrong in self.false_positives.items():
             where = f"in 3d at IoU {LOOSE[name]:g}, scores of {self.threshold:g} or more"
             lines.append(f"{name:<11}{wrong / self.frames:.2f} false positives a frame ({wrong}; {where})")
@@ -254,7 +257,7 @@ class BenchmarkEvaluation(Evaluated):
 
 @dataclass(frozen=True)
 class _Found:
-    """Detections and objects of a frame, as its evaluation needs them: G objects, D detections."""
+    """Detections and objects of a frame, as the evaluation needs them: G objects, D detections."""
 
     boxes: Boxes  # (D,)
     rectangle: Array  # (D, 4) [px]
@@ -264,14 +267,14 @@ class _Found:
 
 
 def is_kitti(path: Path) -> bool:
-    """Return whether `path` is a folder in KITTI's layout and no dataset of flcav's."""
+    """Return whether `path` is a folder in KITTI's layout rather than a dataset of flcav."""
     return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / MANIFEST).exists())
 
 
 def compare_kitti_rig(path: Path, config: SecondConfig, trained: KnownLidar) -> str:
-    """Return how the LiDAR of the KITTI folder `path` differs from the one of the network's training, in words.
+    """Return how the LiDAR of the KITTI folder `path` differs from the one that the network was trained with, in words.
 
-    The words are those of `describe_rig`. Of an export of flcav's neither beams nor range are known.
+    The words are those of `describe_rig`. Neither beams nor range are known of an export of flcav.
     """
     here = KnownLidar() if (path / FRAMES).is_file() else KnownLidar((BEAMS, BEAMS), RANGE_M)
     return describe_rig([MOUNT], here, config, trained)
@@ -288,7 +291,8 @@ def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progre
         raise InputError(f"{path}: no frames to evaluate")
     found = list(_detect(network, folder, progress))
     classes = [name for name in network.config.classes if name in LIMITS]
-    inside, truths = [in_image(one.boxes, one.frame) for one in found], [truth_of(one.frame) for one in found]
+    inside = [in_image(one.boxes, one.frame) for one in found]
+    truths = [truth_of(one.frame) for one in found]
     return BenchmarkEvaluation(
         frames=len(found),
         split=split,
@@ -318,7 +322,7 @@ def in_image(boxes: Boxes, frame: KittiFrame) -> Boxes:
 
 
 def truth_of(frame: KittiFrame) -> FrameTruth:
-    """Return every labelled object of a frame as a target, or as neutral where it is of a similar class."""
+    """Return all labelled objects of a frame as targets, or as neutral where they are of a similar class."""
     boxes = frame.objects.boxes
     similar = np.array([NEUTRAL.get(str(name), "") for name in boxes.label], dtype=np.str_)
     neutral = replace(boxes, label=similar)[similar != ""]
@@ -328,9 +332,11 @@ def truth_of(frame: KittiFrame) -> FrameTruth:
 def _compare(boxes: Boxes, frame: KittiFrame, size: tuple[int, ...]) -> _Found:
     """Return the detections of a frame with their overlaps; `size`: height and width of the image [px]."""
     rectangle = project_boxes(boxes, frame.calibration, size)
-    found, labelled = torch.from_numpy(boxes.array()), torch.from_numpy(frame.objects.boxes.array())
+    detected = torch.from_numpy(boxes.array())
+    labelled = torch.from_numpy(frame.objects.boxes.array())
     shared = _intersect(rectangle, frame.objects.rectangle)
-    area, other = _area(rectangle)[:, None], _area(frame.objects.rectangle)
+    area = _area(rectangle)[:, None]
+    other = _area(frame.objects.rectangle)
     inside = _intersect(rectangle, frame.objects.unlabelled) / np.maximum(area, 1e-9)
     return _Found(
         boxes,
@@ -338,15 +344,15 @@ def _compare(boxes: Boxes, frame: KittiFrame, size: tuple[int, ...]) -> _Found:
         frame,
         {
             "image": shared / np.maximum(area + other - shared, 1e-9),
-            "bev": iou(found, labelled, "bev").numpy(),
-            "3d": iou(found, labelled, "3d").numpy(),
+            "bev": iou(detected, labelled, "bev").numpy(),
+            "3d": iou(detected, labelled, "3d").numpy(),
         },
         inside.max(axis=1, initial=0.0),
     )
 
 
 def project_boxes(boxes: Boxes, calibration: KittiCalibration, size: Sequence[int]) -> Array:
-    """Return (D, 4) rectangles [px] of boxes (LiDAR frame) within an image of `size` (height, width); 0 outside it."""
+    """Return rectangles (D, 4) [px] of boxes (LiDAR frame) within an image of `size` (height, width); 0 outside it."""
     height, width = size
     rectangles = np.zeros((len(boxes), 4))
     for row, corners in enumerate(boxes.corners()):
@@ -365,7 +371,7 @@ def _score(found: Sequence[_Found], name: str, kind: BenchmarkKind, limit: float
 
 
 def _count_wrong(found: Sequence[_Found], name: str) -> int:
-    """Return how many detections of a class, of `THRESHOLD` or more, are of no object, outside DontCare regions."""
+    """Return the number of unmatched detections of a class, scoring `THRESHOLD` or more, outside DontCare regions."""
     frames = [replace(_of_class(one, name, "hard", "3d"), excused=one.unlabelled > LOOSE[name]) for one in found]
     return sum(count_matches(frame, LOOSE[name], THRESHOLD)[1] for frame in frames)
 
@@ -401,6 +407,7 @@ def _area(rectangle: Array) -> Array:
 
 
 def _intersect(one: Array, other: Array) -> Array:
-    """Return (D, K) areas that rectangles (D, 4) and (K, 4) share."""
-    low, high = np.maximum(one[:, None, :2], other[None, :, :2]), np.minimum(one[:, None, 2:], other[None, :, 2:])
+    """Return the intersection areas (D, K) [px^2] of rectangles (D, 4) with (K, 4)."""
+    low = np.maximum(one[:, None, :2], other[None, :, :2])
+    high = np.minimum(one[:, None, 2:], other[None, :, 2:])
     return np.clip(high - low, 0, None).prod(axis=2)

@@ -1,4 +1,4 @@
-"""Marks: drawable results of an inference, of few kinds that all tasks share. `flcav.report` draws each kind.
+"""Marks: drawable results of an inference, of a few kinds shared by all tasks; `flcav.report` draws them.
 
 They are drawn on an image (H, W, 3), a point cloud (N, 4) or a bird's-eye map, see `flcav.perception.task.Finding`.
 """
@@ -12,7 +12,7 @@ from flcav.geometry import Boxes
 
 @dataclass(frozen=True)
 class Bars:
-    """A bar chart of shares by name, such as class probabilities, drawn beside the input."""
+    """A bar chart of shares by name, such as class probabilities, drawn next to the input."""
 
     share: Mapping[str, float]  # name -> in [0, 1]
     title: str = "probability"
@@ -39,7 +39,7 @@ class PictureBoxes:
 
 @dataclass(frozen=True)
 class CloudBoxes:
-    """3D boxes in a point cloud, also drawn on the image of a camera beside the LiDAR."""
+    """3D boxes in a point cloud, also drawn on the image of a camera with the same direction."""
 
     boxes: Boxes  # in the frame of the cloud, with scores
 
@@ -69,7 +69,7 @@ class RoadUser:
     speed: float  # [m/s]
     length: float  # [m]
     width: float
-    modes: tuple[Mode, ...]  # the first is the single path (the medoid), the others follow by falling probability
+    modes: tuple[Mode, ...]  # first the single path (the medoid), then the others by decreasing probability
     constant_velocity: Array | None = None  # (T, 2) world [m]: path at constant heading and speed
     truth: Array | None = None  # (T, 2) world [m]: path that was driven; None if not recorded
 
@@ -78,7 +78,7 @@ class RoadUser:
 class Light:
     """A traffic light with its state."""
 
-    x: float  # world [m]: middle of its bars across the lanes' entries
+    x: float  # world [m]: middle of its stop lines
     y: float
     open: bool  # green
 

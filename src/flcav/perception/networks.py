@@ -1,8 +1,8 @@
 """Training, evaluation and inference of a task's networks, and registration of their mistakes.
 
 In all functions a task is a `Task` or its name on the command line (`flcav.perception.tasks`), data are a dataset or
-its folder, and a network is one in memory, a file of weights, or None for the task's own weights in the package. They
-compute on one thread unless `threads` says otherwise: with another number the last bits of weights differ.
+its folder, and a network is one in memory, a file of weights, or None for the task's weights in the package. They
+compute on one thread unless `threads` says otherwise: another number changes the last bits of weights.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -51,7 +51,7 @@ class TrainedNetwork:
 class Evaluation:
     """Metrics of a network on a dataset."""
 
-    task: str  # its name
+    task: str  # name of the task
     score: float  # the metric that validation maximises, in [0, 1]: accuracy, mAP, AP or another, by task
     chosen: FrameSelection  # the frames that were tested
     numbers: Mapping[str, Json]  # all metrics of the task as JSON values: docs/tasks.md
@@ -118,9 +118,10 @@ def train(
     held = None if validation is None else open_data(validation)
     place = select_device(device)
     request = TrainingRequest(
-        [open_data(each) for each in folders], held, network, epochs, patience, seed, place, agents
+        [open_data(folder) for folder in folders], held, network, epochs, patience, seed, place, agents
     )
-    learned, weights = resolve_task(task), Path(out) / WEIGHTS
+    learned = resolve_task(task)
+    weights = Path(out) / WEIGHTS
     card = train_network(learned, request, Path(out), progress)
     return TrainedNetwork(load_network(learned, weights).to(place), card, weights)
 
@@ -176,12 +177,12 @@ def evaluate(
     chosen = choose_frames(learned, tested.config, dataset, agents, trained=find_trained_lidar(learned, network))
     narrow = {} if within is None else {"asked": narrow_range(tested.config, within)}
     if tracks:
-        group_sequences(dataset, chosen.frames)  # said before the long work
-    found = learned.evaluate(tested, dataset, chosen.frames, **narrow, progress=progress)
-    if isinstance(found, ObjectsEvaluation) and tracks:
-        followed = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
-        found = replace(found, tracks=followed)
-    return Evaluation(learned.name, found.score, chosen, found.as_json(), tuple(found.lines()))
+        group_sequences(dataset, chosen.frames)  # raises before the long work
+    evaluated = learned.evaluate(tested, dataset, chosen.frames, **narrow, progress=progress)
+    if isinstance(evaluated, ObjectsEvaluation) and tracks:
+        tracked = evaluate_tracks(tested, dataset, chosen.frames, **narrow, progress=progress)
+        evaluated = replace(evaluated, tracks=tracked)
+    return Evaluation(learned.name, evaluated.score, chosen, evaluated.as_json(), tuple(evaluated.lines()))
 
 
 def compare_networks(
@@ -204,7 +205,7 @@ def compare_networks(
         task: a name of `TASKS`, `module:NAME`, or the task itself.
         data: dataset or its folder.
         first: the network or its file of weights; None: that of the package.
-        second: the same of the network that is compared with it.
+        second: the network that is compared with it, likewise.
         agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
         device: "auto", "cpu" or "cuda".
         threads: number of CPU threads.
@@ -216,21 +217,22 @@ def compare_networks(
     (0.0, 'undecided')
     """
     use_threads(threads)
-    learned, dataset = resolve_task(task), open_data(data)
-    tested = [resolve_network(learned, each, device) for each in (first, second)]
-    chosen = [choose_frames(learned, each.config, dataset, agents).frames for each in tested]
+    learned = resolve_task(task)
+    dataset = open_data(data)
+    tested = [resolve_network(learned, network, device) for network in (first, second)]
+    chosen = [choose_frames(learned, network.config, dataset, agents).frames for network in tested]
     if chosen[0] != chosen[1]:
         raise InputError(f"{dataset.folder}: the networks use different frames of it, so that none are paired")
-    before, after = (as_measurable(learned).outcomes(each, dataset, chosen[0], progress) for each in tested)
+    before, after = (as_measurable(learned).outcomes(network, dataset, chosen[0], progress) for network in tested)
     return compare_outcomes(learned, before, after, len(chosen[0]))
 
 
 def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:
     tested = resolve_network(task, network, device)
-    found = evaluate_kitti(tested, folder, progress)
+    evaluated = evaluate_kitti(tested, folder, progress)
     rig = compare_kitti_rig(folder, tested.config, find_trained_lidar(task, network))
-    chosen = FrameSelection(tuple(range(found.frames)), ("ego",), {"vehicle": found.frames}, {}, rig)
-    return Evaluation(task.name, found.score, chosen, found.as_json(), tuple(found.lines()))
+    chosen = FrameSelection(tuple(range(evaluated.frames)), ("ego",), {"vehicle": evaluated.frames}, {}, rig)
+    return Evaluation(task.name, evaluated.score, chosen, evaluated.as_json(), tuple(evaluated.lines()))
 
 
 def infer(
@@ -338,9 +340,9 @@ def open_data(data: Data) -> Dataset:
 
 
 def resolve_network(task: Task[ConfigT, NetworkT, SampleT], network: Weights, device: str = "cpu") -> NetworkT:
-    """Return a network in memory as it is; otherwise load the file of weights (None: the task's own) on `device`.
+    """Return a network in memory as it is; otherwise load a file of weights (None: the package's) on `device`.
 
-    Raises `InputError` for a file that is not of the task, and for None if the task has no weights in the package.
+    Raises `InputError` for a file of another task, and for None if the task has no weights in the package.
     """
     if isinstance(network, nn.Module):
         return cast(NetworkT, network)  # the caller answers for its type
@@ -348,7 +350,7 @@ def resolve_network(task: Task[ConfigT, NetworkT, SampleT], network: Weights, de
 
 
 def _turned(task: Task, network: Any, around: bool) -> Any:
-    """Return the network of `task`, looking to all four sides with `around`."""
+    """Return the network of `task`; with `around`, one that looks to all four sides."""
     return look_around(network) if around and isinstance(task, ObjectsTask) else network
 
 
@@ -358,7 +360,7 @@ def _check_around(task: Task, around: bool) -> None:
 
 
 def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
-    """Return the LiDARs that a network was trained with, by its card, as far as that says."""
+    """Return the LiDARs that a network was trained with, as far as its card says."""
     card = None if isinstance(network, nn.Module) else _find_card(Path(network or find_shipped(task)))
     if card is None:
         return KnownLidar()
@@ -367,8 +369,8 @@ def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
 
 def threshold_of(task: Task, threshold: float | None) -> float:
     """Return the score threshold: `threshold`, for None the task's default, or 0 for a task without scores."""
-    own = task.threshold if isinstance(task, Scores) else 0.0
-    return own if threshold is None else threshold
+    default = task.threshold if isinstance(task, Scores) else 0.0
+    return default if threshold is None else threshold
 
 
 @dataclass(frozen=True)
@@ -385,7 +387,7 @@ class Origin:
 
 
 def origin_of(task: Task, weights: Path | None) -> Origin:
-    """Return the origin of the network in a file of weights (None: the task's own), read from its card.
+    """Return the origin of the network in a file of weights (None: the package's), read from its card.
 
     Raises `InputError` for None if the task has no weights in the package.
     """

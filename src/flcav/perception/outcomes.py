@@ -1,8 +1,8 @@
-"""Outcomes of a test, from which the task's measure and its bootstrap over scenes follow without the network.
+"""Outcomes of a test, from which the task's measure and its bootstrap over scenes are computed without the network.
 
 The bootstrap gives 95 % percentile intervals of the measure and of paired differences between two networks, see
-`flcav.statistics`. The `evaluate.py` of each task defines what is kept per unit (a frame, an image or a road user) and
-how the measure is computed from it.
+`flcav.statistics`. The `evaluate.py` of a task defines what is kept per unit (a frame, an image or a road user) and how
+the measure is computed from it.
 """
 
 import zipfile
@@ -93,16 +93,16 @@ class Measurable(Protocol):
 
 @runtime_checkable
 class MeasuresMore(Protocol):
-    """A task with further measures than its own, computed from the same outcomes."""
+    """A task with further measures, computed from the same outcomes as its main measure."""
 
     @property
     def further_measures(self) -> Mapping[str, Measure]:
-        """Return the further measures by the names that they have in `numbers`."""
+        """Return the further measures by their names in `numbers`."""
         ...
 
 
 def further_measures(task: Task) -> Mapping[str, Measure]:
-    """Return the further measures of a task by name; none where it has none."""
+    """Return the further measures of a task by name; empty where it has none."""
     return task.further_measures if isinstance(task, MeasuresMore) else {}
 
 
@@ -122,8 +122,8 @@ class SceneScores:
         scenes = list(dict.fromkeys(data.keys[i].scene for i in frames))
         scores = []
         for done, scene in enumerate(scenes, start=1):
-            own = [i for i in frames if data.keys[i].scene == scene]
-            scores.append(self._task.evaluate(network, data, own).score)
+            of_scene = [i for i in frames if data.keys[i].scene == scene]
+            scores.append(self._task.evaluate(network, data, of_scene).score)
             progress(done, len(scenes), "")
         return Outcomes(np.array(scenes), {"score": np.array(scores, dtype=np.float64)})
 
@@ -142,19 +142,19 @@ def as_measurable(task: Task) -> Measurable:
 
 
 def compute_measure(task: Task, outcomes: Outcomes) -> float:
-    """Return the task's measure, each unit counted once; NaN if it is undefined: nothing was to be found."""
+    """Return the task's measure with every unit counted once; NaN if it is undefined, as without targets."""
     return count_once(as_measurable(task).measure, outcomes)
 
 
 def count_once(measure: Measure, outcomes: Outcomes) -> float:
-    """Return a measure, each unit counted once; NaN if it is undefined."""
+    """Return a measure with every unit counted once; NaN if it is undefined."""
     return float(measure(outcomes, np.ones((1, len(outcomes.scene)), dtype=np.int64))[0])
 
 
 def score_network(task: Task, network: nn.Module, data: Dataset, frames: Sequence[int] | None = None) -> float:
-    """Return the measure of `network` on frames (None: all); 0 if it is undefined: nothing was to be found."""
-    found = compute_measure(task, as_measurable(task).outcomes(network, data, data.numbers(frames)))
-    return 0.0 if np.isnan(found) else found
+    """Return the measure of `network` on frames (None: all); 0 if it is undefined, as without targets."""
+    value = compute_measure(task, as_measurable(task).outcomes(network, data, data.numbers(frames)))
+    return 0.0 if np.isnan(value) else value
 
 
 def compute_interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[float | None, float | None]:
@@ -162,13 +162,15 @@ def compute_interval(task: Task, outcomes: Outcomes, seed: int = 0) -> tuple[flo
 
     Both are None if the measure is defined on fewer than two scenes.
     """
-    own = as_measurable(task)
-    counted = [scene for scene in np.unique(outcomes.scene) if not np.isnan(_alone(own, outcomes, scene))]
+    measurable = as_measurable(task)
+    counted = [scene for scene in np.unique(outcomes.scene) if not np.isnan(_alone(measurable, outcomes, scene))]
     if len(counted) < 2:
         return None, None
     rng = stream(seed, "bootstrap")
     return _known(
-        bootstrap_over_scenes(lambda times: own.measure(outcomes, times), outcomes.scene, own.redraws, rng=rng)
+        bootstrap_over_scenes(
+            lambda times: measurable.measure(outcomes, times), outcomes.scene, measurable.redraws, rng=rng
+        )
     )
 
 
@@ -177,13 +179,13 @@ def difference(
 ) -> tuple[float, float | None, float | None]:
     """Return measure(after) - measure(before) and its paired 95 % bootstrap interval over scenes (low, high).
 
-    `measure`: by default the task's own. Both are taken on the same bootstrap samples. Low and high are None for a
-    single scene. Raises `InputError` if the outcomes are not of the same units.
+    `measure` is by default the task's. Both are computed on the same bootstrap samples. Low and high are None for a
+    single scene. Raises `InputError` if the outcomes are of different units.
     """
     if not np.array_equal(before.scene, after.scene):
         raise InputError("two tests are not of the same frames: there is no paired difference")
-    own = as_measurable(task)
-    of = measure or own.measure
+    measurable = as_measurable(task)
+    of = measure or measurable.measure
     mean = count_once(of, after) - count_once(of, before)
     if len(np.unique(before.scene)) < 2:
         return mean, None, None
@@ -192,7 +194,7 @@ def difference(
     def change(times: Times) -> Values:
         return of(after, times) - of(before, times)
 
-    return mean, *_known(bootstrap_over_scenes(change, before.scene, own.redraws, rng=rng))
+    return mean, *_known(bootstrap_over_scenes(change, before.scene, measurable.redraws, rng=rng))
 
 
 @dataclass(frozen=True)
@@ -205,7 +207,7 @@ class NetworkComparison(Record):
     scenes: int
     first: float  # the first network's measure
     second: float
-    difference: Estimate  # with its interval over scenes (95 %, bootstrap); none of a single scene
+    difference: Estimate  # with its interval over scenes (95 %, bootstrap); without one for a single scene
     verdict: str  # of the claim that the second network is better on such frames
 
     def lines(self) -> list[str]:
@@ -221,12 +223,12 @@ class NetworkComparison(Record):
 
 
 def compare_outcomes(task: Task, first: Outcomes, second: Outcomes, frames: int) -> NetworkComparison:
-    """Return the comparison of two networks by their outcomes.
+    """Return the comparison of two networks, given their outcomes.
 
-    Raises `InputError` where they look for different things, or nothing was to be found.
+    Raises `InputError` where their targets differ, or there are none.
     """
-    own = as_measurable(task)
-    wanted = [(sorted(each.arrays), own.numbers(each).get("targets")) for each in (first, second)]
+    measurable = as_measurable(task)
+    wanted = [(sorted(outcomes.arrays), measurable.numbers(outcomes).get("targets")) for outcomes in (first, second)]
     if wanted[0] != wanted[1]:
         targets = " and ".join(f"{count or 0:.0f}" for _, count in wanted)
         raise InputError(
@@ -238,7 +240,7 @@ def compare_outcomes(task: Task, first: Outcomes, second: Outcomes, frames: int)
         raise InputError(f"the {plural(frames, 'frame')} hold nothing to find for '{task.name}'")
     change, scenes = Estimate(*difference(task, first, second)), len(np.unique(first.scene))
     decided = verdict(change.low, change.high)
-    return NetworkComparison(task.name, own.measure_name, frames, scenes, before, after, change, decided)
+    return NetworkComparison(task.name, measurable.measure_name, frames, scenes, before, after, change, decided)
 
 
 def share_test_scenes(
@@ -248,19 +250,20 @@ def share_test_scenes(
     seed: int = 0,
     measure: Measure | None = None,
 ) -> SharedScenes:
-    """Return the spread of a mean over seeds by the test scenes that several seeds share, see `flcav.statistics`.
+    """Return the spread of a mean over seeds, given that several seeds share test scenes: see `flcav.statistics`.
 
-    Each seed has one or several tests of the same frames. `number` computes the seed's number from their measures, such
-    as the difference of two. `measure`: by default the task's own.
+    Each seed has one or several tests of the same frames. `number` computes the seed's value from their measures, such
+    as the difference of two. `measure` is by default the task's.
     """
-    own = as_measurable(task)
-    of = measure or own.measure
+    measurable = as_measurable(task)
+    of = measure or measurable.measure
 
     def of_seed(tests: Sequence[Outcomes]) -> Callable[[Times], Values]:
         return lambda times: number([of(outcomes, times) for outcomes in tests])
 
-    measures, scenes = [of_seed(tests) for tests in seeds], [tests[0].scene for tests in seeds]
-    return share_scenes(measures, scenes, own.redraws, rng=stream(seed, "bootstrap"))
+    measures = [of_seed(tests) for tests in seeds]
+    scenes = [tests[0].scene for tests in seeds]
+    return share_scenes(measures, scenes, measurable.redraws, rng=stream(seed, "bootstrap"))
 
 
 def weighted_mean(values: Array, times: Times) -> Values:
@@ -269,8 +272,8 @@ def weighted_mean(values: Array, times: Times) -> Values:
         return times @ values / times.sum(axis=1)
 
 
-def _alone(own: Measurable, outcomes: Outcomes, scene: str) -> float:
-    return float(own.measure(outcomes, (outcomes.scene == scene).astype(np.int64)[None])[0])
+def _alone(measurable: Measurable, outcomes: Outcomes, scene: str) -> float:
+    return float(measurable.measure(outcomes, (outcomes.scene == scene).astype(np.int64)[None])[0])
 
 
 def _known(interval: tuple[float, float]) -> tuple[float | None, float | None]:

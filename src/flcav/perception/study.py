@@ -1,6 +1,6 @@
 """Study recipe of a task: training, validation and test recordings, and the length of the training.
 
-All seeds of a study share the recordings for training and validation; each has test recordings of its own.
+All seeds of a study share the recordings for training and validation; the test recordings differ by seed.
 """
 
 from collections.abc import Mapping
@@ -12,7 +12,7 @@ from flcav.sources.recipe import recipe_path
 
 RecipeFields = Mapping[str, Json]  # fields of a recording's `Recipe`, as in YAML
 SCALES = ("full", "quick")
-TEST_SEEDS = 10_000  # test recordings of consecutive seeds are these many seeds apart
+TEST_SEEDS = 10_000  # distance between the seeds of test recordings of consecutive study seeds
 
 
 @dataclass(frozen=True)
@@ -25,14 +25,14 @@ class StudyRecipe:
     network: str  # name of the configuration
     train: tuple[RecipeFields, ...]
     validation: RecipeFields
-    tests: Mapping[str, RecipeFields]  # by name of the test; each seed of the study records its own: `tests_of`
+    tests: Mapping[str, RecipeFields]  # by name of the test; recorded anew for each seed of the study: `tests_of`
     epochs: int
     patience: int  # epochs without a better validation score after which training stops
     quick_scenes: int = 2  # most scenes of each recording at the scale "quick"
     quick_epochs: int = 1  # epochs at the scale "quick"
 
     def tests_of(self, seed: int) -> Mapping[str, RecipeFields]:
-        """Return the test recordings of one seed of the study, by name: traffic and weather are redrawn."""
+        """Return the test recordings for a seed of the study, by name: traffic and weather are redrawn."""
         return {name: {**fields, "seed": test_seed(fields, seed)} for name, fields in self.tests.items()}
 
     def at_scale(self, scale: str) -> "StudyRecipe":
@@ -60,10 +60,10 @@ class StudyRecipe:
 
 
 def test_seed(recipe: RecipeFields, seed: int) -> int:
-    """Return the seed of the test recording by `recipe` of one seed of a study."""
-    own = recipe.get("seed", 0)
-    assert isinstance(own, int)
-    return own + TEST_SEEDS * seed
+    """Return the seed of the test recording by `recipe` for a seed of the study."""
+    first = recipe.get("seed", 0)
+    assert isinstance(first, int)
+    return first + TEST_SEEDS * seed
 
 
 @runtime_checkable

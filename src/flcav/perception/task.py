@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor, nn
-from typing_extensions import TypeVar  # of typing from Python 3.13 on: with defaults
+from typing_extensions import TypeVar  # in typing from Python 3.13 on, with defaults
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
@@ -42,14 +42,14 @@ class Practice:
 
 
 def no_view() -> None:
-    """Return None: the view of an input without a camera beside it."""
+    """Return None: the view of an input without a camera."""
 
 
 class Result(Record):
     """Base of results of a network: a frozen dataclass that converts itself to JSON and to lines of text."""
 
     def lines(self) -> list[str]:
-        """Return the result as lines of text: one per field, unless a subclass has its own."""
+        """Return the result as lines of text: one per field, unless a subclass overrides it."""
         return [f"{name}: {value}" for name, value in self.as_json().items()]
 
 
@@ -62,25 +62,25 @@ class Evaluated(Result, ABC):
         """Return the metric that validation maximises."""
 
     def numbers(self) -> Mapping[str, float]:
-        """Return the metrics, by name, whose means over seeds a study reports: the score, unless a task has others."""
+        """Return the metrics by name whose means over seeds a study reports: the score, unless a task has others."""
         return {"score": self.score}
 
 
 @dataclass(frozen=True)
 class Finding:
-    """Result of a network on one input, with what is needed to draw it."""
+    """Result of a network on an input, with what is needed to draw it."""
 
     path: Path  # of the input
     seen: NDArray  # image (H, W, 3) u8, point cloud (N, 4) f32, or map: (3, H, W) bool of road, lane, crossing
     result: Result
     marks: tuple[Mark, ...] = ()  # the result as it is drawn on `seen`
-    view: Callable[[], "CameraView | None"] = no_view  # reads the image of a camera beside the LiDAR
+    view: Callable[[], "CameraView | None"] = no_view  # reads the image of a camera with the LiDAR's direction
 
 
 class Task(Protocol[ConfigT, NetworkT, SampleT]):
     """A perception task, generic in the types of its configurations, networks and samples (default: any).
 
-    Each network has its configuration as attribute `config`, a pydantic dataclass from which `build` rebuilds it.
+    A network has its configuration as attribute `config`, a pydantic dataclass from which `build` rebuilds it.
     """
 
     @property
@@ -145,7 +145,7 @@ class Task(Protocol[ConfigT, NetworkT, SampleT]):
 
 @runtime_checkable
 class Calibrates(Protocol):
-    """A task whose trained networks have their confidence scores calibrated on frames held out from training."""
+    """A task whose networks have their confidence scores calibrated after training, on held-out frames."""
 
     def calibrate(self, network: Any, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Fit the calibration of scores on frames of `data` (None: all); set it in the network's configuration."""
@@ -175,18 +175,18 @@ class RigBound(Protocol):
 class KnownLidar:
     """Beams and range of the agents' first LiDAR, as far as a recording names them."""
 
-    beams: tuple[int, int] | None = None  # fewest and most, which differ where LiDARs are drawn; None: not known
-    range_m: float | None = None  # largest range; None: not known
+    beams: tuple[int, int] | None = None  # fewest and most, which differ where LiDARs are drawn; None: unknown
+    range_m: float | None = None  # largest range [m]; None: unknown
 
 
 @runtime_checkable
 class KnowsRig(Protocol):
-    """A task whose networks know the sensor rig that they were trained for."""
+    """A task whose networks know the sensor rig that they were trained with."""
 
     def compare_rig(self, data: Dataset, config: Any, frames: Sequence[int], trained: KnownLidar) -> str:
-        """Return how the rig of these frames differs from that of a network of `config`, in words, "" for not at all.
+        """Return how the rig of these frames differs from that of a network of `config`, in words; "" if it does not.
 
-        trained: the LiDAR that the network was trained with.
+        `trained` is the LiDAR that the network was trained with.
         """
         ...
 

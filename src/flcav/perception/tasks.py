@@ -1,4 +1,4 @@
-"""Registry of the perception tasks: `TASKS` lists those of the package, a user's own is `module:NAME`.
+"""Registry of the perception tasks: `TASKS` lists those of the package; a user's is `module:NAME`.
 
 >>> from flcav import TASKS
 >>> list(TASKS)
@@ -22,9 +22,9 @@ TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing the tasks i
 
 
 def task_named(name: str) -> "Task":
-    """Return the task of that name: one of `TASKS`, or a user's own as `module:NAME`.
+    """Return the task of that name: one in `TASKS`, or a user's as `module:NAME`.
 
-    Raises `InputError` for an unknown name, and if the user's module is missing or has no task of that name.
+    Raises `InputError` for an unknown name, and where the user's module is missing or has no task of that name.
 
     >>> from flcav import task_named
     >>> list(task_named("objects").configurations)  # networks, the default first

@@ -6,12 +6,12 @@ is constant velocity in the plane; height, size and yaw are random walks. The pr
 acceleration, so that the time between frames may vary (Bar-Shalom et al., "Estimation with Applications to Tracking and
 Navigation", 2001, eq. 6.3.2-4).
 
-The cost of a pair of a track and a detection is the negative log-likelihood of the detection under the prediction, and
+The cost of pairing a track with a detection is the negative log-likelihood of the detection under the prediction, and
 pairs outside a gate are excluded (Chiu et al., "Probabilistic 3D Multi-Object Tracking for Autonomous Driving", 2020),
-so that the variances a detector predicts count.
+so that the variances predicted by a detector count.
 
-Detectors confuse front and rear, so that a track has the axis of its detections, and the direction of its first one
-until it moves. One that moves backwards is turned by 180 degrees, see `head_with_motion`.
+Detectors confuse front and rear: a track takes its axis from all detections, but its direction from the first one until
+it moves. A track that moves backwards is turned by 180 degrees, see `head_with_motion`.
 
 Recorded sequences are evaluated by MOTA, AMOTA, identity switches and velocity error (`flcav.perception.metrics`).
 """
@@ -45,24 +45,24 @@ DRIFT = np.array((0, 0, 0.2, 0.05, 0.05, 0.05, 0.3))  # of the random walks of z
 FIRST_SPEED = 8.0  # standard deviation of the velocity of a new track [m/s]
 LEAST_VARIANCE = np.array((0.1, 0.1, 0.1, 0.2, 0.1, 0.1, 0.15)) ** 2  # of a detection: x, y, z, size [m^2], yaw [rad^2]
 GATE = 9.21  # largest squared Mahalanobis distance in x, y of a pair: 99 % quantile of chi-squared with 2 dof
-FASTEST = 40.0  # [m/s] a pair is at most this speed times the elapsed time, plus `SLACK_M`, apart
+FASTEST = 40.0  # [m/s] a pair is at most this speed times the elapsed time plus `SLACK_M` apart
 SLACK_M = 2.0
-REVERSING_MPS = 3.0  # no vehicle backs up faster
-REVERSED_M = 6.0  # nor farther, manoeuvring; a vehicle that went so far ahead may back up as far again
-SURE_M = 1.0  # moved backwards, before a speed is believed; nor does who walks or rides a bicycle move so farther
-VEHICLE_M = 2.5  # length from which an object is a vehicle that can back up
-UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # of detections without a predicted one
+REVERSING_MPS = 3.0  # largest speed at which a vehicle backs up
+REVERSED_M = 6.0  # longest distance that a vehicle backs up while manoeuvring
+SURE_M = 1.0  # distance moved backwards from which a speed is believed; also the limit for pedestrians and cyclists
+VEHICLE_M = 2.5  # length from which an object is a vehicle that may back up
+UNKNOWN_VARIANCE = np.array((0.3, 0.3, 0.2, 0.4, 0.15, 0.15, 0.2)) ** 2  # for detections without a predicted one
 
 
 class TrackState(NamedTuple):
-    """Gaussian state estimate of one object: x, y, z, length, width, height [m], yaw [rad], velocity x, y [m/s]."""
+    """Gaussian state estimate of an object: x, y, z, length, width, height [m], yaw [rad], velocity x, y [m/s]."""
 
     mean: Array  # (9,)
     covariance: Array  # (9, 9)
 
 
 def start_state(box: Array, variance: Array) -> TrackState:
-    """Return the state of a new track from its first detection: box (7,) with `variance` (7,), mean velocity zero."""
+    """Return the state of a new track from its first detection, box (7,) with `variance` (7,); zero mean velocity."""
     spread = np.concatenate((np.maximum(variance, LEAST_VARIANCE), np.full(2, FIRST_SPEED**2)))
     return TrackState(np.concatenate((box, np.zeros(2))), np.diag(spread))
 
@@ -83,10 +83,10 @@ def predict_state(state: TrackState, after_s: float) -> TrackState:
 
 
 def innovation(state: TrackState, box: Array, variance: Array) -> tuple[Array, Array]:
-    """Return the innovation (7,) of box (7,) with `variance` (7,), and its covariance (7, 7).
+    """Return the innovation (7,) of a box (7,) with `variance` (7,), and its covariance (7, 7).
 
-    The innovation is detection less prediction. A heading more than 90 degrees off the predicted one is taken for
-    reversed by the detector, and turned by 180 degrees.
+    The innovation is the detection minus the prediction. A heading more than 90 degrees from the predicted one is taken
+    as reversed by the detector, and turned by 180 degrees.
     """
     off = box - state.mean[:MEASURED]
     turn = float(wrap_angle(off[YAW]))
@@ -107,11 +107,11 @@ def update_state(state: TrackState, box: Array, variance: Array) -> TrackState:
 
 
 def head_with_motion(state: TrackState, ahead_m: float, after_s: float) -> tuple[TrackState, float]:
-    """Return the state, turned by 180 degrees where its motion says that it heads the other way, and how far it went.
+    """Return the state, turned by 180 degrees where its motion contradicts its heading, and the distance ahead [m].
 
-    `ahead_m`: how far the object went along its heading [m], less than 0 backwards, without the last `after_s` [s].
-    The heading is wrong once a vehicle has moved backwards farther than it backs up (`REVERSED_M`), or moves so faster
-    than it does (`REVERSING_MPS`, by two standard deviations); one that backs up for a moment keeps it.
+    `ahead_m` is the distance that the object went along its heading before the last `after_s` [s], negative backwards.
+    The heading is wrong once a vehicle has moved backwards farther than vehicles back up (`REVERSED_M`), or does so
+    faster than they do (`REVERSING_MPS`, by two standard deviations); a vehicle that backs up briefly keeps it.
     """
     heading = np.array((np.cos(state.mean[YAW]), np.sin(state.mean[YAW])))
     speed = float(heading @ state.mean[MEASURED:])
@@ -127,7 +127,7 @@ def head_with_motion(state: TrackState, ahead_m: float, after_s: float) -> tuple
 
 @dataclass(frozen=True)
 class Tracked:
-    """The N tracks seen in one frame."""
+    """The N tracks seen in a frame."""
 
     boxes: Boxes  # world frame; score: mean over the track's detections so far; variance: of the Kalman filter
     track: Ints  # (N,) number of each track, constant over its life
@@ -141,15 +141,15 @@ class _Track:
     state: TrackState
     scores: list[float]  # of its detections
     missed: int = 0  # frames since its last detection
-    ahead_m: float = 0.0  # gone along its heading, see `head_with_motion`
-    seen_s: float = 0.0  # of its last detection
+    ahead_m: float = 0.0  # distance along its heading [m], see `head_with_motion`
+    seen_s: float = 0.0  # time of its last detection [s]
 
 
 class Tracker:
     """Multi-object tracker of all classes through one sequence of frames.
 
-    A track is reported in each frame with a detection of it, from its `confirm`-th detection on; in the first frame
-    every track is. It ends when it has had no detection for more than `patience` frames in a row.
+    A track is reported in a frame with a detection of it, from its `confirm`-th detection on; in the first frame all
+    tracks are. It ends once it has had no detection for more than `patience` consecutive frames.
     """
 
     def __init__(self, *, confirm: int = 2, patience: int = 3) -> None:
@@ -161,13 +161,14 @@ class Tracker:
     def step(self, detections: Boxes, time_s: float) -> Tracked:
         """Return the tracks seen at `time_s`: predict, assign `detections` (world frame), update, begin and end tracks.
 
-        Detections without scores count as of score 1, those without variances as of `UNKNOWN_VARIANCE`. Raises
-        ValueError where `time_s` is before that of the last step.
+        Detections without scores count with score 1, those without variances with `UNKNOWN_VARIANCE`. Raises ValueError
+        where `time_s` [s] is before that of the last step.
         """
         after_s = 0.0 if self._time_s is None else time_s - self._time_s
         if after_s < 0:
             raise ValueError(f"frames must come in time order: {time_s} s after {self._time_s} s")
-        first, self._time_s = self._time_s is None, time_s
+        first = self._time_s is None
+        self._time_s = time_s
         variance = detections.variance
         if variance is None:
             variance = np.tile(UNKNOWN_VARIANCE, (len(detections), 1))
@@ -179,9 +180,10 @@ class Tracker:
         free = np.ones(len(rows), dtype=bool)
         for label in sorted({track.label for track in self._tracks}):
             tracks = [track for track in self._tracks if track.label == label]
-            own = np.flatnonzero(detections.label == label)
-            for t, d in associate_detections([track.state for track in tracks], rows[own], variance[own], after_s):
-                track, number = tracks[t], own[d]
+            same = np.flatnonzero(detections.label == label)
+            for t, d in associate_detections([track.state for track in tracks], rows[same], variance[same], after_s):
+                track = tracks[t]
+                number = same[d]
                 state = update_state(track.state, rows[number], variance[number])
                 track.state, track.ahead_m = head_with_motion(state, track.ahead_m, time_s - track.seen_s)
                 track.seen_s = time_s
@@ -190,33 +192,35 @@ class Tracker:
                 free[number] = False
         for number in np.flatnonzero(free):
             state = start_state(rows[number], variance[number])
-            own = [float(scores[number])]
-            self._tracks.append(_Track(self._next, str(detections.label[number]), state, own, seen_s=time_s))
+            first_scores = [float(scores[number])]
+            self._tracks.append(_Track(self._next, str(detections.label[number]), state, first_scores, seen_s=time_s))
             self._next += 1
         self._tracks = [track for track in self._tracks if track.missed <= self.patience]
         return self._report(first)
 
     def _report(self, first: bool) -> Tracked:
-        told = [track for track in self._tracks if (len(track.scores) >= self.confirm or first) and track.missed == 0]
-        mean = np.array([track.state.mean for track in told]).reshape(-1, 9)
+        reported = [
+            track for track in self._tracks if (len(track.scores) >= self.confirm or first) and track.missed == 0
+        ]
+        mean = np.array([track.state.mean for track in reported]).reshape(-1, 9)
         boxes = Boxes(
             mean[:, :3],
             mean[:, 3:6],
             mean[:, 6],
-            np.array([track.label for track in told], dtype=np.str_),
-            np.array([np.mean(track.scores) for track in told], dtype=np.float64),
-            np.array([np.diag(track.state.covariance)[:7] for track in told]).reshape(-1, 7),
+            np.array([track.label for track in reported], dtype=np.str_),
+            np.array([np.mean(track.scores) for track in reported], dtype=np.float64),
+            np.array([np.diag(track.state.covariance)[:7] for track in reported]).reshape(-1, 7),
         )
-        return Tracked(boxes, np.array([track.number for track in told], dtype=np.int64), mean[:, 7:])
+        return Tracked(boxes, np.array([track.number for track in reported], dtype=np.int64), mean[:, 7:])
 
 
 def associate_detections(
     states: list[TrackState], boxes: Array, variance: Array, after_s: float
 ) -> list[tuple[int, int]]:
-    """Return the pairs (index of a state, index of a box) of least total cost: the Hungarian method within the gate.
+    """Return the pairs (index of a state, index of a box) of least total cost, by the Hungarian method within the gate.
 
     The cost is twice the negative log-likelihood of the detection's x, y under the prediction, up to a constant.
-    boxes (D, 7), variance (D, 7), after_s: time since the last step [s].
+    `boxes` and `variance` are (D, 7); `after_s` is the time since the last step [s].
     """
     if not len(boxes) or not states:
         return []
@@ -234,7 +238,7 @@ def associate_detections(
     return [(int(t), int(d)) for t, d in pairs if np.isfinite(cost[t, d])]
 
 
-LONGEST_GAP_S = 1.0  # between two frames of a sequence
+LONGEST_GAP_S = 1.0  # longest time between two frames of a sequence
 SCORE = 0.3  # lowest score of a detection that is tracked
 
 
@@ -248,12 +252,12 @@ def evaluate_tracks(
 ) -> TracksEvaluation:
     """Return MOTA, AMOTA, identity switches and velocity error per class.
 
-    A sequence is the frames (None: all) of one agent in one scene. Objects to be tracked are the targets of detection,
-    by the network's configuration or by `asked`, one of smaller range.
-
-    Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
+    A sequence consists of the frames (None: all) of one agent in one scene. Objects to track are the targets of
+    detection, by the network's configuration or by `asked`, a configuration of smaller range. Raises `InputError` where
+    consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
     """
-    numbers, config = group_sequences(data, frames), asked or network.config
+    numbers = group_sequences(data, frames)
+    config = asked or network.config
     total = sum(map(len, numbers.values()))
     per_class: dict[str, list[list[TrackingFrame]]] = {name: [] for name in network.config.classes}
     speed_errors: dict[str, list[float]] = {name: [] for name in network.config.classes}
@@ -264,8 +268,8 @@ def evaluate_tracks(
         for number in sequence:
             frame = read(number)
             lidar = choose_lidar(frame)
-            (found,) = detect_in(network, [frame], score_threshold=SCORE)
-            story.append((frame, tracker.step(found.transform(frame.world_from_sensor(lidar)), frame.time_s)))
+            (detected,) = detect_in(network, [frame], score_threshold=SCORE)
+            story.append((frame, tracker.step(detected.transform(frame.world_from_sensor(lidar)), frame.time_s)))
             done += 1
             progress(done, total, "")
         final = _final_scores([tracked for _, tracked in story])
@@ -297,19 +301,19 @@ def group_sequences(data: Dataset, frames: Sequence[int] | None = None) -> dict[
 
     Raises `InputError` where consecutive frames of a sequence are more than `LONGEST_GAP_S` apart.
     """
-    found: dict[tuple[str, str], list[int]] = defaultdict(list)
+    sequences: dict[tuple[str, str], list[int]] = defaultdict(list)
     for number in sorted(data.numbers(frames), key=lambda i: data.keys[i].time_s):
-        found[data.keys[number].scene, data.keys[number].agent].append(number)
-    for (scene, agent), numbers in found.items():
+        sequences[data.keys[number].scene, data.keys[number].agent].append(number)
+    for (scene, agent), numbers in sequences.items():
         gap = max(np.diff([data.keys[i].time_s for i in numbers]), default=0.0)
         if gap > LONGEST_GAP_S + 1e-6:
             apart = f"frames of {agent} in {scene} are {gap:g} s apart"
             raise InputError(f"{data.folder}: {apart}; tracks need {LONGEST_GAP_S:g} s at most")
-    return found
+    return sequences
 
 
 def _final_scores(story: Sequence[Tracked]) -> dict[int, float]:
-    """Return the score of each track in the last frame it is reported in, by its number."""
+    """Return the score of each track in the last frame in which it is reported, by its number."""
     final: dict[int, float] = {}
     for tracked in story:
         score = tracked.boxes.score if tracked.boxes.score is not None else np.ones(len(tracked.boxes))
@@ -322,32 +326,33 @@ def _moment(
 ) -> tuple[TrackingFrame, list[float]]:
     """Return ground truth and tracks of class `name` in a frame, and velocity errors [m/s].
 
-    There is one error for each track within 1 m of an object: that of the velocity in the plane, against the nearest
+    There is one error per track within 1 m of an object: that of the velocity in the plane, relative to the nearest
     object.
     """
     truth, annotations = ground_truth(frame, config), frame.annotations
     of_class = truth.boxes.label == name
     wanted = of_class & truth.target
     sensor_from_world = inverse(frame.world_from_sensor(choose_lidar(frame)))
-    own = np.flatnonzero(tracked.boxes.label == name)
-    own = own[in_range(tracked.boxes[own].transform(sensor_from_world), config)]
-    boxes: Boxes = tracked.boxes[own]
+    rows = np.flatnonzero(tracked.boxes.label == name)
+    rows = rows[in_range(tracked.boxes[rows].transform(sensor_from_world), config)]
+    boxes: Boxes = tracked.boxes[rows]
     objects = np.flatnonzero(wanted)
-    places, found = annotations.boxes.center[objects, :2], boxes.center[:, :2]
+    places = annotations.boxes.center[objects, :2]
+    found = boxes.center[:, :2]
     moment = TrackingFrame(
         objects=annotations.track[objects],
         places=places,
-        tracks=tracked.track[own],
+        tracks=tracked.track[rows],
         found=found,
-        score=np.array([final[int(track)] for track in tracked.track[own]]),
+        score=np.array([final[int(track)] for track in tracked.track[rows]]),
         neutral=on_neutral(boxes, annotations.boxes[of_class & ~wanted]),
     )
     errors = []
-    if len(objects) and len(own):
+    if len(objects) and len(rows):
         apart = np.linalg.norm(places[:, None] - found[None], axis=2)
         nearest = apart.argmin(0)
         for number in np.flatnonzero(apart.min(0) <= 1.0):
             true = annotations.velocity[objects[nearest[number]]][:2]
             if np.isfinite(true).all():  # unknown in an imported dataset
-                errors.append(float(np.linalg.norm(true - tracked.velocity[own[number]])))
+                errors.append(float(np.linalg.norm(true - tracked.velocity[rows[number]])))
     return moment, errors

@@ -63,17 +63,17 @@ class TrainingProgress(Record):
 
 @dataclass(frozen=True, kw_only=True)
 class DataEntry:
-    """Provenance of one dataset: name, frames and agents used, hash of the manifest, recipe."""
+    """Provenance of a dataset: name, frames and agents used, hash of the manifest, recipe."""
 
     name: str  # the last two parts of the folder's path
     frames: int  # number of frames used
-    agents: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose frames; None in older cards
+    agents: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # the agents used; None in older cards
     manifest: str  # SHA-256 of the manifest
     recipe: Mapping[str, Json]  # `RECIPE_FIELDS` of the recording's recipe, and the rigs that have a name
 
 
 class Card(Config):
-    """Model card of a file of weights, stored as JSON in the file's metadata and as Markdown beside the file."""
+    """Model card of a file of weights, stored as JSON in the file's metadata and as Markdown next to the file."""
 
     task: str
     network: str  # name of the configuration
@@ -134,17 +134,18 @@ def write_card(card: Card, path: Path) -> None:
 
 
 def find_recorded_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None = None) -> KnownLidar:
-    """Return beams and range of the agents' first LiDAR by the recipe of a recording, or as an import knows them.
+    """Return beams and range of the agents' first LiDAR, from a recording's recipe or as an import states them.
 
-    recipe: of a manifest, or of a card's entry, which names the rig. agents: whose LiDAR; that of the poles where all
-    are poles, else that of the vehicles. None where it does not say.
+    `recipe` is that of a manifest, or of a card's entry, which names the rig. `agents` are those whose LiDAR is meant:
+    that of the poles if all are poles, else that of the vehicles. None stands for what the recipe does not state.
     """
     kinds = {kind_of(agent) for agent in agents or ()}
     rig: Any = recipe.get("pole_rig" if kinds == {POLE} else "vehicle_rig")
     known: Any = RIGS[rig].model_dump(mode="json") if isinstance(rig, str) and rig in RIGS else rig
     try:
         settings = next(iter(known["lidars"].values()))["settings"]
-        beams, range_m = settings["channels"], settings.get("range_m")
+        beams = settings["channels"]
+        range_m = settings.get("range_m")
     except (TypeError, KeyError, AttributeError, StopIteration):
         beams, range_m = recipe.get("beams"), recipe.get("range_m")
     span = (beams, beams) if isinstance(beams, int) else None
@@ -154,7 +155,7 @@ def find_recorded_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None
 
 
 def join_lidars(known: Sequence[KnownLidar]) -> KnownLidar:
-    """Return what is known of several recordings' LiDARs: the fewest and most beams, and the range if all have one."""
+    """Return the common knowledge of LiDARs: fewest and most beams, and the range [m] if it is the same for all."""
     spans = [lidar.beams for lidar in known if lidar.beams is not None]
     beams = (min(low for low, _ in spans), max(high for _, high in spans)) if spans else None
     ranges = {lidar.range_m for lidar in known}
@@ -172,7 +173,7 @@ def _entry(entry: DataEntry) -> str:
 
 
 def _blocks(values: Mapping[str, Json]) -> list[str]:
-    """Return Markdown blocks: one list of the values that fit on a line, then a titled table of each other value."""
+    """Return Markdown blocks: a list of the values that fit on a line, then a titled table for each other value."""
     tables = {name: _table(value, values.get("classes")) for name, value in values.items()}
     plain = [f"{name}: {_text(value)}" for name, value in values.items() if tables[name] is None]
     named = [f"### {name}\n\n{text}" for name, text in tables.items() if text is not None]
@@ -221,7 +222,7 @@ COUNTER = "num_batches_tracked"  # buffer of batch normalisation, unused with a 
 def find_shipped(task: Task, name: str = SHIPPED) -> Path:
     """Return the path of the task's weights in the package; raises `InputError` if there are none.
 
-    name: of another network of the package, relative to the folder of the task's module.
+    `name` is that of another network of the package, relative to the folder of the task's module.
     """
     module = sys.modules.get(type(task).__module__)
     path = Path(getattr(module, "__file__", None) or "").parent / name
@@ -258,7 +259,7 @@ def save_network(
 def load_network(task: Task[ConfigT, NetworkT, SampleT], path: Path | str) -> NetworkT:
     """Return the network that `save_network` wrote, in evaluation mode on the CPU.
 
-    Raises `InputError` for any other file, for weights that are not finite, and for the name of a task.
+    Raises `InputError` for any other file, for weights that are not finite, and where `task` is the name of a task.
     """
     if isinstance(task, str):
         raise InputError(f"load_network: a task is wanted, flcav.task_named({task!r}), not its name")

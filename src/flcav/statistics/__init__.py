@@ -1,1 +1,1 @@
-"""Statistics of claims: random streams, intervals over scenes and seeds, power and sample size, verdicts."""
+"""Statistics of claims: random streams, confidence intervals over scenes and seeds, power and sample size, verdicts."""

@@ -12,7 +12,7 @@ from flcav.arrays import Array, Ints
 from flcav.statistics.estimates import TAILS
 from flcav.statistics.seeds import OWN_SCENES, SharedScenes
 
-REDRAWS = 1000
+REDRAWS = 1000  # bootstrap resamples
 
 
 def bootstrap_over_scenes(
@@ -25,9 +25,9 @@ def bootstrap_over_scenes(
 ) -> tuple[float, float]:
     """Return the ends of the percentile interval of a measure, 95 %, from `n` bootstrap resamples of the scenes.
 
-    `measure` takes (n, F) counts, how often each of F frames is in each resample, and returns (n,) values, NaN where it
-    is undefined; such resamples are left out, and both ends are NaN where none is left. `scene_of_frame` (F,) names
-    the scene of each frame; `tails` are the quantiles of the ends.
+    `measure` maps (n, F) counts, the multiplicity of each of F frames in each resample, to (n,) values, NaN where it is
+    undefined; such resamples are left out, and both ends are NaN where none is left. `scene_of_frame` (F,) has the
+    scene of each frame; `tails` are the quantiles of the ends.
     """
     names, scene = np.unique(np.asarray(scene_of_frame), return_inverse=True)
     times = rng.multinomial(len(names), np.full(len(names), 1 / len(names)), size=n)
@@ -46,20 +46,22 @@ def share_scenes(
     *,
     rng: np.random.Generator,
 ) -> SharedScenes:
-    """Return the spread of the mean over seeds by the test scenes that several seeds share.
+    """Return the standard deviation of the mean over seeds that is due to the test scenes that seeds share.
 
     `measures` and `scenes_of_frames` are those of `bootstrap_over_scenes`, one per seed. A scene's weight is drawn from
     a Poisson distribution of mean 1, the same in all seeds that have it (Poisson bootstrap; Hanley and MacGibbon,
     Computer Methods and Programs in Biomedicine 83, 2006). The variance is the mean covariance between two seeds, at
     least 0.
     """
-    scenes = [np.asarray(each) for each in scenes_of_frames]
-    names, counts = np.unique(np.concatenate([np.unique(each) for each in scenes]), return_counts=True)
+    scenes = [np.asarray(seed_scenes) for seed_scenes in scenes_of_frames]
+    names, counts = np.unique(np.concatenate([np.unique(seed_scenes) for seed_scenes in scenes]), return_counts=True)
     shared = int((counts > 1).sum())
     if not shared:
         return OWN_SCENES
     times = rng.poisson(1.0, size=(n, len(names)))
-    draws = np.array([of(times[:, np.searchsorted(names, each)]) for of, each in zip(measures, scenes, strict=True)])
+    draws = np.array(
+        [measure(times[:, np.searchsorted(names, of_seed)]) for measure, of_seed in zip(measures, scenes, strict=True)]
+    )
     covariance = np.cov(draws[:, np.isfinite(draws).all(axis=0)])
     between = covariance[~np.eye(len(draws), dtype=bool)].mean()
     return SharedScenes(float(np.sqrt(max(between, 0.0))), shared)

@@ -1,8 +1,8 @@
-"""Estimates with 95 % confidence intervals, and the spread of retraining that widens those of a single training.
+"""Estimates with 95 % confidence intervals, and the spread over retrainings that widens those of a single training.
 
 A network is one draw of those that other random numbers would give: its interval over scenes (`bootstrap`) is widened
-by the spread of others that were trained on the same frames. Numbers in [0, 1] have their interval on the scale of
-log-odds.
+by the standard deviation over others that were trained on the same frames. Intervals of numbers in [0, 1] are on the
+scale of log-odds.
 """
 
 from collections.abc import Sequence
@@ -13,7 +13,7 @@ from scipy.special import expit, logit, ndtri, stdtrit
 
 CONFIDENCE = 0.95
 TAILS = (0.5 - CONFIDENCE / 2, 0.5 + CONFIDENCE / 2)
-EDGE = 1e-6  # log-odds are taken of shares this far from 0 and 1
+EDGE = 1e-6  # shares are limited to this distance from 0 and 1 before their log-odds are taken
 
 
 @dataclass(frozen=True)
@@ -36,17 +36,18 @@ class Estimate:
 
 
 def average_estimates(estimates: Sequence[Estimate]) -> Estimate:
-    """Return the mean of independent estimates; half-widths add in quadrature. One without an interval gives none."""
-    n, mean = len(estimates), float(np.mean([each.mean for each in estimates]))
-    below = [each.mean - each.low for each in estimates if each.low is not None]
-    above = [each.high - each.mean for each in estimates if each.high is not None]
+    """Return the mean of independent estimates; half-widths add in quadrature. It has no interval if one has none."""
+    n = len(estimates)
+    mean = float(np.mean([estimate.mean for estimate in estimates]))
+    below = [estimate.mean - estimate.low for estimate in estimates if estimate.low is not None]
+    above = [estimate.high - estimate.mean for estimate in estimates if estimate.high is not None]
     if min(len(below), len(above)) < n:
         return Estimate(mean, None, None)
     return Estimate(mean, mean - float(np.linalg.norm(below)) / n, mean + float(np.linalg.norm(above)) / n)
 
 
 def score_interval(share: float, trials: int) -> Estimate:
-    """Return a share of independent trials with Wilson's 95 % score interval (JASA 22, 1927), of 0 and 1, too."""
+    """Return a share of independent trials with Wilson's 95 % score interval (JASA 22, 1927), also of 0 and 1."""
     z2 = float(ndtri(TAILS[1])) ** 2 / trials
     middle = (share + z2 / 2) / (1 + z2)
     half = float(np.sqrt(z2 * share * (1 - share) + z2**2 / 4)) / (1 + z2)
@@ -58,11 +59,11 @@ class Spread:
     """The standard deviation of a number over trainings on the same frames with other random numbers."""
 
     sd: float
-    trainings: int  # that the standard deviation was estimated from, at least 2
+    trainings: int  # number of trainings that the standard deviation was estimated from, at least 2
 
     @property
     def half_width(self) -> float:
-        """Half the width of the 95 % interval for the mean over trainings, around one training: t(n - 1) · sd."""
+        """Half the width of the 95 % interval for the mean over trainings, about one training: t(n - 1) · sd."""
         return float(stdtrit(self.trainings - 1, TAILS[1])) * self.sd
 
 
@@ -72,16 +73,16 @@ def measure_spread(values: Sequence[float]) -> Spread | None:
 
 
 def pool_spreads(spreads: Sequence[Spread]) -> Spread:
-    """Return the spread over several sets of frames: variances are averaged, weighted by their degrees of freedom."""
-    freedom = [each.trainings - 1 for each in spreads]
-    variance = np.average([each.sd**2 for each in spreads], weights=freedom)
+    """Return the pooled spread over several sets of frames: variances are averaged, weighted by degrees of freedom."""
+    freedom = [spread.trainings - 1 for spread in spreads]
+    variance = np.average([spread.sd**2 for spread in spreads], weights=freedom)
     return Spread(float(np.sqrt(variance)), sum(freedom) + 1)
 
 
 def combine_spreads(first: Spread | None, second: Spread | None) -> Spread | None:
     """Return the spread of the difference of two numbers whose trainings vary independently; None where one is unknown.
 
-    Variances add; trainings are the fewer of both.
+    Variances add; `trainings` is the smaller of both.
     """
     if first is None or second is None:
         return None
@@ -96,7 +97,8 @@ def widen(estimate: Estimate, spread: Spread) -> Estimate:
     """
     if estimate.low is None or estimate.high is None:
         return estimate
-    below, above = estimate.mean - estimate.low, estimate.high - estimate.mean
+    below = estimate.mean - estimate.low
+    above = estimate.high - estimate.mean
     half = spread.half_width
     return Estimate(estimate.mean, estimate.mean - np.hypot(below, half), estimate.mean + np.hypot(above, half))
 

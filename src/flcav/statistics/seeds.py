@@ -1,12 +1,12 @@
 """Means over seeds, with Student's t intervals and tests over seeds and scenes; and the test of a single training.
 
-Seeds differ in training and, where each has test scenes of its own, in scenes. Of nested data only the top level is to
-be resampled, since the values of seeds vary by their scenes already (Davison and Hinkley, "Bootstrap Methods and their
+Seeds differ in training and, where each has separate test scenes, in scenes. Of nested data only the top level is to be
+resampled, since the values of seeds already vary by their scenes (Davison and Hinkley, "Bootstrap Methods and their
 Application", 1997, section 3.8). For few seeds the bootstrap of the mean, with its standard error scaled by
 sqrt(n / (n - 1)), is Student's t. Scenes that seeds share do not average out over seeds: their variance is the
-covariance between seeds over draws of these scenes (`bootstrap.share_scenes`), and is added. Numbers in [0, 1] have
-their interval on the scale of log-odds. `tests/unit/statistics/test_seeds_and_scenes.py` simulates the coverage of
-this and of other methods.
+covariance between seeds over draws of these scenes (`bootstrap.share_scenes`), and is added. Intervals of numbers in
+[0, 1] are on the scale of log-odds. `tests/unit/statistics/test_seeds_and_scenes.py` simulates the coverage of this and
+of other methods.
 """
 
 from collections.abc import Sequence
@@ -18,10 +18,10 @@ from scipy.special import expit, logit, ndtri, stdtr, stdtrit
 
 from flcav.statistics.estimates import CONFIDENCE, EDGE, TAILS, Estimate, Spread, widen
 
-LEVEL = 1 - CONFIDENCE  # of a test, two-sided
-LEAST_P = 1e-12  # p-values below are 0
-LARGEST_SPREAD = 0.1  # assumed where it is not known: above the deviation of any retrainings in `reproductions`
-FEWEST_SCENES = 6  # by which signs alone can decide at `LEVEL`: 2^(1 - 6) = 0.03
+LEVEL = 1 - CONFIDENCE  # significance level of a test, two-sided
+LEAST_P = 1e-12  # smaller p-values are returned as 0
+LARGEST_SPREAD = 0.1  # assumed where it is not known: above the deviation over retrainings of any in `reproductions`
+FEWEST_SCENES = 6  # least number whose signs alone can be significant at `LEVEL`: 2^(1 - 6) = 0.03
 
 
 @dataclass(frozen=True)
@@ -29,14 +29,14 @@ class SharedScenes:
     """The part of the spread of a mean over seeds that more seeds do not reduce, since they share test scenes."""
 
     sd: float = 0.0  # standard deviation of the mean over draws of these scenes
-    scenes: int = 0  # that several seeds share
+    scenes: int = 0  # number of scenes that several seeds share
 
 
-OWN_SCENES = SharedScenes()  # every seed has test scenes of its own
+OWN_SCENES = SharedScenes()  # no scenes are shared
 
 
 def average_shared(parts: Sequence[SharedScenes]) -> SharedScenes:
-    """Return the part of the spread of a mean over regions, whose scenes are independent, from that of each region."""
+    """Return the part of the spread of a mean over regions, whose scenes are independent, from those of the regions."""
     sd = float(np.linalg.norm([part.sd for part in parts])) / len(parts)
     return SharedScenes(sd, sum(part.scenes for part in parts))
 
@@ -45,15 +45,15 @@ def average_shared(parts: Sequence[SharedScenes]) -> SharedScenes:
 class MeanOverSeeds(Estimate):
     """The mean over seeds with its 95 % confidence interval, over seeds and scenes.
 
-    There is no interval (None) of a single seed, and none of a share that is 0, or 1, in all seeds. The standard error
-    is sqrt(sd^2 / n + shared.sd^2); its degrees of freedom are the harmonic mean of those of the seeds, n - 1, and of
-    the shared scenes, weighted by their parts of the variance.
+    There is no interval (None) of a single seed, nor of a share that is 0, or 1, in all seeds. The standard error is
+    sqrt(sd^2 / n + shared.sd^2); its degrees of freedom are the harmonic mean of those of the seeds, n - 1, and of the
+    shared scenes, weighted by their parts of the variance.
     """
 
     seeds: int = 1
     sd: float = 0.0  # standard deviation over seeds; 0 of a single seed
     shared: SharedScenes = OWN_SCENES
-    share: bool = False  # a number in [0, 1]: its interval and tests are on the scale of log-odds
+    share: bool = False  # whether it is a number in [0, 1], with interval and tests on the scale of log-odds
 
     @property
     def known(self) -> bool:
@@ -66,11 +66,11 @@ class MeanOverSeeds(Estimate):
 
     @property
     def slope(self) -> float:
-        """Return the derivative of the tests' scale: that of the log-odds for a share, 1 for other numbers."""
+        """Return the derivative of the tests' scale at the mean: of the log-odds for a share, 1 for other numbers."""
         return 1 / (self.mean * (1 - self.mean)) if self.share else 1.0
 
     def distance(self, hypothesis: float) -> float:
-        """Return how far the mean is above `hypothesis`, on the tests' scale."""
+        """Return the difference of the mean from `hypothesis` on the tests' scale."""
         if not self.share:
             return self.mean - hypothesis
         return float(logit(self.mean) - logit(np.clip(hypothesis, EDGE, 1 - EDGE)))
@@ -80,10 +80,10 @@ class MeanOverSeeds(Estimate):
         if not self.known:
             return None
         error, freedom = standard_error(self.sd, self.seeds, self.shared)
-        far = abs(self.distance(hypothesis))
+        distance = abs(self.distance(hypothesis))
         if error == 0:
-            return 0.0 if far else 1.0
-        return float(2 * stdtr(freedom, -far / (self.slope * error)))
+            return 0.0 if distance else 1.0
+        return float(2 * stdtr(freedom, -distance / (self.slope * error)))
 
     def ends(self, level: float = LEVEL) -> tuple[float, float]:
         """Return the ends of the interval of a two-sided test at `level`, where the spread is known."""
@@ -99,42 +99,45 @@ class MeanOverSeeds(Estimate):
 class OneTraining(MeanOverSeeds):
     """A number of one training whose standard deviation over trainings on the same frames is known from others.
 
-    `shared` is that of the test scenes, towards 0. Interval and p-value are those of `widen`.
+    `shared` is the part by test scenes, of the half-width towards 0. Interval and p-value are those of `widen`.
     """
 
-    trainings: int = 2  # that the standard deviation was estimated from
+    trainings: int = 2  # number of trainings that the standard deviation was estimated from
 
     @property
     def known(self) -> bool:
-        """Return that there is a test."""
+        """Return True: there is always a test."""
         return True
 
     def ends(self, level: float = LEVEL) -> tuple[float, float]:
-        """Return the ends of the interval of `widen` at `level`; half-widths over scenes are as normal quantiles."""
+        """Return the ends of the interval of `widen` at `level`; the scenes' half-widths scale as normal quantiles."""
         assert self.low is not None
         assert self.high is not None
-        grown = float(ndtri(1 - level / 2) / ndtri(TAILS[1]))
-        own = Spread(self.sd, self.trainings).half_width
+        scale = float(ndtri(1 - level / 2) / ndtri(TAILS[1]))
+        of_trainings = Spread(self.sd, self.trainings).half_width
         half = float(stdtrit(self.trainings - 1, 1 - level / 2)) * self.sd
         sides = np.array([self.mean - self.low, self.high - self.mean])
-        below, above = np.hypot(grown * np.sqrt(np.maximum(sides**2 - own**2, 0.0)), half).tolist()
+        # `widen` added the half-widths in quadrature: the part of the scenes remains when that of trainings is removed.
+        below, above = np.hypot(scale * np.sqrt(np.maximum(sides**2 - of_trainings**2, 0.0)), half).tolist()
         return self.mean - below, self.mean + above
 
     def p_value(self, hypothesis: float = 0.0) -> float:
         """Return the level at which the interval of `widen` ends at `hypothesis`."""
-        far, of_scenes = abs(self.distance(hypothesis)), self.shared.sd
+        distance = abs(self.distance(hypothesis))
+        of_scenes = self.shared.sd
 
         def beyond(p: float) -> float:
-            scenes, trainings = ndtri(1 - p / 2) * of_scenes, stdtrit(self.trainings - 1, 1 - p / 2) * self.sd
-            return float(np.hypot(scenes, trainings)) - far
+            scenes = ndtri(1 - p / 2) * of_scenes
+            trainings = stdtrit(self.trainings - 1, 1 - p / 2) * self.sd
+            return float(np.hypot(scenes, trainings)) - distance
 
-        if far == 0:
+        if distance == 0:
             return 1.0
         return 0.0 if beyond(LEAST_P) < 0 else float(root_scalar(beyond, bracket=(LEAST_P, 1.0)).root)
 
 
 def of_one_training(over_scenes: Estimate, scenes: int, spread: Spread) -> OneTraining | None:
-    """Return a number of one training with the interval of `widen`; None where there is none over its scenes."""
+    """Return a number of one training with the interval of `widen`; None where there is no interval over its scenes."""
     mean, low, high = over_scenes.mean, over_scenes.low, over_scenes.high
     if low is None or high is None:
         return None
@@ -145,12 +148,12 @@ def of_one_training(over_scenes: Estimate, scenes: int, spread: Spread) -> OneTr
 
 
 def p_value_of_loss(over_scenes: Estimate, scenes: int, spread: float = LARGEST_SPREAD) -> float | None:
-    """Return the two-sided p-value of a negative difference of one training whose spread of retraining is not known.
+    """Return the two-sided p-value of a negative difference of one training whose spread over retrainings is not known.
 
     `spread`: the standard deviation that is assumed instead. The interval over scenes, of normal quantiles and of a
-    standard deviation that divides by the number of scenes, is widened for few of them, by Student's t with the degrees
-    of freedom of `standard_error`. None for a difference that is not negative, without an interval, or of fewer than
-    `FEWEST_SCENES`: so few may all be scenes of a collapse.
+    standard deviation that divides by the number of scenes, is widened for few scenes by Student's t, with degrees of
+    freedom as in `standard_error`. None for a difference that is not negative, without an interval, or of fewer than
+    `FEWEST_SCENES` scenes, which might all be affected by a rare failure.
     """
     mean, high = over_scenes.mean, over_scenes.high
     if high is None or mean >= 0 or scenes < FEWEST_SCENES:
@@ -170,18 +173,19 @@ def mean_over_seeds(
     """
     array = np.asarray(values, dtype=np.float64)
     sd = float(array.std(ddof=1)) if len(array) > 1 else 0.0
-    found = MeanOverSeeds(float(array.mean()), None, None, len(array), sd, shared, share)
-    low, high = found.ends() if found.known else (None, None)
-    return replace(found, low=low, high=high)
+    over_seeds = MeanOverSeeds(float(array.mean()), None, None, len(array), sd, shared, share)
+    low, high = over_seeds.ends() if over_seeds.known else (None, None)
+    return replace(over_seeds, low=low, high=high)
 
 
 def standard_error(sd: float, seeds: int, shared: SharedScenes) -> tuple[float, float]:
     """Return the standard error of a mean over seeds, and its degrees of freedom."""
-    own, common = sd**2 / seeds, shared.sd**2
-    if own + common == 0:
+    independent = sd**2 / seeds
+    common = shared.sd**2
+    if independent + common == 0:
         return 0.0, seeds - 1
-    freedom = (own + common) / (own / (seeds - 1) + common / max(shared.scenes - 1, 1))
-    return float(np.sqrt(own + common)), freedom
+    freedom = (independent + common) / (independent / (seeds - 1) + common / max(shared.scenes - 1, 1))
+    return float(np.sqrt(independent + common)), freedom
 
 
 def half_width(sd: float, seeds: int) -> float:

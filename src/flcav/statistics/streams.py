@@ -1,4 +1,4 @@
-"""Named random streams of one seed: each consumer has its own, so that adding one does not change the others.
+"""Named random streams of one seed: every consumer has a separate one, so that adding one does not change the others.
 
 Names become the spawn key of NumPy's `SeedSequence`; strings by their CRC-32.
 """

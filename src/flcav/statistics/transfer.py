@@ -1,8 +1,8 @@
-"""Final mean, backward and forward transfer of a learner to which tasks come one after another.
+"""Final mean, backward and forward transfer of a learner of a sequence of tasks.
 
-`scores` (T + 1, T) has the score on each of T tasks, in the order in which they come: in row 0 before the first of
-them, in row i after task i. Source: Lopez-Paz and Ranzato, "Gradient Episodic Memory for Continual Learning", NeurIPS
-2017, equations 2 to 4. There the first row is of random weights; here it is of the network that learning begins with.
+`scores` (T + 1, T) has the score on each of T tasks, in the order of learning: row 0 before the first of them, row i
+after task i. Source: Lopez-Paz and Ranzato, "Gradient Episodic Memory for Continual Learning", NeurIPS 2017, equations
+2 to 4. There the first row is of random weights; here it is of the network that learning starts with.
 """
 
 import numpy as np
@@ -12,19 +12,19 @@ from flcav.arrays import Array
 
 
 def compute_final_mean(scores: ArrayLike) -> float:
-    """Return the mean score over all tasks after the last; raises ValueError as all functions here."""
+    """Return the mean score over all tasks after the last; raises ValueError for scores of a wrong shape."""
     return float(_check(scores)[-1].mean())
 
 
 def compute_backward_transfer(scores: ArrayLike) -> float:
-    """Return the mean change of the score on a task by all later ones: forgetting where it is negative."""
+    """Return the mean change of the score on a task by all later ones, negative for forgetting; raises ValueError."""
     table = _check(scores)
     learned = np.diagonal(table[1:])
     return float((table[-1] - learned)[:-1].mean())
 
 
 def compute_forward_transfer(scores: ArrayLike) -> float:
-    """Return the mean change of the score on a task by all earlier ones, before it is learned."""
+    """Return the mean change of the score on a task by all earlier ones, before it is learned; raises ValueError."""
     table = _check(scores)
     before = np.diagonal(table[:-1])
     return float((before - table[0])[1:].mean())

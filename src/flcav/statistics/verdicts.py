@@ -1,7 +1,7 @@
 """Verdicts on claims and targets from 95 % confidence intervals and corrected p-values, and their wording.
 
-A page makes several claims. Their p-values are corrected together, so that the chance of any wrong verdict on a page
-is at most 5 % (Holm, "A Simple Sequentially Rejective Multiple Test Procedure", Scandinavian Journal of Statistics 6,
+The p-values of all claims of a page are corrected together, so that the probability of any false verdict on a page is
+at most 5 % (Holm, "A Simple Sequentially Rejective Multiple Test Procedure", Scandinavian Journal of Statistics 6,
 1979).
 """
 
@@ -16,14 +16,14 @@ from flcav.storage.markdown import format_table
 from flcav.storage.records import LEFT_OUT
 
 HELD, NOT_HELD, UNDECIDED = "held", "did not hold", "undecided"
-ESTIMATE = "estimate"  # in the place of a verdict, of a difference about which nothing is claimed
-REACHED = {HELD: "reached", NOT_HELD: "not reached", UNDECIDED: UNDECIDED}  # the words for an aim
+ESTIMATE = "estimate"  # instead of a verdict, for a difference without a claim
+REACHED = {HELD: "reached", NOT_HELD: "not reached", UNDECIDED: UNDECIDED}  # wording for an aim
 
 
 def verdict(low: float | None, high: float | None) -> str:
     """Return the verdict on the claim that a difference with the interval [low, high] is positive.
 
-    HELD if the interval lies above 0, NOT_HELD if below 0, else UNDECIDED, also where there is no interval (None).
+    HELD if the interval lies above 0, NOT_HELD if below 0, else UNDECIDED, as without an interval (None).
     """
     if low is None or high is None:
         return UNDECIDED
@@ -33,7 +33,7 @@ def verdict(low: float | None, high: float | None) -> str:
 
 
 def explain_verdict(decided: str) -> str:
-    """Return a clause that says the verdict `decided` on a claim of one run."""
+    """Return a clause with the verdict `decided` on a claim of one run."""
     return {
         HELD: "the claim held in this run",
         NOT_HELD: "the claim did not hold in this run",
@@ -43,7 +43,7 @@ def explain_verdict(decided: str) -> str:
 
 @dataclass(frozen=True)
 class Claim:
-    """The claim that a mean over seeds is above `than`, or with `at_most` below it."""
+    """The claim that a mean over seeds is above `than`, or, if `at_most`, below it."""
 
     mean: MeanOverSeeds
     than: float = 0.0
@@ -52,7 +52,7 @@ class Claim:
 
 @dataclass(frozen=True)
 class Alone:
-    """A claim that its own interval would decide, and the correction for the others leaves undecided."""
+    """A claim that is decided by its uncorrected p-value, but not by the corrected one."""
 
     p: float  # not corrected
     ends: tuple[float, float]  # of its simultaneous interval: at `LEVEL` divided by the number of claims
@@ -60,37 +60,37 @@ class Alone:
 
 @dataclass(frozen=True)
 class Judged:
-    """The verdict on one of several claims that are judged together."""
+    """The verdict on one claim of a family that is tested together."""
 
     verdict: str  # HELD, NOT_HELD or UNDECIDED
     p: float | None  # corrected for the claims of the family; None where the spread over seeds or scenes is not known
-    family: int  # number of claims that are judged together
-    seeds: int | None  # that it takes to decide, if the effect is as large as was found; None: unknown, or too many
+    family: int  # number of claims that are tested together
+    seeds: int | None  # number that decides an effect as large as observed; None: unknown, or too many
     size: Annotated[SampleSize | None, LEFT_OUT] = None  # the same with test scenes, where seeds share them
     alone: Annotated[Alone | None, LEFT_OUT] = None
 
     def describe(self, word: str = "seeds") -> str:
-        """Return p and the number of claims as text, and of an undecided claim how many seeds it would take.
+        """Return p and the number of claims as text, and for an undecided claim the number of seeds that decides it.
 
         `word`: the plural of a seed, or of a training.
         """
         if self.p is None:
             return "the spread over seeds is not known"
         corrected = f", corrected for {self.family} claims" if self.family > 1 else ""
-        said = f"p {format_p(self.p)}{corrected}{self._tell_alone()}"
+        text = f"p {format_p(self.p)}{corrected}{self._tell_alone()}"
         if self.verdict != UNDECIDED:
-            return said
+            return text
         takes = f"about {self.seeds} {word}" if self.seeds else f"more than {MOST_SEEDS} {word}"
-        return f"{said}; detecting an effect of this size takes {self.size.describe(word) if self.size else takes}"
+        return f"{text}; detecting an effect of this size takes {self.size.describe(word) if self.size else takes}"
 
     @property
     def p_cell(self) -> str:
-        """Return the corrected p for a table, with what the correction made undecided; empty where it is not known."""
+        """Return the corrected p for a table, and the uncorrected one of `alone`; empty where p is not known."""
         return "" if self.p is None else f"{format_p(self.p)}{self._tell_alone()}"
 
     @property
     def takes_cell(self) -> str:
-        """Return for a table the seeds that would decide; empty where the claim is decided, or cannot be."""
+        """Return for a table the number of seeds that decides; empty where the claim is decided, or p is not known."""
         if self.verdict != UNDECIDED or self.p is None:
             return ""
         return self.size.describe("seeds") if self.size else str(self.seeds or f"more than {MOST_SEEDS}")
@@ -104,9 +104,10 @@ class Judged:
 
 
 def correct_p_values(p_values: Sequence[float]) -> list[float]:
-    """Return Holm's corrected p-values: those up to a level are the hypotheses that are rejected at this level."""
+    """Return Holm's corrected p-values: those of at most a level are of the hypotheses that are rejected at it."""
     order = sorted(range(len(p_values)), key=lambda i: p_values[i])
-    corrected, largest = [0.0] * len(p_values), 0.0
+    corrected = [0.0] * len(p_values)
+    largest = 0.0
     for rank, i in enumerate(order):
         largest = max(largest, min(1.0, (len(p_values) - rank) * p_values[i]))
         corrected[i] = largest
@@ -116,22 +117,22 @@ def correct_p_values(p_values: Sequence[float]) -> list[float]:
 def judge(claims: Sequence[Claim]) -> list[Judged]:
     """Return the verdicts on all claims of a page, by p-values that are corrected for their number.
 
-    Claims whose spread over seeds is not known are undecided and do not count. The number of seeds is for the
-    level that a single claim has at worst, `LEVEL` divided by the number of claims, and a power of 0.8.
+    Claims whose spread over seeds is not known are undecided and do not count. The number of seeds is for the level of
+    a single claim in the worst case, `LEVEL` divided by the number of claims, and a power of 0.8.
     """
-    found = [claim.mean.p_value(claim.than) for claim in claims]
-    known = [p for p in found if p is not None]
+    p_values = [claim.mean.p_value(claim.than) for claim in claims]
+    known = [p for p in p_values if p is not None]
     corrected = iter(correct_p_values(known))
     return [
         Judged(UNDECIDED, None, len(known), None) if p is None else _judged(claim, next(corrected), len(known))
-        for claim, p in zip(claims, found, strict=True)
+        for claim, p in zip(claims, p_values, strict=True)
     ]
 
 
 def judge_known(claims: Sequence[Claim | None]) -> list[Judged | None]:
-    """Return `judge` of the claims that there are; None where there is none, which does not count."""
-    found = iter(judge([claim for claim in claims if claim is not None]))
-    return [None if claim is None else next(found) for claim in claims]
+    """Return `judge` of the claims that are not None, which alone count; None in the place of the others."""
+    verdicts = iter(judge([claim for claim in claims if claim is not None]))
+    return [None if claim is None else next(verdicts) for claim in claims]
 
 
 def judge_means(means: Mapping[str, MeanOverSeeds]) -> dict[str, Judged]:
@@ -140,37 +141,39 @@ def judge_means(means: Mapping[str, MeanOverSeeds]) -> dict[str, Judged]:
 
 
 def describe_means(means: Mapping[str, MeanOverSeeds]) -> list[str]:
-    """Return each mean with the verdict on the claim that it is above 0, in words."""
+    """Return each mean with the verdict on the claim that it is above 0, as text."""
     return [
-        f"{name}: {means[name].describe(sign=True)}, {one.verdict}: {one.describe()}"
-        for name, one in judge_means(means).items()
+        f"{name}: {means[name].describe(sign=True)}, {judged.verdict}: {judged.describe()}"
+        for name, judged in judge_means(means).items()
     ]
 
 
 def tabulate_means(title: str, means: Mapping[str, MeanOverSeeds]) -> str:
     """Return a Markdown table of the means, of the `title`, with the verdicts on the claims that they are above 0."""
     rows = [
-        [name, means[name].describe(sign=True), one.p_cell, one.verdict] for name, one in judge_means(means).items()
+        [name, means[name].describe(sign=True), judged.p_cell, judged.verdict]
+        for name, judged in judge_means(means).items()
     ]
     return format_table((title, "mean over seeds", "p, corrected", "claim that it is positive"), rows)
 
 
 def _judged(claim: Claim, p: float, family: int) -> Judged:
-    above, level = claim.mean.mean > claim.than, LEVEL / family
-    said = UNDECIDED if p > LEVEL else HELD if above != claim.at_most else NOT_HELD
-    own = claim.mean.p_value(claim.than)
+    above = claim.mean.mean > claim.than
+    level = LEVEL / family
+    decided = UNDECIDED if p > LEVEL else HELD if above != claim.at_most else NOT_HELD
+    uncorrected = claim.mean.p_value(claim.than)
     alone = None
-    if said == UNDECIDED and own is not None and own <= LEVEL:
-        alone = Alone(own, claim.mean.ends(level))
-    size = plan_sample(claim.mean, claim.than, level) if said == UNDECIDED else None
-    return Judged(said, p, family, seeds_to_tell(claim.mean, claim.than, level), size, alone)
+    if decided == UNDECIDED and uncorrected is not None and uncorrected <= LEVEL:
+        alone = Alone(uncorrected, claim.mean.ends(level))
+    size = plan_sample(claim.mean, claim.than, level) if decided == UNDECIDED else None
+    return Judged(decided, p, family, seeds_to_tell(claim.mean, claim.than, level), size, alone)
 
 
 def tell_loss(over_scenes: Estimate, scenes: int, family: int, spread: float = LARGEST_SPREAD) -> str | None:
-    """Return why a claim of one training of unknown spread did not hold, in words; None where it is undecided.
+    """Return the reason why a claim of one training of unknown spread did not hold, as text; None where undecided.
 
-    So large a loss is one whatever the spread: its p-value with the largest that is assumed, times the `family`, the
-    number of claims that are made (Bonferroni), is at most `LEVEL`. A gain is never decided so.
+    A large enough loss is significant whatever the spread: its p-value with the largest spread that is assumed, times
+    the number of claims `family` (Bonferroni), is at most `LEVEL`. A gain is never decided in this way.
     """
     p = p_value_of_loss(over_scenes, scenes, spread)
     if p is None or p * family > LEVEL:
@@ -183,10 +186,10 @@ def tell_loss(over_scenes: Estimate, scenes: int, family: int, spread: float = L
 def describe_aims(aims: Mapping[str, Claim]) -> list[str]:
     """Return the sentence "*aim*: **verdict**, mean (low to high) over n seeds; p." of each aim, in Markdown.
 
-    All aims of the page are judged together. The verdict is "reached", "not reached" or UNDECIDED.
+    All aims of the page are tested together. The verdict is "reached", "not reached" or UNDECIDED.
     """
     judged = judge(list(aims.values()))
-    return [_describe_aim(aim, claim.mean, one) for (aim, claim), one in zip(aims.items(), judged, strict=True)]
+    return [_describe_aim(aim, claim.mean, result) for (aim, claim), result in zip(aims.items(), judged, strict=True)]
 
 
 def _describe_aim(aim: str, mean: MeanOverSeeds, judged: Judged) -> str:

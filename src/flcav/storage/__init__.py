@@ -1,1 +1,1 @@
-"""Files that hold results: atomic writing, JSON records, Parquet and CSV tables, Markdown."""
+"""Storage of results: atomic writing, JSON records, Parquet and CSV tables, Markdown."""

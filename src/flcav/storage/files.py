@@ -19,17 +19,17 @@ import pyarrow.parquet as pq
 
 from flcav.config import InputError, Json, check_is_file
 
-PIECE_BYTES = 1 << 16
-SYNCING = 8  # files that are flushed at once: the file system commits them together, ten times as fast as in turn
+PIECE_BYTES = 1 << 16  # of a single write
+SYNCING = 8  # files that are flushed in parallel: the file system commits them together, ten times as fast
 
 
 @contextlib.contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary file beside `path` to write to; it is renamed to `path` on success and removed on failure.
+    """Yield a temporary file in the folder of `path` to write to; renamed to `path` on success, removed on failure.
 
-    It is on the disk before it has its name, so that a crash of the machine leaves the old file or the whole new one,
-    and on return it has its name on the disk, too. Creates missing parent folders. An `OSError` without a file name,
-    such as one raised by a write, is raised on with `path` as its file name.
+    It is flushed to the disk before it is renamed, and its folder after that, so that a crash of the machine leaves
+    either the old file or the whole new one. Creates missing parent folders. An `OSError` without a file name, such as
+    one raised by a write, is raised on with `path` as its file name.
     """
     if path.is_dir():
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
@@ -71,7 +71,7 @@ def flush_tree(folder: Path) -> None:
 
 def find_existing(path: Path) -> Path:
     """Return `path`, or the nearest of its parents that exists."""
-    return next(each for each in (path, *path.absolute().parents) if each.exists())
+    return next(candidate for candidate in (path, *path.absolute().parents) if candidate.exists())
 
 
 def check_writable(folder: Path) -> None:
@@ -82,7 +82,7 @@ def check_writable(folder: Path) -> None:
     try:
         tempfile.TemporaryFile(dir=find_existing(folder)).close()
     except OSError as error:
-        # PermissionError whatever the cause: a FileNotFoundError would be reported as a wrong input of the user
+        # PermissionError whatever the cause: a FileNotFoundError would be reported as an invalid input of the user
         raise PermissionError(error.errno, error.strerror, str(folder)) from None
 
 
@@ -103,7 +103,7 @@ def write_in_pieces(path: Path, data: bytes | memoryview) -> None:
 
 
 def write_json(path: Path, value: Json, *, sort: bool = True) -> None:
-    """Write `value` as indented JSON to `path`, atomically, with keys sorted or (`sort=False`) in their own order.
+    """Write `value` as indented JSON to `path`, atomically, with keys sorted or, with `sort=False`, in the order given.
 
     Raises ValueError for a number that is not finite.
     """
@@ -116,15 +116,15 @@ def sha256(path: Path) -> str:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
 
-HARMLESS_BYTES = 1 << 28  # that any table may take in memory
-UNFOLDED = 1000  # most bytes in memory that a byte of a larger table stands for; unlike rows unfold to a few
+HARMLESS_BYTES = 1 << 28  # size in memory of a table that is read without further checks
+UNFOLDED = 1000  # greatest ratio of the sizes in memory and in the file of a larger table; usual ones are below 10
 
 
 def read_parquet(path: Path) -> pa.Table:
-    """Return the table in a Parquet file, validated in full: its strings are UTF-8.
+    """Return the table in a Parquet file, fully validated, so that its strings are UTF-8.
 
-    Raises `InputError` where the file is missing, not Parquet, or damaged, and before it is read where it would unfold
-    to far more than tables do.
+    Raises `InputError` where the file is missing, not Parquet, or damaged, and, before it is read, where it would take
+    far more memory than tables do (a decompression bomb).
     """
     check_is_file(path, None)
     try:
@@ -139,7 +139,7 @@ def read_parquet(path: Path) -> pa.Table:
 
 
 def _measure_table(metadata: Any) -> int:
-    """Return the size of a file's values in memory by its metadata [bytes]: at least eight a value, or their pages."""
+    """Return the size [bytes] of a file's values in memory by its metadata: at least eight a value, or their pages."""
     groups = (metadata.row_group(i) for i in range(metadata.num_row_groups))
     columns = (group.column(j) for group in groups for j in range(group.num_columns))
     return sum(max(8 * column.num_values, column.total_uncompressed_size) for column in columns)

@@ -1,6 +1,6 @@
 """Conversion of frozen dataclasses to JSON values and back, by pydantic, and to rows of a table.
 
-Tables of users: CSV read, and tables written as CSV or Parquet by the suffix of the file's name.
+Tables of users: reading of CSV, and writing as CSV or Parquet by the suffix of the file's name.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 Class = Annotated[str, Field(alias="class")]  # a field named "class" in JSON, a reserved word in Python
-LEFT_OUT = Field(exclude_if=lambda value: value is None)  # for `Annotated`: not in the JSON where it is None
-WHERE_TRUE = Field(exclude_if=lambda value: not value)  # for `Annotated`: in the JSON where it is true
+LEFT_OUT = Field(exclude_if=lambda value: value is None)  # for `Annotated`: left out of the JSON where it is None
+WHERE_TRUE = Field(exclude_if=lambda value: not value)  # for `Annotated`: only in the JSON where it is true
 
 RecordT = TypeVar("RecordT")
 
@@ -34,7 +34,7 @@ class Record:
 
     @classmethod
     def from_json(cls, values: Json, origin: str) -> Self:
-        """Return the record that `as_json` made `values` of; raises `InputError` naming `origin` if they do not fit."""
+        """Return the record with `values` as its `as_json`; raises `InputError` naming `origin` if they do not fit."""
         return from_json(cls, values, origin)
 
 
@@ -44,7 +44,7 @@ def to_json(record: RecordT, kind: type[RecordT]) -> dict[str, Json]:
 
 
 def from_json(kind: type[RecordT], values: Json, origin: str) -> RecordT:
-    """Return the `kind` that `to_json` made `values` of; raises `InputError` naming `origin` if they do not fit."""
+    """Return the `kind` with `values` as its `to_json`; raises `InputError` naming `origin` if they do not fit."""
     try:
         return _adapter(kind).validate_python(values)
     except ValidationError as error:
@@ -59,7 +59,7 @@ def from_json(kind: type[RecordT], values: Json, origin: str) -> RecordT:
 def to_rows(records: Iterable["DataclassInstance"]) -> list[dict[str, Json]]:
     """Return a row of a table for each record; `pandas.DataFrame` and `polars.DataFrame` take the list.
 
-    Fields of a record within a record are columns of their own, named as in "estimate.mean".
+    Fields of a record within a record are separate columns, named as in "estimate.mean".
 
     >>> from flcav.statistics.estimates import Estimate
     >>> to_rows([Estimate(0.5, 0.4, 0.6)])
@@ -82,7 +82,7 @@ def _adapter(record: type) -> TypeAdapter[Any]:
     return TypeAdapter(record)
 
 
-ENDINGS = (".csv", ".parquet")
+ENDINGS = (".csv", ".parquet")  # of the files that tables are written to
 
 
 def check_ending(path: Path) -> None:
@@ -94,8 +94,8 @@ def check_ending(path: Path) -> None:
 def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str = "") -> pa.Table:
     """Return the table in the CSV file at `path`, or in an open one called `origin`, the columns `texts` as text.
 
-    Only an empty cell is None; "NaN" is a number, "NA" is text. Raises `InputError` where the file is missing or no
-    table, or a column is there twice.
+    Only an empty cell is None; "NaN" is a number, "NA" is text. Raises `InputError` where the file is missing or not a
+    table, or where two columns have the same name.
     """
     named = origin or str(path)
     written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
@@ -104,8 +104,8 @@ def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str
     try:
         table = csv.read_csv(path, convert_options=written)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
-        said = str(error) if str(error).isprintable() else "its bytes are no text"
-        raise InputError(f"{named}: not a table ({said})") from None
+        reason = str(error) if str(error).isprintable() else "its bytes are no text"
+        raise InputError(f"{named}: not a table ({reason})") from None
     for name in table.column_names:
         if name and table.column_names.count(name) > 1:
             raise InputError(f"{named}: column '{name}' is there twice; found {', '.join(table.column_names)}")

@@ -1,1 +1,1 @@
-"""Dataset formats of the field, written and read: `formats.EXPORTS`, `formats.IMPORTS`."""
+"""Dataset formats of the field, written and read: see `formats.EXPORTS` and `formats.IMPORTS`."""

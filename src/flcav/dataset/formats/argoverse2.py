@@ -1,9 +1,9 @@
 """Reading of Argoverse 2's sensor dataset: logs in Feather files, as av2-api reads them.
 
 Frames: `egovehicle` is at the centre of the rear axle, x ahead, y left, z up; `city` is the world; cameras are optical.
-A sweep's points are of both stacked LiDARs, in the ego frame at the sweep's time, their motion compensated; their times
-are those of the measurements, from the sweep's time on, when the spin begins. Images have no distortion: av2-api's
-camera model has none, the coefficients in `intrinsics.feather` are of the raw images.
+A sweep has the points of both stacked LiDARs, motion-compensated to the ego frame at the sweep's time; their times are
+those of the measurements, counted from the sweep's time, at which the spin begins. Images have no distortion: av2-api's
+camera model has none, and the coefficients in `intrinsics.feather` belong to the raw images.
 """
 
 import re
@@ -43,7 +43,7 @@ from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 from flcav.sensors.lens import Lens
 
-# A bicycle of flcav's has a rider; Argoverse 2's without one keeps its name, as do all other classes.
+# A bicycle in flcav has a rider; Argoverse 2's without a rider keeps its class name, as do all other classes.
 CATEGORIES = group_classes(
     car="REGULAR_VEHICLE",
     truck="LARGE_VEHICLE BOX_TRUCK TRUCK TRUCK_CAB VEHICULAR_TRAILER",
@@ -56,16 +56,16 @@ SPLITS = ("train", "val", "test")  # folders of logs
 AXLE_M = 0.33  # height of the rear axle above the ground, which in the log 7fab2350 lies 0.33 to 0.37 m below it
 BEAMS = 64  # of both LiDARs: the lasers 0 to 63 of a sweep
 RANGE_M = 200.0  # of a VLP-32C, by its data sheet (Velodyne 63-9378); both are of this type (Wilson et al., 2021)
-LIDAR, MOUNT = "lidar", "up_lidar"  # our name of both LiDARs, where they are taken to be
+LIDAR, MOUNT = "lidar", "up_lidar"  # our name for both LiDARs, and the sensor whose mount they are given
 TIME = re.compile(r"[0-9]{1,18}")  # [ns], the name of a sweep or picture
-LATE_NS = 50_000_000  # most time between a sweep and the picture of a camera that goes with it: it runs at 20 Hz
-TEXT = ("sensor_name", "track_uuid", "category")  # columns, of which all others are numbers
+LATE_NS = 50_000_000  # longest time between a sweep and the picture that belongs to it: cameras run at 20 Hz
+TEXT = ("sensor_name", "track_uuid", "category")  # columns of text; all others are numbers
 PLACED = ("qw", "qx", "qy", "qz", "tx_m", "ty_m", "tz_m")
 EGO_FROM_AGENT = pose(0.0, 0.0, -AXLE_M)
 
 
 class Log(NamedTuple):
-    """A log: its folder, split and agent, the times of its sweeps, and what is not in it."""
+    """A log: its folder, split and agent, the times of its sweeps, and what is missing from it."""
 
     folder: Path
     split: str | None
@@ -73,11 +73,11 @@ class Log(NamedTuple):
     sweeps: tuple[int, ...]  # [ns]
     labelled: bool
     lost: tuple[str, ...]  # annotated times without a sweep
-    dark: tuple[str, ...]  # sweeps without a picture of a camera that has others
+    dark: tuple[str, ...]  # sweeps without a picture of a camera that has pictures of others
 
 
 class LogLabels(NamedTuple):
-    """The A annotations of a log."""
+    """The A annotations of a log, city frame."""
 
     sweep: NDArray[np.int64]  # (A,) time [ns]
     track: NDArray[np.str_]  # (A,)
@@ -86,31 +86,31 @@ class LogLabels(NamedTuple):
 
 
 class Argoverse2Source(LogSource):
-    """The logs of a folder of Argoverse 2's sensor dataset: one log, a folder of logs, or folders of SPLITS of them."""
+    """The logs in a folder of Argoverse 2's sensor dataset: one log, a folder of logs, or folders of SPLITS of logs."""
 
     FORMAT = "argoverse2"
     beams = BEAMS
     range_m = RANGE_M
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where there is no log in `folder`, none of `split`, or a file of a log is missing."""
+        """Open the logs; raises `InputError` where there is none, none of `split`, or a file of a log is missing."""
         self.folder, self.split = folder, split
-        self.folders = found = _find_logs(folder)
+        self.folders = folders = _find_logs(folder)
         names = AgentNames()
         self._logs = {
-            scene: _open_log(found[scene], names)
-            for scene in choose_split(folder, {scene: _split_of(path) for scene, path in found.items()}, split)
+            scene: _open_log(folders[scene], names)
+            for scene in choose_split(folder, {scene: _split_of(path) for scene, path in folders.items()}, split)
         }
         bare = [log.folder.name for log in self._logs.values() if not log.labelled]
         lost = [name for log in self._logs.values() for name in log.lost]
         dark = [name for log in self._logs.values() for name in log.dark]
         late = f"no picture within {LATE_NS // 10**6} ms of a sweep, of cameras with others: {len(dark)}"
-        told = {
+        notes = {
             f"no annotations in {len(bare)} of {plural(len(self._logs), 'log')}, so no boxes: {name_some(bare)}": bare,
             f"no sweep at {plural(len(lost), 'annotated time')}, so no frames there: {name_some(lost)}": lost,
             f"{late}, as of {name_some(dark)}": dark,
         }
-        self.notes = tuple(note for note, names in told.items() if names)
+        self.notes = tuple(note for note, names in notes.items() if names)
         self.labelled = not bare
         self.split_of = {scene: log.split for scene, log in self._logs.items()}
 
@@ -143,8 +143,8 @@ class Argoverse2Source(LogSource):
                 for name, t in taken.items()
             }
             points, times_s = _read_sweep(log.folder / "sensors" / "lidar" / f"{sweep}.feather", mounts[MOUNT][:3, 3])
-            own = np.flatnonzero(labels.sweep == sweep) if labels else np.zeros(0, np.int64)
-            boxes = labels.boxes[own] if labels else Boxes.empty()
+            rows = np.flatnonzero(labels.sweep == sweep) if labels else np.zeros(0, np.int64)
+            boxes = labels.boxes[rows] if labels else Boxes.empty()
             city_from_ego = poses.at(sweep)
             files = {name: picture.path for name, picture in pictures.items()}
             yield LinkedFrame(
@@ -158,11 +158,11 @@ class Argoverse2Source(LogSource):
                 lidar={LIDAR: points},
                 point_times={LIDAR: times_s},
                 annotations=annotate(
-                    labels.track[own].tolist() if labels else (),
+                    labels.track[rows].tolist() if labels else (),
                     boxes,
                     {LIDAR: (points, city_from_ego @ at[LIDAR])},
                     view_boxes(boxes, pictures),
-                    velocity=labels.velocity[own] if labels else None,
+                    velocity=labels.velocity[rows] if labels else None,
                 ),
                 images=link_pictures(files),
                 agent_at_trigger={name: city_from_then @ EGO_FROM_AGENT for name, city_from_then in then.items()},
@@ -174,7 +174,7 @@ IMPORT = ImportFormat(Argoverse2Source, ("sensors/lidar", "*/sensors/lidar", "*/
 
 
 class Poses:
-    """The ego vehicle's poses in the city, by time."""
+    """The ego vehicle's poses in the city frame [m], by time."""
 
     def __init__(self, path: Path) -> None:
         table = _read_feather(path, ("timestamp_ns", *PLACED), key="timestamp_ns")
@@ -182,14 +182,14 @@ class Poses:
         self._row = {time: row for row, time in enumerate(table["timestamp_ns"].to_pylist())}
 
     def at(self, time_ns: int) -> Array:
-        """Return the (4, 4) pose at a time [ns] of the table; raises `InputError` at any other."""
+        """Return the pose (4, 4) at a time [ns] in the table; raises `InputError` for any other time."""
         if time_ns not in self._row:
             raise InputError(f"{self._path}: no pose at {time_ns}, when a measurement was made")
         return self._transforms[self._row[time_ns]]
 
 
 def _find_logs(folder: Path) -> dict[str, Path]:
-    """Return scene -> folder of the logs in `folder`, which is itself one, or holds them, or splits of them."""
+    """Return the folders of the logs in `folder`, by scene: it is a log itself, or holds logs or splits of them."""
     depths = (folder,), folder.glob("*"), (path for split in SPLITS for path in (folder / split).glob("*"))
     for paths in depths:
         if logs := sorted(path for path in paths if (path / "sensors" / "lidar").is_dir()):
@@ -219,9 +219,9 @@ def _open_log(folder: Path, names: AgentNames) -> Log:
     times = {name: _list_times(folder / "sensors" / "cameras" / name, "jpg") for name in lenses}
     dark = tuple(
         f"{folder.name}/{name} at {sweep}"
-        for name, own in times.items()
-        for sweep in (sweeps.tolist() if len(own) else ())
-        if _nearest(own, sweep) is None
+        for name, taken in times.items()
+        for sweep in (sweeps.tolist() if len(taken) else ())
+        if _nearest(taken, sweep) is None
     )
     return Log(
         folder, _split_of(folder), names.of("ego", calibration), tuple(sweeps.tolist()), bool(annotated), lost, dark
@@ -229,7 +229,7 @@ def _open_log(folder: Path, names: AgentNames) -> Log:
 
 
 def _list_times(folder: Path, suffix: str) -> NDArray[np.int64]:
-    """Return the times [ns] that name the files of a folder, in order; none where there is no such folder."""
+    """Return the times [ns] after which the files of a folder are named, ascending; none where it does not exist."""
     times = (int(path.stem) for path in folder.glob(f"*.{suffix}") if TIME.fullmatch(path.stem))
     return np.array(sorted(times), np.int64)
 
@@ -240,9 +240,9 @@ def _nearest(times: NDArray[np.int64], sweep: int) -> int | None:
 
 
 def _read_sweep(path: Path, origin: Array) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Return (N, 4) x, y, z [m] from `origin` in the ego frame, intensity [0, 1], and (N,) times after the sweep's [s].
+    """Return points (N, 4): x, y, z [m] from `origin` in the ego frame, intensity [0, 1]; and their times (N,) [s].
 
-    Raises `InputError` where a point was measured LONGEST_SPIN_S or more before or after.
+    Times are from the sweep's time on. Raises `InputError` where one is LONGEST_SPIN_S or more before or after it.
     """
     names = ("x", "y", "z", "intensity")
     table = _read_feather(path, (*names, "offset_ns"))
@@ -256,7 +256,7 @@ def _read_sweep(path: Path, origin: Array) -> tuple[NDArray[np.float32], NDArray
 
 
 def _read_mounts(folder: Path) -> dict[str, Array]:
-    """Return sensor -> (4, 4) pose in the ego frame."""
+    """Return the poses (4, 4) of the sensors in the ego frame [m], by name."""
     path = folder / "calibration" / "egovehicle_SE3_sensor.feather"
     table = _read_feather(path, ("sensor_name", *PLACED), key="sensor_name")
     return dict(zip(table["sensor_name"].to_pylist(), _transforms(table, path)))
@@ -264,7 +264,8 @@ def _read_mounts(folder: Path) -> dict[str, Array]:
 
 def _read_lenses(folder: Path) -> dict[str, Lens]:
     names = ("fx_px", "fy_px", "cx_px", "cy_px", "width_px", "height_px")
-    path, lenses = folder / "calibration" / "intrinsics.feather", {}
+    path = folder / "calibration" / "intrinsics.feather"
+    lenses = {}
     table = _read_feather(path, ("sensor_name", *names), key="sensor_name")
     for row in table.to_pylist():
         matrix = np.array([[row["fx_px"], 0, row["cx_px"]], [0, row["fy_px"], row["cy_px"]], [0, 0, 1.0]])
@@ -274,25 +275,28 @@ def _read_lenses(folder: Path) -> dict[str, Lens]:
 
 
 def _read_labels(folder: Path, poses: Poses) -> LogLabels:
-    """Return the annotations of a log, of its sweeps that are not here, too: velocities are differences of them."""
-    path, sides = folder / "annotations.feather", ("length_m", "width_m", "height_m")
+    """Return all annotations of a log, also those of missing sweeps, from which velocities are differenced."""
+    path = folder / "annotations.feather"
+    sides = ("length_m", "width_m", "height_m")
     table = _read_feather(path, ("timestamp_ns", "track_uuid", "category", *sides, *PLACED))
     size = np.column_stack([table[name].to_numpy() for name in sides])
     check_sizes(size, path)
-    sweep, track = table["timestamp_ns"].to_numpy(), np.array(table["track_uuid"].to_pylist(), np.str_)
+    sweep = table["timestamp_ns"].to_numpy()
+    track = np.array(table["track_uuid"].to_pylist(), np.str_)
     in_ego = _transforms(table, path)
     center, rotation = np.zeros((len(table), 3)), np.zeros((len(table), 3, 3))
     for time in np.unique(sweep).tolist():
-        city_from_ego, own = poses.at(time), np.flatnonzero(sweep == time)
-        center[own] = transform_points(city_from_ego, in_ego[own, :3, 3])
-        rotation[own] = city_from_ego[:3, :3] @ in_ego[own, :3, :3]
+        city_from_ego = poses.at(time)
+        rows = np.flatnonzero(sweep == time)
+        center[rows] = transform_points(city_from_ego, in_ego[rows, :3, 3])
+        rotation[rows] = city_from_ego[:3, :3] @ in_ego[rows, :3, :3]
     label = np.array([CATEGORIES.get(name, name) for name in table["category"].to_pylist()], np.str_)
     boxes = turned_boxes(center, size, rotation, label)
     return LogLabels(sweep, track, boxes, difference_tracks(track, (sweep - sweep[:1]) / 1e9, center))
 
 
 def _transforms(table: pa.Table, path: Path) -> Array:
-    """Return (N, 4, 4) transforms of the quaternions and translations in PLACED, which the file at `path` has."""
+    """Return the transforms (N, 4, 4) of the quaternions and translations in PLACED, from the file at `path`."""
     w, x, y, z, *translation = (table[name].to_numpy() for name in PLACED)
     transforms = np.tile(np.eye(4), (len(table), 1, 1))
     if not (unit := are_unit_quaternions(np.column_stack((w, x, y, z)))).all():
@@ -306,7 +310,7 @@ def _transforms(table: pa.Table, path: Path) -> Array:
 def _read_feather(path: Path, columns: tuple[str, ...], *, key: str | None = None) -> pa.Table:
     """Return columns of a Feather file.
 
-    Raises `InputError` where it is missing, truncated, lacks one of them, or has two rows with one value of `key`.
+    Raises `InputError` where it is missing, truncated, lacks a column, or has two rows with the same value of `key`.
     """
     check_is_file(path, None)
     try:

@@ -1,11 +1,11 @@
 """Reading of raw recordings of CarlaFLCAV's FLDatasetTool (SIAT-INVS, at its commit e19af3d): `raw_data/record_DATE`.
 
-A recording is a scene. `others.world_0` has its labels; each other folder is a vehicle, whose `vehicle_status.csv` has
-its poses, or a post, and holds a folder for each sensor. Frames, in the names of files, are ticks of CARLA. Everything
-is right-handed already: metres, degrees, poses of cameras in their optical frames. The recorder's principal point is in
-pixels from the image's corner. The agent itself is among the labels; so are the map's parked cars, with their boxes
-about the origin of their meshes, and all actors of the town, of which those within LABELLED_M are taken, as by the
-recorder's own export to KITTI.
+A recording is a scene. `others.world_0` has its labels; each other folder is a vehicle, with its poses in
+`vehicle_status.csv`, or a post, and holds a folder per sensor. Frames, in the names of files, are ticks of CARLA.
+Everything is already right-handed: metres, degrees, poses of cameras in their optical frames. The recorder's principal
+point is in pixels from the image's corner. The agent is itself among the labels; so are the map's parked cars, with
+boxes about the origins of their meshes, and all actors of the town, of which those within LABELLED_M are taken, as by
+the recorder's export to KITTI.
 """
 
 import re
@@ -47,46 +47,46 @@ Poses = Mapping[int, Array]  # tick -> (4, 4)
 WORLD, STATUS, POSES, CAMERA = "others.world_*", "vehicle_status.csv", "poses.csv", "camera_info.csv"
 POSE = ("frame", "timestamp", "x", "y", "z", "roll", "pitch", "yaw")
 LABELLED_M = 150.0  # from the agent, between centres
-OWN_M = 0.05  # an actor this near to the agent's pose is the agent
+OWN_M = 0.05  # an actor closer than this to the agent's pose is the agent
 METRES, DEGREES = 3, 2  # decimals of mounts, which follow from CARLA's poses in float32
-BESIDE = re.compile(r"sensor\.camera\.(depth|semantic_segmentation)")  # cameras whose pictures are no colour images
+BESIDE = re.compile(r"sensor\.camera\.(depth|semantic_segmentation)")  # cameras whose pictures are not colour images
 SEMANTIC = np.dtype([*((name, "<f4") for name in ("x", "y", "z", "CosAngle")), ("ObjIdx", "<u4"), ("ObjTag", "<u4")])
-RADAR = 7  # numbers of a detection
-NUMBER = re.compile(r"\d+$")  # of a folder, in the order of the recorder's settings
+RADAR = 7  # numbers per detection
+NUMBER = re.compile(r"\d+$")  # of a folder, by the order of the recorder's settings
 
 
 class RecordedSensor(NamedTuple):
     """A LiDAR, or a camera with its lens."""
 
     files: Mapping[int, Path]  # by tick
-    poses: Poses  # world_from_sensor, of a camera optical
+    poses: Poses  # `world_from_sensor` [m], of a camera in the optical frame
     lens: Lens | None
 
 
 class RecordedAgent(NamedTuple):
-    """An agent of a recording, the ticks that it has a frame of, and its sensors."""
+    """An agent of a recording, the ticks for which it has a frame, and its sensors."""
 
     agent: str
     ticks: Collection[int]
     sensors: Mapping[str, RecordedSensor]
     calibration: Calibration
-    anchor: str  # sensor that the agent's poses follow from
-    vehicle: Poses  # empty of a post
+    anchor: str  # the sensor from whose poses the agent's follow
+    vehicle: Poses  # empty for a post
 
 
 class CarlaFlcavSource(LogSource):
-    """The recordings of a folder, or the folder of one."""
+    """The recordings in a folder, or the folder of a single one."""
 
     FORMAT = "carlaflcav"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where there is no recording, a table is malformed, or a split is asked for."""
+        """Open the recordings; raises `InputError` where there is none, a table is malformed, or `split` is given."""
         self.folder, self.split = folder, split
-        found = sorted({path.parent for pattern in (WORLD, f"*/{WORLD}") for path in folder.glob(pattern)})
-        self.folders = name_folders(found)
+        folders = sorted({path.parent for pattern in (WORLD, f"*/{WORLD}") for path in folder.glob(pattern)})
+        self.folders = name_folders(folders)
         self.split_of = dict.fromkeys(choose_split(folder, dict.fromkeys(self.folders), split))
         self._counts: Counter[str] = Counter()
-        self._lost: list[str] = []  # frames without labels, or not all of a LiDAR
+        self._lost: list[str] = []  # frames that lack labels, or points of a LiDAR
         self._pairs = PosePairs(f"the poses of the first sensor and '{STATUS}'")
         self._labels = {scene: _list_files(min(path.glob(WORLD)), "pkl") for scene, path in self.folders.items()}
         self._time_s: dict[str, dict[int, float]] = {scene: {} for scene in self.split_of}
@@ -102,7 +102,8 @@ class CarlaFlcavSource(LogSource):
 
     def frames(self, scene: str) -> Iterator[Frame]:
         """Yield the frames of a recording; raises `InputError` where a file is missing, truncated or malformed."""
-        rigs, time_s = self._rigs[scene], self._time_s[scene]
+        rigs = self._rigs[scene]
+        time_s = self._time_s[scene]
         ticks = sorted({tick for rig in rigs for tick in rig.ticks})
         labels = {tick: self._read_labels(scene, tick) for tick in ticks}
         self._note()
@@ -119,14 +120,19 @@ class CarlaFlcavSource(LogSource):
         self._note()
 
     def _open(self, scene: str, names: AgentNames) -> list[RecordedAgent]:
-        """Return the agents of a recording that have frames, its vehicles and posts numbered in order."""
+        """Return the agents of a recording that have frames; its vehicles and posts are numbered in order."""
         folders = [path for path in self.folders[scene].iterdir() if path.is_dir() and not path.match(WORLD)]
-        number, rigs = Counter[str](), []
+        number = Counter[str]()
+        rigs = []
         for path in sorted(
-            folders, key=lambda path: (int(own[0]) if (own := NUMBER.search(path.name)) else 0, path.name)
+            folders, key=lambda path: (int(digits[0]) if (digits := NUMBER.search(path.name)) else 0, path.name)
         ):
-            found = {own.name: self._read_sensor(scene, own) for own in sorted(path.iterdir()) if own.is_dir()}
-            sensors = {name: sensor for name, sensor in found.items() if sensor is not None}
+            read = {
+                sensor_folder.name: self._read_sensor(scene, sensor_folder)
+                for sensor_folder in sorted(path.iterdir())
+                if sensor_folder.is_dir()
+            }
+            sensors = {name: sensor for name, sensor in read.items() if sensor is not None}
             if not sensors:
                 continue
             vehicle = self._read_poses(scene, path / STATUS) if (path / STATUS).is_file() else {}
@@ -141,7 +147,7 @@ class CarlaFlcavSource(LogSource):
         return rigs
 
     def _read_sensor(self, scene: str, folder: Path) -> RecordedSensor | None:
-        """Return the sensor of a folder; None of one that a dataset has no place for, which is counted."""
+        """Return the sensor of a folder; None, and counted, for a kind that a dataset cannot hold."""
         pictures, clouds = (_list_files(folder, ending) for ending in ("png", "npy"))
         if not pictures and not clouds:
             return None
@@ -154,7 +160,7 @@ class CarlaFlcavSource(LogSource):
         return RecordedSensor(pictures or clouds, self._read_poses(scene, folder / POSES), lens)
 
     def _read_poses(self, scene: str, path: Path) -> Poses:
-        """Return the (4, 4) poses in a table, by tick; keeps the ticks' times."""
+        """Return the poses (4, 4) [m] in a table, by tick, and keep the times of the ticks."""
         table = _read_numbers(path, POSE)
         ticks = table["frame"].astype(np.int64).tolist()
         if len({*ticks}) < len(ticks):
@@ -177,7 +183,7 @@ class CarlaFlcavSource(LogSource):
 
     def _note(self) -> None:
         count = self._counts
-        told = {
+        kinds = {
             f"left out {plural(count['semantic'], 'semantic LiDAR')}, which has no intensities": "semantic",
             f"left out {plural(count['radar'], 'radar')}, which has no radar cross-sections": "radar",
             f"left out {plural(count['other camera'], 'camera')} of depths or classes": "other camera",
@@ -186,7 +192,7 @@ class CarlaFlcavSource(LogSource):
         lost = f"left out {len(self._lost)} of {plural(count['frame'], 'frame')}: no labels, or not all of a LiDAR"
         self.notes = (
             *((f"{lost}: {name_some(self._lost)}",) if self._lost else ()),
-            *(note for note, kind in told.items() if count[kind]),
+            *(note for note, kind in kinds.items() if count[kind]),
             *self._pairs.notes(),
         )
 
@@ -197,10 +203,10 @@ IMPORT = ImportFormat(CarlaFlcavSource, (WORLD, f"*/{WORLD}"))
 def _assemble(
     agent: str, vehicle: Poses, sensors: Mapping[str, RecordedSensor], labelled: Collection[int], names: AgentNames
 ) -> RecordedAgent | None:
-    """Return an agent with its mounts by its first frame; None where it has none.
+    """Return an agent, with its mounts as in its first frame; None where it has no frame.
 
-    A frame has labels, the vehicle's pose, and points of all LiDARs, or a picture of the first camera where there are
-    none.
+    A frame needs labels, the vehicle's pose, and points of all LiDARs or, where there are none, a picture of the first
+    camera.
     """
     lidars = [name for name, sensor in sensors.items() if sensor.lens is None]
     anchor = (lidars or list(sensors))[0]
@@ -224,9 +230,9 @@ def _assemble(
         intrinsics={name: lens.intrinsics() for name, lens in cameras.items()},
         distortion={name: np.zeros(5) for name in cameras},
     )
-    own = (*((name, mount.tobytes()) for name, mount in mounts.items()), *cameras.items())
+    fingerprint = (*((name, mount.tobytes()) for name, mount in mounts.items()), *cameras.items())
     kept = {name: sensors[name] for name in mounts}
-    return RecordedAgent(names.of(agent, own), frozenset(ticks), kept, calibration, anchor, vehicle)
+    return RecordedAgent(names.of(agent, fingerprint), frozenset(ticks), kept, calibration, anchor, vehicle)
 
 
 def _round_mount(mount: Array) -> Array:
@@ -235,12 +241,12 @@ def _round_mount(mount: Array) -> Array:
 
 
 def _difference(labels: Mapping[int, ActorLabels], time_s: Mapping[int, float]) -> dict[int, Array]:
-    """Return tick -> (M, 3) velocities of the labels: see `difference_tracks`."""
-    ends = np.cumsum([len(own.track) for own in labels.values()])
+    """Return the velocities (M, 3) [m/s] of the labels, by tick: see `difference_tracks`."""
+    ends = np.cumsum([len(actors.track) for actors in labels.values()])
     moved = difference_tracks(
-        np.concatenate([own.track for own in labels.values()]),
-        np.concatenate([np.full(len(own.track), time_s[tick]) for tick, own in labels.items()]),
-        np.concatenate([own.world_from_box[:, :3, 3] for own in labels.values()]),
+        np.concatenate([actors.track for actors in labels.values()]),
+        np.concatenate([np.full(len(actors.track), time_s[tick]) for tick, actors in labels.items()]),
+        np.concatenate([actors.world_from_box[:, :3, 3] for actors in labels.values()]),
     )
     return dict(zip(labels, np.split(moved, ends[:-1])))
 
@@ -284,24 +290,24 @@ def _read_frame(
 
 
 def _list_files(folder: Path, ending: str) -> dict[int, Path]:
-    """Return tick -> file of a folder, in order."""
+    """Return the files of a folder by tick, in order."""
     found = [path for path in folder.glob(f"*.{ending}") if path.stem.isdecimal()]
     return {int(path.stem): path for path in sorted(found)}
 
 
 def _read_numbers(path: Path, columns: tuple[str, ...]) -> dict[str, Array]:
-    """Return the columns of numbers of a CSV file; raises `InputError` where it lacks one, or it has other values."""
+    """Return numeric columns of a CSV file; raises `InputError` where one is missing or has other values."""
     table = read_csv(path)
-    found: dict[str, Array] = {}
+    values: dict[str, Array] = {}
     for name in columns:
         try:
-            found[name] = np.array(table[name].to_pylist(), np.float64)
+            values[name] = np.array(table[name].to_pylist(), np.float64)
         except (KeyError, TypeError, ValueError):
             raise InputError(f"{path}: no column '{name}' of numbers") from None
-        if len(odd := np.flatnonzero(~(np.abs(found[name]) < FARTHEST * 10))):
-            row, value = int(odd[0]), found[name][odd[0]]
+        if len(odd := np.flatnonzero(~(np.abs(values[name]) < FARTHEST * 10))):
+            row, value = int(odd[0]), values[name][odd[0]]
             raise InputError(f"{path}: row {row + 1}: a value of '{name}' is not finite, or too large: {value:g}")
-    return found
+    return values
 
 
 def _read_lens(path: Path) -> Lens:
@@ -309,12 +315,12 @@ def _read_lens(path: Path) -> Lens:
     if any(len(column) != 1 for column in values.values()):
         raise InputError(f"{path}: other than one camera")
     width, height, fx, fy, cx, cy = (float(column[0]) for column in values.values())
-    half = 0.5  # ours is in pixels from the centre of the first one
+    half = 0.5  # flcav's principal point is in pixels from the centre of the first one
     return pinhole(np.array([[fx, 0, cx - half], [0, fy, cy - half], [0, 0, 1.0]]), width, height, path)
 
 
 def _open_array(path: Path) -> NDArray[np.generic]:
-    """Return the array of a .npy file, mapped, so that its header's sizes allocate nothing."""
+    """Return the array of a .npy file, memory-mapped, so that sizes in its header allocate nothing."""
     check_is_file(path)
     try:
         found = np.load(path, mmap_mode="r", allow_pickle=False)
@@ -326,7 +332,7 @@ def _open_array(path: Path) -> NDArray[np.generic]:
 
 
 def _tell_cloud(path: Path) -> str:
-    """Return the kind of sensor that an array comes from; raises `InputError` where it is none of the recorder's."""
+    """Return the kind of sensor that an array comes from; raises `InputError` where it is not one of the recorder's."""
     found = _open_array(path)
     if found.dtype == SEMANTIC:
         return "semantic"

@@ -2,15 +2,15 @@
 
 A pickle is a program: unpickling runs it, and it may call anything that can be imported. Here no such program is run.
 `pickletools.genops` only splits the bytes into operations, and `_evaluate` carries out the few that a list of plain
-records takes. It is safe for these reasons:
+records needs. It is safe for these reasons:
 
-- *Nothing is imported or called.* A class is no object of Python but its name, one of RECORDS; any other name is
-  refused. Creating a record gives an inert `PickledRecord`, and its state becomes a dictionary, never attributes.
+- *Nothing is imported or called.* A class is not a Python object but a name, one of RECORDS; any other name is refused.
+  Creating a record gives an inert `PickledRecord`, and its state becomes a dictionary, never attributes.
 - *Every other operation is refused*: those that call (REDUCE, INST, OBJ, NEWOBJ_EX), the extension registry, persistent
   ids, buffers, and whatever a later protocol may add.
 - *Memory and time are bounded.* A file has at most MOST_BYTES, each operation adds at most one small value and copies
   nothing, and lengths and indices in the file allocate nothing: the memo is a dictionary.
-- *Nothing recurses.* Values are read along a fixed path, label -> transform -> location -> x, with the kind of record
+- *Nothing recurses.* Values are read along a fixed path, label -> transform -> location -> x, and the kind of record is
   checked at each step, so that depth and cycles have no effect.
 """
 
@@ -27,7 +27,7 @@ from flcav.config import InputError, check_is_file, shorten
 from flcav.dataset.formats.reading import FARTHEST
 from flcav.geometry import Array, pose
 
-MOST_BYTES = 2**22  # of a file; a label takes some 300
+MOST_BYTES = 2**22  # largest file; a label takes about 300
 MOST_LABELS = 10_000
 RECORDS: Mapping[tuple[str, str], str] = {  # module and name of the recorder's classes -> kind of record
     ("utils.label_types", "ObjectLabel"): "label",
@@ -41,25 +41,25 @@ CATEGORIES = {"vehicle": "car", "pedestrian": "pedestrian"}
 
 
 class ActorLabels(NamedTuple):
-    """The M labels of an instant, in the recorder's right-handed world."""
+    """The M labels at an instant, in the recorder's right-handed world frame."""
 
-    track: NDArray[np.str_]  # (M,) CARLA's numbers of the actors
+    track: NDArray[np.str_]  # (M,) CARLA's actor ids
     category: NDArray[np.str_]  # (M,)
-    world_from_actor: Array  # (M, 4, 4)
-    world_from_box: Array  # (M, 4, 4) of the boxes' centres
+    world_from_actor: Array  # (M, 4, 4) [m]
+    world_from_box: Array  # (M, 4, 4) [m] of the boxes' centres
     size: Array  # (M, 3) length, width, height [m]; may be 0 or below
 
 
 @dataclass(frozen=True)
 class Class:
-    """A class that a pickle names: nothing but the kind of its records."""
+    """A class named in a pickle, reduced to the kind of its records."""
 
     kind: str
 
 
 @dataclass
 class PickledRecord:
-    """A record of a pickle: inert, its state is data."""
+    """A record in a pickle: inert, its state is data."""
 
     kind: str
     state: dict[str, "Value"] = field(default_factory=dict)
@@ -69,7 +69,7 @@ Value = int | float | str | Class | PickledRecord | tuple[()] | list["Value"] | 
 
 
 def read_labels(path: Path) -> ActorLabels:
-    """Return the labels in a file of the recorder's; raises `InputError` where it is missing or holds anything else."""
+    """Return the labels in a file of the recorder; raises `InputError` where it is missing or holds anything else."""
     check_is_file(path)
     with path.open("rb") as file:
         data = file.read(MOST_BYTES + 1)
@@ -98,17 +98,18 @@ def read_labels(path: Path) -> ActorLabels:
 
 def _decode_label(label: PickledRecord) -> tuple[str, str, Array, Array, Array]:
     """Return track, category, `world_from_actor`, `world_from_box` and size of a label."""
-    number, kind = label.state["carla_id"], label.state["label_type"]
+    number = label.state["carla_id"]
+    kind = label.state["label_type"]
     if not isinstance(number, int) or not isinstance(kind, str) or kind not in CATEGORIES:
         raise ValueError("a label without the number of an actor, or that is neither vehicle nor pedestrian")
-    actor, box = (_find_record(label, *each) for each in (("transform", "transform"), ("bounding_box", "box")))
+    actor, box = (_find_record(label, *path) for path in (("transform", "transform"), ("bounding_box", "box")))
     world_from_actor = _read_pose(actor)
     size = 2 * np.array(_read_numbers(_find_record(box, "extent", "vector"), "xyz"))
     return str(number), CATEGORIES[kind], world_from_actor, world_from_actor @ _read_pose(box), size
 
 
 def _read_pose(record: PickledRecord) -> Array:
-    """Return the (4, 4) pose of a record with a location [m] and a rotation [degrees]."""
+    """Return the pose (4, 4) [m] of a record with a location [m] and a rotation [degrees]."""
     place = _read_numbers(_find_record(record, "location", "vector"), "xyz")
     turn = _read_numbers(_find_record(record, "rotation", "rotation"), ("yaw", "pitch", "roll"))
     return pose(*place, *np.radians(turn))
@@ -133,11 +134,11 @@ def _read_numbers(record: PickledRecord, names: Iterable[str]) -> list[float]:
 
 
 def _evaluate(data: bytes) -> Value:
-    """Return what a pickle of plain records stands for; raises ValueError, IndexError or KeyError for any other."""
+    """Return the value of a pickle of plain records; raises ValueError, IndexError or KeyError for any other pickle."""
     stack: list[Value] = []
     marks: list[int] = []  # lengths of the stack
     memo: dict[int, Value] = {}
-    argument: Any  # None only of operations without one
+    argument: Any  # None only for operations without one
     for code, argument, _ in pickletools.genops(data):
         match code.name:
             case "PROTO" | "FRAME":
@@ -164,10 +165,10 @@ def _evaluate(data: bytes) -> Value:
                 name, module = stack.pop(), stack.pop()
                 stack.append(_find_class(module, name))
             case "NEWOBJ":
-                arguments, own = stack.pop(), stack.pop()
-                if not isinstance(own, Class) or arguments != ():
+                arguments, record_class = stack.pop(), stack.pop()
+                if not isinstance(record_class, Class) or arguments != ():
                     raise ValueError("a record made of more than its class")
-                stack.append(PickledRecord(own.kind))
+                stack.append(PickledRecord(record_class.kind))
             case "BUILD":
                 state, record = stack.pop(), stack[-1]
                 if not isinstance(record, PickledRecord) or not isinstance(state, dict):

@@ -1,8 +1,8 @@
-"""Files of point clouds: which layout bare numbers have, and PCD files (Point Cloud Library, version 0.7).
+"""Files of point clouds: layouts of headerless numbers, and PCD files (Point Cloud Library, version 0.7).
 
-A file of bare numbers is told by their ranges. KITTI's files are rows of x, y, z [m] and intensity 0 to 1, nuScenes' of
-x, y, z [m], intensity 0 to 255 and ring, all little-endian float32. Neither has a header. Read with another number of
-columns or another type, coordinates get into the column of intensities, or numbers become huge, tiny or no numbers.
+The layout of a headerless file is recognised by the ranges of its numbers. KITTI's files are rows of x, y, z [m] and
+intensity 0 to 1, nuScenes' of x, y, z [m], intensity 0 to 255 and ring, all little-endian float32. Read with another
+number of columns or another type, coordinates fall into the column of intensities, or numbers become huge, tiny or NaN.
 """
 
 import re
@@ -13,28 +13,28 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError, read_file
 
-FARTHEST_M = 1e4  # largest coordinate that a LiDAR is taken to measure
-NEAREST_M = 1.0  # the farthest point of a sweep is beyond
-TINY = 1e-30  # smallest number above 0; what is smaller is of another type
+FARTHEST_M = 1e4  # largest coordinate that a LiDAR is assumed to measure
+NEAREST_M = 1.0  # the farthest point of a sweep is farther than this
+TINY = 1e-30  # smallest number above 0; a smaller one shows another type
 BRIGHTEST = 255  # largest intensity of nuScenes
 HALF_ONE_M = 2.0**-7  # largest y of a cloud whose numbers are float16: its upper bytes are an intensity's, at most 1
-BESIDE_M = 1.75  # normals and colours are within
+BESIDE_M = 1.75  # largest norm of a normal or a colour
 TYPES = {"<f4": "float32", "<f8": "float64", ">f4": "big-endian float32", ">f8": "big-endian float64"}
 COLUMNS = range(3, 13)
-SAMPLE = 48_000  # values that columns are counted by
-FEW = 16  # rows of which nothing is told but ranges
+SAMPLE = 48_000  # values from which columns are counted
+FEW = 16  # fewest rows for more than a check of ranges
 
 Values = NDArray[np.floating]
 
 
 def has_kitti_layout(data: bytes) -> bool:
-    """Return whether the bytes are rows of x, y, z, intensity 0 to 1."""
+    """Return whether the bytes are rows of x, y, z [m], intensity 0 to 1."""
     rows = _rows(data, 4)
     return rows is not None and _is_cloud(rows) and _within(rows[:, 3], 1) and not _mixes(rows)
 
 
 def has_nuscenes_layout(data: bytes) -> bool:
-    """Return whether the bytes are rows of x, y, z, intensity 0 to 255, ring, and some point is brighter than 1."""
+    """Return whether the bytes are rows of x, y, z [m], intensity 0 to 255, ring, with an intensity above 1."""
     rows = _rows(data, 5)
     if rows is None or not _is_cloud(rows):
         return False
@@ -44,7 +44,7 @@ def has_nuscenes_layout(data: bytes) -> bool:
 
 
 def describe_numbers(data: bytes) -> str:
-    """Return the layout that bytes of neither layout seem to have, as "5 columns of float32"; empty if none."""
+    """Return the apparent layout of bytes in neither layout, as "5 columns of float32"; empty if there is none."""
     for dtype, name in TYPES.items():
         if len(data) % np.dtype(dtype).itemsize == 0:
             values = np.frombuffer(data, dtype)
@@ -67,7 +67,7 @@ def _is_cloud(rows: NDArray[np.float32]) -> bool:
 
 
 def _are_numbers(values: Values) -> bool:
-    """Return whether the values, but for those that are not finite, are of sizes that a LiDAR measures."""
+    """Return whether the finite values have magnitudes that a LiDAR measures."""
     size = np.abs(values[np.isfinite(values)])
     return bool(len(size) and size.max() <= FARTHEST_M and not ((size > 0) & (size < TINY)).any())
 
@@ -77,9 +77,9 @@ def _within(values: Values, most: float) -> bool:
 
 
 def _mixes(rows: NDArray[np.float32]) -> bool:
-    """Return whether rows are of other ones, although every fourth number is an intensity.
+    """Return whether rows are those of another layout, although every fourth number is an intensity.
 
-    Of rows of eight numbers, every second half is no point, but a normal, a colour or padding. Of float16, the upper
+    In rows of eight numbers, every second half is not a point but a normal, a colour or padding. In float16, the upper
     bytes of y are an intensity: no y is negative or as large as a centimetre.
     """
     y = rows[rows.any(axis=1), 1]
@@ -93,11 +93,11 @@ def _mixes(rows: NDArray[np.float32]) -> bool:
 
 
 def _count_columns(values: Values) -> int:
-    """Return the number of columns with which values differ least from those of the next row; 0 if there is none.
+    """Return the number of columns for which values differ least from those of the next row; 0 if there is none.
 
-    Two draws of one distribution differ less, in the mean, than draws of two (G. J. Székely and M. L. Rizzo, "Energy
-    statistics", J. Statistical Planning and Inference 143, 2013, prop. 1). With a multiple of the right number they
-    differ as little: it is the smallest that is better than all numbers but its multiples.
+    Two draws from one distribution differ less, on average, than draws from two (G. J. Székely and M. L. Rizzo, "Energy
+    statistics", J. Statistical Planning and Inference 143, 2013, prop. 1). For a multiple of the correct number they
+    differ as little: the result is the smallest number that is better than all numbers but its multiples.
     """
     some = np.where(np.isfinite(values[:SAMPLE]), values[:SAMPLE], np.nan)
     if len(some) < FEW * max(COLUMNS) or np.isnan(some).all():
@@ -114,7 +114,7 @@ PCD_TYPES = {"F": "f", "I": "i", "U": "u"}
 
 
 def encode_pcd(rows: NDArray[np.void]) -> bytes:
-    """Return a binary PCD file, version 0.7, of a structured array: a field for each of its fields."""
+    """Return a binary PCD file, version 0.7, of a structured array, with one field for each of the array's fields."""
     fields = {name: rows.dtype[name] for name in rows.dtype.names or ()}
     letters = {kind: letter for letter, kind in PCD_TYPES.items()}
     header = (
@@ -139,9 +139,9 @@ def is_pcd(data: bytes) -> bool:
 
 
 def read_pcd(path: Path) -> NDArray[np.void]:
-    """Return the points of a PCD file as a structured array with a field for each of the file's.
+    """Return the points of a PCD file as a structured array with the fields of the file.
 
-    Raises `InputError` where the file is missing, truncated, compressed, or no PCD file with one number in each field.
+    Raises `InputError` where the file is missing, truncated, compressed, or not a PCD file with one number per field.
     """
     data = read_file(path)
     header, kind, body = _split(data)
@@ -165,7 +165,7 @@ def read_pcd(path: Path) -> NDArray[np.void]:
 
 
 def _split(data: bytes) -> tuple[list[list[str]], str, bytes]:
-    """Return the words of each line of the header, how the points are stored, and their bytes; nothing if no PCD."""
+    """Return the words of the header's lines, how the points are stored, and their bytes; empty for no PCD file."""
     end = DATA.search(data)
     if end is None:
         return [], "", b""

@@ -67,7 +67,7 @@ EXPORT = ExportFormat(export_coco, ("validation", "min_pixels"))
 
 
 class Table(TypedDict):
-    """One of COCO's annotation files."""
+    """The content of a COCO annotation file."""
 
     info: dict[str, str]
     images: list[dict[str, Json]]
@@ -76,7 +76,7 @@ class Table(TypedDict):
 
 
 def encode_run_lengths(mask: NDArray[np.bool_]) -> dict[str, Json]:
-    """Return COCO's compressed run-length encoding of an (H, W) mask: {"size": [H, W], "counts": text}."""
+    """Return COCO's compressed run-length encoding of a mask (H, W): {"size": [H, W], "counts": text}."""
     encoded = coco_mask.encode(np.asfortranarray(mask, dtype=np.uint8))
     return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
 
@@ -104,10 +104,10 @@ def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, 
 
 
 def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> list[dict[str, Json]]:
-    found = select_rectangles(frame, camera, labels, min_pixels)
+    rectangles = select_rectangles(frame, camera, labels, min_pixels)
     instance = frame.images[camera].instance
-    out = []
-    for label, box, pixels, row in zip(found.label, found.box, found.pixels, found.row):
+    annotations = []
+    for label, box, pixels, row in zip(rectangles.label, rectangles.box, rectangles.pixels, rectangles.row):
         left, top, right, bottom = box.tolist()
         about: dict[str, Json] = {
             "category_id": int(label) + 1,
@@ -122,5 +122,5 @@ def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> lis
         else:
             about["segmentation"] = []
             about["distance_m"] = float(frame.annotations.signs[camera].distance_m[row])
-        out.append(about)
-    return out
+        annotations.append(about)
+    return annotations

@@ -1,4 +1,4 @@
-"""Import of datasets of other formats, read as a source of frames and recorded; export into a folder, whole or not."""
+"""Import of datasets in other formats, which are read as a source of frames and recorded; and export to a folder."""
 
 import contextlib
 import shutil
@@ -34,17 +34,17 @@ def import_dataset(
 ) -> tuple[str, ...]:
     """Record the dataset of the format `name` in `folder` as one of flcav's in `out`.
 
-    Points and pictures that are in an encoding of flcav's are linked to, others are rewritten. Returns sentences on
-    what the files do not have, and on what in them contradicts itself. Raises `InputError` where `folder` is missing,
-    of another format or damaged, and as `record` does; scenes that were complete by then stay in `out`, and the same
-    call goes on from there.
+    Points and pictures whose encoding is one of flcav's are linked to, others are rewritten. Returns sentences on what
+    the files lack and where they contradict themselves. Raises `InputError` where `folder` is missing, of another
+    format or damaged, and as `record` does; scenes that were complete by then stay in `out`, and the same call resumes
+    from there.
 
     Args:
-        name: a name of `IMPORTS`, or a user's own format as `module:NAME`.
+        name: a name in `IMPORTS`, or a user's format as `module:NAME`.
         folder: folder of that format, as it is distributed.
         out: new or empty folder for the dataset.
         split: split whose scenes are taken; None: all.
-        posed: what gives the frames other poses, such as `flcav.fusion.registration.DrivenSource`.
+        posed: function that gives the frames other poses, such as `flcav.fusion.registration.DrivenSource`.
         progress: callback for the frames recorded so far and in total.
     """
     chosen = import_format(name)
@@ -75,10 +75,10 @@ class _Checked:
 
     source: Source
     boxes: EmptyBoxes = field(default_factory=EmptyBoxes)
-    strays: list[str] = field(default_factory=list)  # sentences on poses, one for each
+    strays: list[str] = field(default_factory=list)  # a sentence per inconsistent pose
 
     def problems(self) -> Iterator[str]:
-        """Yield sentences on what contradicts itself in the frames so far."""
+        """Yield sentences on the contradictions found in the frames so far."""
         if self.strays:
             more = f" (and {len(self.strays) - 1} more)" if len(self.strays) > 1 else ""
             yield f"{self.strays[0]}{more}"
@@ -116,13 +116,13 @@ def export(
     """Write `dataset` in the format `name` to the new or empty folder `out`; return counts.
 
     Raises `InputError` for an unknown format, an option that is set but does not apply to the format, a folder that is
-    not empty, and a dataset that lacks what the format needs. After any failure no partial output is left.
+    not empty, and a dataset that lacks what the format needs. No partial output is left after a failure.
 
     Args:
         dataset: the dataset.
-        name: a name of `EXPORTS`, or a user's own format as `module:NAME`.
+        name: a name in `EXPORTS`, or a user's format as `module:NAME`.
         out: new or empty folder.
-        options: options that the format takes.
+        options: options for the format.
         progress: callback for the frames written so far and in total.
     """
     chosen = export_format(name)
@@ -135,13 +135,13 @@ def export(
 
 @contextlib.contextmanager
 def _new_folder(path: Path) -> Iterator[Path]:
-    """Yield a hidden folder beside `path` to write into; it is renamed to `path` on success and removed on failure.
+    """Yield a hidden folder next to `path` to write into; rename it to `path` on success, remove it on failure.
 
     Raises `InputError` where `path` is a file or a folder that is not empty.
     """
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: is a file; an export needs a folder")
-    if path.is_dir() and any(each.name != LOCK for each in path.iterdir()):
+    if path.is_dir() and any(entry.name != LOCK for entry in path.iterdir()):
         raise InputError(f"{path}: holds other files; export into a new or empty folder")
     part = path.absolute().with_name(f".{path.absolute().name}.part")
     shutil.rmtree(part, ignore_errors=True)  # leftover of a killed export

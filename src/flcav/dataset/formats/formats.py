@@ -1,4 +1,4 @@
-"""Registry of the dataset formats: `EXPORTS` and `IMPORTS` list those of the package, a user's own is `module:NAME`."""
+"""Registry of the dataset formats: `EXPORTS` and `IMPORTS` list those of the package; a user's is `module:NAME`."""
 
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
@@ -29,9 +29,9 @@ IMPORTS: Mapping[str, str] = {
 
 
 def export_format(name: str) -> "ExportFormat":
-    """Return the format of that name to write: one of `EXPORTS`, or a user's own as `module:NAME`.
+    """Return the format of that name to write: one in `EXPORTS`, or a user's as `module:NAME`.
 
-    Raises `InputError` for an unknown name, and if the user's module is missing or has no format of that name.
+    Raises `InputError` for an unknown name, and where the user's module is missing or has no format of that name.
     """
     from flcav.dataset.formats.writing import ExportFormat
 
@@ -39,9 +39,9 @@ def export_format(name: str) -> "ExportFormat":
 
 
 def import_format(name: str) -> "ImportFormat":
-    """Return the format of that name to read: one of `IMPORTS`, or a user's own as `module:NAME`.
+    """Return the format of that name to read: one in `IMPORTS`, or a user's as `module:NAME`.
 
-    Raises `InputError` for an unknown name, and if the user's module is missing or has no format of that name.
+    Raises `InputError` for an unknown name, and where the user's module is missing or has no format of that name.
     """
     from flcav.dataset.formats.reading import ImportFormat
 

@@ -1,4 +1,4 @@
-"""Writer of MCAP files, one for each scene, with time stamps of the simulation."""
+"""Export to MCAP: one file per scene, with Foxglove's messages and time stamps of the simulation."""
 
 import json
 from collections import Counter
@@ -59,8 +59,9 @@ IMU_FIELDS = ("linear_acceleration", "angular_velocity")  # specific force [m/s^
 
 
 def scene_update(frame: Frame, stamp: Timestamp) -> SceneUpdate:
-    """Return the 3D boxes of a frame, world frame, which replace the earlier ones; fainter without a LiDAR return."""
-    truth, boxes = frame.annotations, frame.annotations.boxes
+    """Return the 3D boxes of a frame, world frame, which replace earlier ones; boxes without returns are fainter."""
+    truth = frame.annotations
+    boxes = frame.annotations.boxes
     entities = []
     for i, label in enumerate(boxes.label.tolist()):
         cube = CubePrimitive(
@@ -108,7 +109,7 @@ def image_annotations(frame: Frame, camera: str, stamp: Timestamp) -> ImageAnnot
 
 
 def pose_message(matrix: Array) -> Pose:
-    """Return a rigid (4, 4) transform as a pose message: position and unit quaternion."""
+    """Return a rigid transform (4, 4) [m] as a pose message: position and unit quaternion."""
     w, x, y, z = quaternion(matrix)
     px, py, pz = matrix[:3, 3].tolist()
     return Pose(position=Vector3(x=px, y=py, z=pz), orientation=Quaternion(x=x, y=y, z=z, w=w))
@@ -117,7 +118,9 @@ def pose_message(matrix: Array) -> Pose:
 def _rectangle(
     box: Array, colour: tuple[float, float, float], about: dict[str, str], stamp: Timestamp
 ) -> PointsAnnotation:
-    left, top, right, bottom = (box + 0.5).tolist()  # a frame's pixel coordinates are 0 at the centre of the first
+    left, top, right, bottom = (
+        box + 0.5
+    ).tolist()  # a frame's pixel coordinates are 0 at the centre of the first pixel
     corners = ((left, top), (right, top), (right, bottom), (left, bottom))
     return PointsAnnotation(
         timestamp=stamp,
@@ -139,7 +142,7 @@ def _metadata(about: dict[str, str]) -> list[KeyValuePair]:
 
 
 class JsonMessage(NamedTuple):
-    """A JSON message, for data without a schema of Foxglove's."""
+    """A JSON message, for data that Foxglove has no schema for."""
 
     kind: str
     values: Mapping[str, Json]
@@ -153,7 +156,7 @@ class MessageStamp(TypedDict):
 
 
 class Logged(NamedTuple):
-    """A message, its topic below the agent's name, and its simulation time [s]."""
+    """A message with its topic, below the agent's name, and its simulation time [s]."""
 
     topic: str
     message: Message | JsonMessage
@@ -161,8 +164,9 @@ class Logged(NamedTuple):
 
 
 def make_messages(frame: Frame) -> Iterator[Logged]:
-    """Yield the messages of everything in a frame: transforms, measurements of each sensor, weather, annotations."""
-    true, spin_s = frame.calibration, frame.time_s
+    """Yield the messages of a whole frame: transforms, measurements of all sensors, weather, annotations."""
+    true = frame.calibration
+    spin_s = frame.time_s
 
     def looks_s(sensor: str) -> float:
         return spin_s + true.offset_ms.get(sensor, 0.0) / 1000
@@ -176,7 +180,8 @@ def make_messages(frame: Frame) -> Iterator[Logged]:
         moved = _transforms([("world", frame.agent, world_from_agent)], looks_s(name))
         yield Logged("tf", moved, looks_s(name))
     for name, points in frame.lidar.items():
-        cloud, fields = points, LIDAR_FIELDS
+        cloud = points
+        fields = LIDAR_FIELDS
         if name in frame.point_times:
             cloud, fields = np.column_stack((points, frame.point_times[name])), (*LIDAR_FIELDS, TIME_FIELD)
         yield Logged(f"{name}/points", _cloud(cloud, fields, place(name)), looks_s(name))
@@ -204,7 +209,7 @@ def make_messages(frame: Frame) -> Iterator[Logged]:
 
 
 def radar_points(echoes: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Return (N, 8) columns RADAR_FIELDS of (N, 5) radar returns: x, y, z [m] in the radar's frame are prepended."""
+    """Return radar returns (N, 5) as columns RADAR_FIELDS (N, 8), with x, y, z [m] in the radar's frame prepended."""
     return np.concatenate((echoes[:, :1] * compute_echo_directions(echoes), echoes), axis=1).astype(np.float32)
 
 
@@ -236,7 +241,7 @@ def _thermal(picture: NDArray[np.uint16], place: MessageStamp) -> RawImage:
 
 
 def _transforms(tree: list[tuple[str, str, Array]], time_s: float) -> FrameTransforms:
-    """Return one message of the transforms in `tree`: triples of parent, child and (4, 4) parent_from_child."""
+    """Return one message with the transforms in `tree`: triples of parent, child and parent_from_child (4, 4) [m]."""
     return FrameTransforms(
         transforms=[
             FrameTransform(
@@ -279,7 +284,7 @@ EXPORT = ExportFormat(export_mcap, ("calibration",))
 
 
 class _Log:
-    """An open MCAP file with a channel for each topic, registered by its first message."""
+    """An open MCAP file with one channel per topic, registered with its first message."""
 
     def __init__(self, writer: Writer) -> None:
         writer.start(profile="", library="flcav")
@@ -306,7 +311,7 @@ class _Log:
 
 
 def _schema_of(value: Json) -> dict[str, Json]:
-    """Return the JSON schema of a value made of objects, texts and numbers."""
+    """Return the JSON schema of a value of objects, texts and numbers."""
     if isinstance(value, Mapping):
         return {"type": "object", "properties": {name: _schema_of(part) for name, part in value.items()}}
     return {"type": "string" if isinstance(value, str) else "number"}

@@ -1,7 +1,7 @@
-"""Readers of other formats, what they share: scenes, names of agents, annotations from boxes with all that follows.
+"""Parts shared by readers of other formats: scenes, agents' names, and annotations that are derived from boxes.
 
-What a format does not say is NaN, or UNKNOWN_PIXELS. Computed are returns (the points in an object's box), velocities
-from tracks, and the rectangles that boxes fill in images.
+What a format does not provide is NaN, or UNKNOWN_PIXELS. Derived are returns (the points in an object's box),
+velocities from tracks, and the rectangles that boxes fill in images.
 """
 
 import os
@@ -25,32 +25,32 @@ from flcav.sensors.frame import UNKNOWN_PIXELS, Annotations, CameraImage, Frame,
 from flcav.sensors.lens import Lens
 from flcav.sensors.views import outline_boxes
 
-LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track whose difference is a velocity, as nuscenes-devkit's
-FARTHEST = 1e9  # largest number that a measurement is taken to have
+LONGEST_STEP_S = 1.5  # between neighbouring annotations of a track that give a velocity, as in nuscenes-devkit
+FARTHEST = 1e9  # largest number that a measurement may have
 LARGEST_M, SMALLEST_M = 200.0, 0.01  # longest side of an object, at most and at least
-ROUNDED = 0.01  # error of a rotation by few digits: of its singular values, or of its quaternion's length
-APART_M, APART_DEG = 3.0, 5.0  # difference from which two poses of one instant contradict each other
-NAMED = 3  # most things of a kind that a note names
+ROUNDED = 0.01  # error of a rotation of few digits: in its singular values, or in its quaternion's length
+APART_M, APART_DEG = 3.0, 5.0  # difference above which two poses of one instant contradict each other
+NAMED = 3  # largest number of things that a note names
 
 
 class LogSource(ABC):
-    """A source that reads recorded logs from a folder: of its scenes, all that every format says alike.
+    """A source that reads recorded logs from a folder, with what all formats have in common.
 
-    The traffic is known at its frames alone, so that there is no trace. A reader names its format, and sets the fields.
+    The traffic is known only at the frames, so that there is no trace. A reader names its format and sets the fields.
     """
 
     FORMAT: ClassVar[str]
-    notes: tuple[str, ...] = ()  # sentences on what is not in the files, for whoever imports them
+    notes: tuple[str, ...] = ()  # sentences for the user on what the files lack
     folder: Path
-    split: str | None  # that was asked for
+    split: str | None  # the requested one
     split_of: Mapping[str, str | None]  # scene -> its split
-    folders: Mapping[str, Path] = {}  # scene -> its folder, where a format has one for each
+    folders: Mapping[str, Path] = {}  # scene -> its folder, where a format has one per scene
     labelled: bool = True  # whether all frames have boxes
-    beams: int | None = None  # of the LiDAR, where the format settles them
-    range_m: float | None = None  # of the LiDAR, the largest
+    beams: int | None = None  # of the LiDAR, where the format determines them
+    range_m: float | None = None  # largest range of the LiDAR [m], likewise
 
     def describe(self) -> Mapping[str, Json]:
-        """Return folder, splits and what is labelled; of scenes that are not called as their folders, these."""
+        """Return folder, splits and labelled kinds, and the folders of scenes that are not named after their folder."""
         folders = {scene: name_place(self.folders[scene])[1] for scene in self.split_of if scene in self.folders}
         renamed = {scene: name for scene, name in folders.items() if scene != name}
         return {
@@ -82,19 +82,19 @@ class LogSource(ABC):
 
 
 class ImportFormat(NamedTuple):
-    """A format to read: how a folder of it is opened, and the files by which it is told from others."""
+    """A format to read: how a folder of it is opened, and the files by which it is recognised."""
 
     read: Callable[[Path, str | None], LogSource]  # folder, split (None: all)
-    signs: tuple[str, ...] = ()  # patterns of paths, of which a folder of this format has one
+    signs: tuple[str, ...] = ()  # patterns of paths, at least one of which matches in a folder of this format
 
 
 @dataclass(frozen=True)
 class LogPicture:
-    """A camera's image file with what projects into it."""
+    """A camera's image file, with its projection."""
 
     path: Path
     lens: Lens
-    world_from_camera: Array  # (4, 4), optical frame
+    world_from_camera: Array  # (4, 4) [m], optical frame
 
 
 def annotate(
@@ -106,7 +106,7 @@ def annotate(
     velocity: Array | None = None,
     occlusion: Array | None = None,
 ) -> Annotations:
-    """Return annotations of M objects from their boxes; the points in an object's box are its returns.
+    """Return the annotations of M objects, given their boxes; the points in an object's box are its returns.
 
     Args:
         track: M track ids.
@@ -135,10 +135,10 @@ def annotate(
 
 
 def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> Array:
-    """Return (R, 3) velocities [m/s] of R annotations of tracks, by the difference of their neighbours' centres (R, 3).
+    """Return velocities (R, 3) [m/s] of R annotations, by differences of neighbouring centres (R, 3) [m] of a track.
 
-    A track's first and last annotation have one neighbour. NaN where neighbours are LONGEST_STEP_S away or more, and
-    where a track has one annotation: nuscenes-devkit's `box_velocity`.
+    The first and the last annotation of a track have one neighbour. NaN where neighbours are LONGEST_STEP_S or more
+    apart, and where a track has one annotation, as in nuscenes-devkit's `box_velocity`. `time_s` is (R,) [s].
     """
     order = np.lexsort((time_s, track))
     same = track[order][1:] == track[order][:-1]
@@ -153,10 +153,10 @@ def difference_tracks(track: NDArray[np.str_], time_s: Array, center: Array) -> 
 
 
 def view_boxes(boxes: Boxes, pictures: Mapping[str, LogPicture]) -> dict[str, Views]:
-    """Return the rectangles that `boxes` (world frame) fill in each image, with the share outside it.
+    """Return the rectangles that `boxes` (world frame) fill in each image, with the share outside it, by camera.
 
-    They are those of the boxes and not of what is in them, so somewhat larger than of a simulated actor. Which pixels
-    show is unknown.
+    They outline the boxes rather than their contents, so that they are somewhat larger than a simulated actor's. Which
+    pixels show is unknown.
     """
     corners = boxes.corners()
     return {
@@ -166,7 +166,7 @@ def view_boxes(boxes: Boxes, pictures: Mapping[str, LogPicture]) -> dict[str, Vi
 
 
 def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = None) -> Views:
-    """Return views of M objects with (M, 4) amodal boxes of whose visible pixels nothing is known."""
+    """Return views of M objects with amodal boxes (M, 4) [px] and unknown visible pixels."""
     count = len(amodal)
     return Views(
         amodal_box=amodal,
@@ -178,7 +178,7 @@ def unseen_views(amodal: Array, truncation: Array, occlusion: Array | None = Non
 
 
 def check_cloud(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
-    """Return the points (N, 4) of the file at `path`, x, y, z [m], intensity, as they are.
+    """Return the points (N, 4) of the file at `path`, x, y, z [m] and intensity, unchanged.
 
     Raises `InputError` where one is not finite or has an intensity outside 0 to 1.
     """
@@ -192,7 +192,7 @@ def check_cloud(points: NDArray[np.float32], path: Path) -> NDArray[np.float32]:
 
 
 def check_sizes(size: Array, path: Path) -> None:
-    """Raise `InputError` where the size (M, 3) of an object that the file at `path` labels is not one in metres."""
+    """Raise `InputError` where the file at `path` labels an object with a size (M, 3) that cannot be in metres."""
     if not (size > 0).all():
         raise InputError(f"{path}: object {int((size > 0).all(axis=1).argmin()) + 1} has a size that is not positive")
     longest = size.max(axis=1)
@@ -202,16 +202,16 @@ def check_sizes(size: Array, path: Path) -> None:
 
 
 def check_headings(yaw: Array, path: Path) -> None:
-    """Raise `InputError` where a heading (M,) that the file at `path` labels is more than a whole turn [rad]."""
+    """Raise `InputError` where the file at `path` labels an object with a heading (M,) [rad] beyond a full turn."""
     if (odd := np.abs(yaw) > 2 * np.pi + ROUNDED).any():
         number = int(odd.argmax())
         raise InputError(f"{path}: object {number + 1} is turned by {yaw[number]:g}; radians within a turn are wanted")
 
 
 def check_rotation(rotation: Array) -> Array:
-    """Return the rotation (3, 3) that a matrix of few digits stands for; one that is exact to 1e-6 is as it was.
+    """Return the rotation (3, 3) for a matrix of few digits; a matrix that is exact to 1e-6 is returned unchanged.
 
-    Raises ValueError where it is none: mirrored, scaled, sheared or not finite.
+    Raises ValueError where it is no rotation: mirrored, scaled, sheared or not finite.
     """
     whole = np.eye(4)
     whole[:3, :3] = rotation
@@ -219,6 +219,7 @@ def check_rotation(rotation: Array) -> Array:
         return rotation
     if not np.isfinite(rotation).all():
         raise ValueError("has a rotation that is not finite")
+    # The nearest rotation in the Frobenius norm is that of the polar decomposition.
     left, scale, right = np.linalg.svd(rotation)
     if np.abs(scale - 1).max() > ROUNDED:
         raise ValueError(
@@ -230,19 +231,19 @@ def check_rotation(rotation: Array) -> Array:
 
 
 def are_unit_quaternions(quaternions: Array) -> NDArray[np.bool_]:
-    """Return (N,) whether quaternions (N, 4) are rotations: of length 1, but for rounding."""
+    """Return the mask (N,) of quaternions (N, 4) that are rotations: of length 1, except for rounding."""
     return np.abs(np.linalg.norm(quaternions, axis=1) - 1) <= ROUNDED
 
 
 class PosePairs:
-    """Comparison of two poses that each frame of a format has of one body: counts those that contradict each other."""
+    """Comparison of two poses that every frame of a format has for the same body: counts those in contradiction."""
 
     def __init__(self, names: str) -> None:
-        """`names` are those of both in a note, such as "'lidar_pose' and 'true_ego_pos'"."""
+        """`names` denotes the two poses in a note, such as "'lidar_pose' and 'true_ego_pos'"."""
         self._names, self._frames, self._apart, self._first = names, 0, 0, ""
 
     def add(self, one: Array, other: Array, origin: Path, also: str = "") -> None:
-        """Compare two (4, 4) poses of the file `origin`; `also` is a clause on another contradiction of theirs."""
+        """Compare two poses (4, 4) [m] of the file `origin`; `also` is a clause on another contradiction."""
         between = inverse(one) @ other
         degrees = float(np.degrees(np.arccos(np.clip((np.trace(between[:3, :3]) - 1) / 2, -1, 1))))
         metres = float(np.linalg.norm(between[:3, 3]))
@@ -253,26 +254,26 @@ class PosePairs:
             self._first = self._first or f"{origin}, where {also or f'they are {apart}'}"
 
     def notes(self) -> tuple[str, ...]:
-        """Return a sentence on the frames in which they contradict each other; none where there are none."""
-        told = f"{self._names} contradict each other in {self._apart} of {plural(self._frames, 'frame')}"
-        return (f"{told}, first in {self._first}",) if self._apart else ()
+        """Return a sentence on the frames in which they contradict each other; empty where there are none."""
+        summary = f"{self._names} contradict each other in {self._apart} of {plural(self._frames, 'frame')}"
+        return (f"{summary}, first in {self._first}",) if self._apart else ()
 
 
 def group_classes(**theirs: str) -> dict[str, str]:
-    """Return a format's class -> category of flcav's, from category -> the format's classes, with spaces between."""
+    """Return flcav's categories by a format's class, from the format's classes by category, separated by spaces."""
     return {name: category for category, names in theirs.items() for name in names.split()}
 
 
 def name_some(names: Collection[str]) -> str:
-    """Return the first NAMED of several names, and how many others there are."""
+    """Return the first NAMED of several names, and the number of the others."""
     shown = ", ".join(list(names)[:NAMED])
     return shown if len(names) <= NAMED else f"{shown} and {len(names) - NAMED} more"
 
 
 def pinhole(intrinsics: Array, width: float, height: float, path: Path) -> Lens:
-    """Return the lens of a camera matrix (3, 3), which the file at `path` says.
+    """Return the lens of a camera matrix (3, 3) [px] that was read from the file at `path`.
 
-    Raises `InputError` where no camera has that matrix, or that width and height [px].
+    Raises `InputError` where the matrix, or the `width` and `height` [px], are not those of a camera.
     """
     if intrinsics.shape != (3, 3):
         raise InputError(f"{path}: a camera has no matrix of 3 x 3 numbers")
@@ -281,7 +282,7 @@ def pinhole(intrinsics: Array, width: float, height: float, path: Path) -> Lens:
 
 
 def measure_picture(path: Path) -> tuple[int, int]:
-    """Return width and height of an image file, upright [px]; raises `InputError` where it is missing or no image."""
+    """Return width and height [px] of an image file, upright; raises `InputError` where it is missing or no image."""
     try:
         with open_image(path) as image:
             return measure_upright(image)
@@ -292,12 +293,12 @@ def measure_picture(path: Path) -> tuple[int, int]:
 
 
 def link_pictures(paths: Mapping[str, Path]) -> Mapping[str, CameraImage]:
-    """Return camera -> image, each read on first access."""
+    """Return the images by camera; each is read on first access."""
     return LazyMapping(list(paths), lambda name: CameraImage(read_image(paths[name], np.uint8, channels=3)))
 
 
 class AgentNames:
-    """Names of agents: a dataset has one calibration for each, so that another calibration makes another agent.
+    """Names of agents: a dataset has one calibration per agent, so that another calibration makes another agent.
 
     >>> names = AgentNames()
     >>> names.of("ego", "calibration of Monday"), names.of("ego", "of Tuesday"), names.of("ego", "of Tuesday")
@@ -308,15 +309,15 @@ class AgentNames:
         self._known: dict[str, dict[Hashable, str]] = {}
 
     def of(self, vehicle: str, calibration: Hashable) -> str:
-        """Return the name of the agent of a `vehicle` with this `calibration`."""
+        """Return the name of the agent for a `vehicle` with this `calibration`."""
         known = self._known.setdefault(vehicle, {})
         return known.setdefault(calibration, vehicle if not known else f"{vehicle}-{len(known) + 1}")
 
 
 def name_folders(folders: Sequence[Path]) -> dict[str, Path]:
-    """Return scene -> folder: a scene has the name of its folder, or `PARENT-NAME` where folders share a name.
+    """Return folders by scene: a scene has the name of its folder, or `PARENT-NAME` where folders share a name.
 
-    Logs of one name in several splits are scenes of their own.
+    Logs of the same name in several splits are separate scenes. Raises `InputError` where two scenes have one name.
     """
     count = Counter(name_place(path)[1] for path in folders)
     named = {}
@@ -330,33 +331,33 @@ def name_folders(folders: Sequence[Path]) -> dict[str, Path]:
 
 
 def name_place(path: Path) -> tuple[str, str]:
-    """Return the names of a path's folder and of itself, as it is called and not what it links to."""
+    """Return the names of a path's folder and of the path itself, without following links."""
     whole = Path(os.path.abspath(path))  # noqa: PTH100 - `resolve` follows links, `absolute` keeps `..`
     return whole.parent.name, whole.name
 
 
 def assign_split(split_of: MutableMapping[str, str | None], scene: str, split: str | None, origin: Path) -> None:
-    """Put a scene into a split; raises `InputError` where it is in another: its frames show the same cars."""
+    """Assign a scene to a split; raises `InputError` where it is in another: a scene's frames show the same cars."""
     if split_of.setdefault(scene, split) != split:
         both = " and ".join(sorted(f"'{each}'" if each else "no split" for each in (split_of[scene], split)))
         raise InputError(f"{origin}: the scene {shorten(scene)} is in {both}")
 
 
 def name_splits(split_of: Mapping[str, str | None]) -> dict[str, list[str]]:
-    """Return split -> scenes from scene -> split, without those of no split."""
-    found: dict[str, list[str]] = {}
+    """Return the scenes by split, given the splits by scene; scenes without a split are left out."""
+    scenes: dict[str, list[str]] = {}
     for scene, split in split_of.items():
         if split is not None:
-            found.setdefault(split, []).append(scene)
-    return found
+            scenes.setdefault(split, []).append(scene)
+    return scenes
 
 
 def choose_split(folder: Path, split_of: Mapping[str, str | None], split: str | None) -> list[str]:
-    """Return the scenes of `split`, all for None; raises `InputError` where there are none."""
+    """Return the scenes of `split`, or all for None; raises `InputError` where there are none."""
     if not split_of:
         raise InputError(f"{folder}: no scenes in it")
-    chosen = [scene for scene, own in split_of.items() if split is None or own == split]
+    chosen = [scene for scene, scene_split in split_of.items() if split is None or scene_split == split]
     if not chosen:
-        known = sorted({own for own in split_of.values() if own is not None})
+        known = sorted({scene_split for scene_split in split_of.values() if scene_split is not None})
         raise InputError(f"{folder}: no split '{split}'; it has {', '.join(known) or 'none'}")
     return chosen

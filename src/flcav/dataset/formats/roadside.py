@@ -1,9 +1,9 @@
 """Reading of roadside LiDAR datasets, DAIR-V2X and TUMTraf: sweeps of sensors at junctions, with boxes.
 
 DAIR-V2X-I (Yu et al., CVPR 2022) has its sweeps in `velodyne` and boxes in `label/virtuallidar`, in the frame of a
-level LiDAR; of the cooperative dataset it is the folder `infrastructure-side`. TUMTraf Intersection (Zimmer et al.,
+level LiDAR; in the cooperative dataset it is the folder `infrastructure-side`. TUMTraf Intersection (Zimmer et al.,
 ITSC 2023) has `point_clouds/<lidar>` and, as ASAM OpenLABEL, `labels_point_clouds/<lidar>`. Each LiDAR is a pole. The
-world is the LiDAR's frame: where a sensor stands is not read, nor are pictures.
+world frame is the LiDAR's: positions of sensors are not read, nor are pictures.
 """
 
 import math
@@ -46,7 +46,7 @@ CATEGORIES = group_classes(
     bicycle="cyclist bicycle",
     motorcycle="motorcyclist motorcycle",
 )
-OCCLUSION = (0.0, 0.3, 0.75)  # share that stands for DAIR-V2X's levels 0 not, 1 partly and 2 largely occluded
+OCCLUSION = (0.0, 0.3, 0.75)  # shares for DAIR-V2X's levels: 0 not, 1 partly and 2 largely occluded
 STAMP = re.compile(r"(\d+)_(\d{9})_")  # seconds and nanoseconds in the names of TUMTraf's files
 
 
@@ -57,7 +57,7 @@ class RoadsideSweep(NamedTuple):
     label: Path
     pole: str
     spin: int
-    time_s: float  # since the first of its scene
+    time_s: float  # since the first sweep of its scene [s]
 
 
 class Labelled(NamedTuple):
@@ -65,20 +65,22 @@ class Labelled(NamedTuple):
 
     track: tuple[str, ...]
     boxes: Boxes
-    occlusion: Array  # (M,)
+    occlusion: Array  # (M,) 0 to 1
 
 
 class RoadsideSource(LogSource):
     """The sweeps of roadside LiDARs in a folder."""
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where there is no sweep with labels, none of `split`, or a table is malformed."""
+        """Open the sweeps; raises `InputError` where none has labels, none is in `split`, or a table is malformed."""
         self.folder, self.split = folder, split
-        found, bare = self._list_sweeps(folder)
-        if not found:
+        labelled, bare = self._list_sweeps(folder)
+        if not labelled:
             raise InputError(f"{folder}: no sweep that has labels")
-        self.split_of = dict.fromkeys(choose_split(folder, dict.fromkeys(found), split))
-        self._sweeps = {scene: sorted(found[scene], key=lambda each: (each.spin, each.pole)) for scene in self.split_of}
+        self.split_of = dict.fromkeys(choose_split(folder, dict.fromkeys(labelled), split))
+        self._sweeps = {
+            scene: sorted(labelled[scene], key=lambda sweep: (sweep.spin, sweep.pole)) for scene in self.split_of
+        }
         self.notes = tuple(_describe_lacking(bare, self._sweeps))
 
     def frame_count(self, scene: str) -> int:
@@ -89,8 +91,9 @@ class RoadsideSource(LogSource):
         """Yield the sweeps of a scene; raises `InputError` where a file is missing, truncated or malformed."""
         calibration, here = Calibration({LIDAR: np.eye(4)}), np.eye(4)
         for sweep in self._sweeps[scene]:
-            points, found = read_roadside_sweep(sweep.cloud), self._read_labels(sweep.label)
-            check_sizes(found.boxes.size, sweep.label)
+            points = read_roadside_sweep(sweep.cloud)
+            labelled = self._read_labels(sweep.label)
+            check_sizes(labelled.boxes.size, sweep.label)
             yield Frame(
                 scene=scene,
                 index=sweep.spin,
@@ -100,35 +103,41 @@ class RoadsideSource(LogSource):
                 calibration=calibration,
                 assumed=calibration,
                 lidar={LIDAR: points},
-                annotations=annotate(found.track, found.boxes, {LIDAR: (points, here)}, {}, occlusion=found.occlusion),
+                annotations=annotate(
+                    labelled.track, labelled.boxes, {LIDAR: (points, here)}, {}, occlusion=labelled.occlusion
+                ),
             )
 
     @abstractmethod
     def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
-        """Return the labelled sweeps by scene, and the names of those without labels."""
+        """Return the labelled sweeps by scene, and the file names of those without labels."""
 
     @abstractmethod
     def _read_labels(self, path: Path) -> Labelled:
-        """Return the objects in a file of labels; raises `InputError` for another file."""
+        """Return the objects in a label file; raises `InputError` for another file."""
 
 
 class DairSource(RoadsideSource):
-    """The sweeps of DAIR-V2X-I: by the sequences of `data_info.json` where it has some, else scenes of one sweep."""
+    """The sweeps of DAIR-V2X-I: scenes are the sequences in `data_info.json`; without them, a scene is one sweep."""
 
     FORMAT = "dair-v2x"
 
     def _list_sweeps(self, folder: Path) -> tuple[dict[str, list[RoadsideSweep]], list[str]]:
-        about, labels = _read_infos(folder / "data_info.json"), folder / "label" / "virtuallidar"
+        about = _read_infos(folder / "data_info.json")
+        labels = folder / "label" / "virtuallidar"
         places = {place: number for number, place in enumerate(sorted({row.place for row in about.values()} | {""}))}
         scenes: dict[str, list[RoadsideSweep]] = {}
         bare = list[str]()
         for cloud in sorted((folder / "velodyne").glob("*.pcd")):
-            label, own = labels / f"{cloud.stem}.json", about.get(cloud.stem, Info("", "", 0.0))
+            label = labels / f"{cloud.stem}.json"
+            info = about.get(cloud.stem, Info("", "", 0.0))
             if not label.is_file():
                 bare.append(cloud.name)
                 continue
-            scene = f"dair-{own.sequence or cloud.stem}"
-            scenes.setdefault(scene, []).append(RoadsideSweep(cloud, label, f"pole{places[own.place]}", 0, own.time_s))
+            scene = f"dair-{info.sequence or cloud.stem}"
+            scenes.setdefault(scene, []).append(
+                RoadsideSweep(cloud, label, f"pole{places[info.place]}", 0, info.time_s)
+            )
         return {scene: _number(sweeps) for scene, sweeps in scenes.items()}, bare
 
     def _read_labels(self, path: Path) -> Labelled:
@@ -136,7 +145,8 @@ class DairSource(RoadsideSource):
         track, category, numbers, occlusion = [], [], [], []
         try:
             for number, row in enumerate(rows):
-                size, place = row["3d_dimensions"], row["3d_location"]
+                size = row["3d_dimensions"]
+                place = row["3d_location"]
                 values = [place[axis] for axis in "xyz"] + [size[axis] for axis in "lwh"] + [row["rotation"]]
                 numbers.append([float(value) for value in values])
                 category.append(str(row["type"]))
@@ -152,7 +162,7 @@ class DairSource(RoadsideSource):
 
 
 class TumTrafSource(RoadsideSource):
-    """The sequences of TUMTraf Intersection in a folder, or the folder of one."""
+    """The sequences of TUMTraf Intersection in a folder, or the folder of a single one."""
 
     FORMAT = "tumtraf"
 
@@ -160,7 +170,7 @@ class TumTrafSource(RoadsideSource):
         roots = [folder] if (folder / "point_clouds").is_dir() else sorted(folder.iterdir())
         scenes: dict[str, list[RoadsideSweep]] = {}
         bare = list[str]()
-        for root in (each for each in roots if (each / "point_clouds").is_dir()):
+        for root in (path for path in roots if (path / "point_clouds").is_dir()):
             for number, lidar in enumerate(sorted(path for path in (root / "point_clouds").iterdir() if path.is_dir())):
                 for cloud in sorted(lidar.glob("*.pcd")):
                     label = root / "labels_point_clouds" / lidar.name / f"{cloud.stem}.json"
@@ -179,9 +189,9 @@ class TumTrafSource(RoadsideSource):
         try:
             (frame,) = values["openlabel"]["frames"].values()
             for name, row in frame["objects"].items():
-                own = row["object_data"]
-                numbers.append([float(value) for value in own["cuboid"]["val"]])
-                category.append(str(own["type"]))
+                data = row["object_data"]
+                numbers.append([float(value) for value in data["cuboid"]["val"]])
+                category.append(str(data["type"]))
                 track.append(str(name))
             array = np.array(numbers, np.float64).reshape(-1, 10)
             turned = Rotation.from_quat(array[:, 3:7]).as_matrix() if len(array) else np.zeros((0, 3, 3))
@@ -195,9 +205,9 @@ class TumTrafSource(RoadsideSource):
 
 
 def read_roadside_sweep(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x, y, z [m], intensity [0, 1] of a PCD file; points that are not finite are left out.
+    """Return points (N, 4) of a PCD file: x, y, z [m], intensity [0, 1]; points that are not finite are left out.
 
-    Intensities may reach 255, or 65535. Raises `InputError` for other files.
+    Intensities in the file may reach 255, or 65535. Raises `InputError` for other files.
     """
     rows = read_pcd(path)
     try:
@@ -217,28 +227,28 @@ def read_roadside_sweep(path: Path) -> NDArray[np.float32]:
 class Info(NamedTuple):
     """The entry of a sweep in `data_info.json`."""
 
-    sequence: str  # "" where it is of none
+    sequence: str  # "" for none
     place: str  # junction
-    time_s: float
+    time_s: float  # of the sweep [s]
 
 
 def _read_infos(path: Path) -> Mapping[str, Info]:
-    """Return what is said of each sweep, by the name of its file; nothing where there is no table."""
+    """Return the entries of the sweeps, by the stem of the sweep's file; empty where there is no table."""
     if not path.is_file():
         return {}
     rows: Any = read_json(path)
-    found: dict[str, Info] = {}
+    infos: dict[str, Info] = {}
     try:
         for row in rows:
             name = Path(str(row["pointcloud_path"])).stem
-            own = Info(
+            info = Info(
                 str(row.get("sequence_id", "")),
                 str(row.get("intersection_loc", "")),
                 float(row.get("pointcloud_timestamp", 0)) / 1e6,
             )
-            if found.setdefault(name, own) != own:
+            if infos.setdefault(name, info) != info:
                 raise InputError(f"{path}: two entries of {shorten(name)} differ")
-        return found
+        return infos
     except InputError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError):
@@ -246,9 +256,9 @@ def _read_infos(path: Path) -> Mapping[str, Info]:
 
 
 def _number(sweeps: Sequence[RoadsideSweep]) -> list[RoadsideSweep]:
-    """Return a scene's sweeps with their spins, each LiDAR's in the order of time, and times since the first."""
+    """Return a scene's sweeps with their spins, which number each LiDAR's sweeps by time, and times since the first."""
     first, spins, numbered = min(sweep.time_s for sweep in sweeps), dict[str, int](), []
-    for sweep in sorted(sweeps, key=lambda each: (each.time_s, each.cloud)):
+    for sweep in sorted(sweeps, key=lambda entry: (entry.time_s, entry.cloud)):
         spin = spins.get(sweep.pole, 0)
         spins[sweep.pole] = spin + 1
         numbered.append(sweep._replace(spin=spin, time_s=round(sweep.time_s - first, 6)))
@@ -256,15 +266,15 @@ def _number(sweeps: Sequence[RoadsideSweep]) -> list[RoadsideSweep]:
 
 
 def _describe_lacking(bare: Sequence[str], scenes: Mapping[str, Sequence[RoadsideSweep]]) -> Iterator[str]:
-    """Yield sentences on sweeps without labels, and on those of one LiDAR and scene with one time."""
+    """Yield sentences on sweeps without labels, and on sweeps of one LiDAR and scene that share a time stamp."""
     if bare:
         yield f"left out {plural(len(bare), 'sweep')} without labels: {name_some(bare)}"
-    found: dict[tuple[str, str, float], list[RoadsideSweep]] = {}
-    for scene, sweep in ((scene, each) for scene, own in scenes.items() for each in own):
-        found.setdefault((scene, sweep.pole, sweep.time_s), []).append(sweep)
-    if twins := [own for own in found.values() if len(own) > 1]:
+    by_time: dict[tuple[str, str, float], list[RoadsideSweep]] = {}
+    for scene, sweep in ((scene, entry) for scene, sweeps in scenes.items() for entry in sweeps):
+        by_time.setdefault((scene, sweep.pole, sweep.time_s), []).append(sweep)
+    if twins := [twin for twin in by_time.values() if len(twin) > 1]:
         one, other, *_ = twins[0]
-        equal, whole = (sum(map(len, own)) for own in (twins, found.values()))
+        equal, whole = (sum(map(len, group)) for group in (twins, by_time.values()))
         yield (
             f"{equal} of {plural(whole, 'sweep')} have the time stamp of another "
             f"of their LiDAR, as {other.cloud.name} has that of {one.cloud.name}: correct the time stamps"

@@ -1,4 +1,4 @@
-"""Reading of a LiDAR sweep from a single file: KITTI's and nuScenes' bare numbers, PCD."""
+"""Reading of a LiDAR sweep from a single file: headerless numbers of KITTI or nuScenes, or PCD."""
 
 from pathlib import Path
 
@@ -14,7 +14,7 @@ from flcav.dataset.payloads import TIMES
 
 ENDINGS = (".bin", ".pcd")
 FIELDS = ("x", "y", "z", "intensity")
-OTHERS = {  # formats that are not read, by their first bytes
+OTHERS = {  # unsupported formats, by their first bytes
     b"\x93NUMPY": "a NumPy array",
     b"PK\x03\x04": "a zip archive",
     b"\x1f\x8b": "compressed by gzip",
@@ -29,10 +29,10 @@ OTHERS = {  # formats that are not read, by their first bytes
 
 
 def read_cloud_file(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z up [m], intensity [0, 1] of a point cloud's file, LiDAR frame.
+    """Return points (N, 4) of a point cloud file: x ahead, y left, z up [m], intensity [0, 1]; LiDAR frame.
 
-    Files of KITTI and nuScenes are told by their numbers, see `layout`; a PCD file has the fields `FIELDS`. Raises
-    `InputError` for other files, and for points that are not finite or have an intensity out of range.
+    Files of KITTI and nuScenes are recognised by their numbers, see `clouds`; a PCD file has the fields `FIELDS`.
+    Raises `InputError` for other files, and for points that are not finite or have an intensity out of range.
     """
     data = read_file(path)
     for start, name in OTHERS.items():
@@ -44,7 +44,7 @@ def read_cloud_file(path: Path) -> NDArray[np.float32]:
 
 
 def list_sweeps(folder: Path) -> list[Path]:
-    """Return the files of point clouds in a folder, in order; times of points, which datasets keep beside, are none."""
+    """Return the files of point clouds in a folder, in order, without the files of point times that datasets keep."""
     return sorted(file for file in folder.iterdir() if file.suffix in ENDINGS and not file.name.endswith(f".{TIMES}"))
 
 

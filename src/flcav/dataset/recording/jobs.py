@@ -1,9 +1,9 @@
-"""The jobs of a recording: division of the frames, how a job is performed, and engines that perform many at a time.
+"""The jobs of a recording: division of the frames, how a job is performed, and engines that perform jobs in parallel.
 
 A scene of a `Replayable` source is one job for its traffic and one for each part of its frames; any other scene is one
 job. A job writes below `work/SCENE`: the traffic, with navigation logs if there are any, or the folder of a part, which
-appears there when it is complete. A scene's traffic is scheduled before its parts, and only a few scenes are under way
-at a time. Jobs run in this process, in a pool of processes, or in actors on the machines of a Ray cluster.
+appears there when it is complete. A scene's traffic is scheduled before its parts, and only a few scenes are in
+progress at a time. Jobs run in this process, in a pool of processes, or in actors on the machines of a Ray cluster.
 """
 
 import contextlib
@@ -36,7 +36,7 @@ from flcav.sources.source import Isolated, LoggingSource, Replayable, Source
 from flcav.storage.files import flush_all, flush_tree, sha256, write_bytes, write_in_pieces
 from flcav.world.trace import Trace
 
-PART_FRAMES = 16  # frames of a part: few are lost by an interruption, and starting a part is cheap beside them
+PART_FRAMES = 16  # frames of a part: an interruption loses few, and they take much longer than starting the part
 TRAFFIC = "traffic.parquet"
 LOGS = "navigation.parquet"
 HEADER = "recipe.json"
@@ -48,7 +48,7 @@ AHEAD = 2  # jobs submitted beyond an engine's slots, so that no worker idles
 
 
 class SceneTraffic(NamedTuple):
-    """The job that simulates the traffic of a scene, which its parts replay."""
+    """The job that simulates the traffic of a scene, which the scene's parts replay."""
 
     scene: str
 
@@ -70,7 +70,7 @@ Job = SceneTraffic | ScenePart
 
 
 def check_scenes(scenes: Sequence[str]) -> None:
-    """Raise ValueError where a scene has no safe name of a folder, that of a dataset's own file, or another's."""
+    """Raise ValueError where a scene's name is unsafe as a folder, reserved by the dataset, or used twice."""
     for scene in scenes:
         if not _SAFE_NAME.fullmatch(scene) or scene in OWN_NAMES:
             raise ValueError(f"{shorten(scene)}: the name of a scene that a dataset cannot hold")
@@ -79,7 +79,7 @@ def check_scenes(scenes: Sequence[str]) -> None:
 
 
 def split_scene(source: Source, scene: str) -> list[ScenePart]:
-    """Return the parts of a scene: of PART_FRAMES each for a `Replayable` source, else one of all frames."""
+    """Return the parts of a scene: PART_FRAMES frames each for a `Replayable` source, else one of all frames."""
     count = source.frame_count(scene)
     step = PART_FRAMES if isinstance(source, Replayable) else max(count, 1)
     return [
@@ -91,8 +91,8 @@ def perform_job(source: Source, task: Job, work: Path, wrote_frame: Callable[[],
     """Perform the job `task` below the folder `work`, replacing leftovers of an earlier attempt.
 
     Calls `wrote_frame` after each frame. Raises ValueError where the source violates its protocol: it has no traffic to
-    replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts; and the
-    ValueError `InputError` where an image that is linked to is truncated.
+    replay, yields a frame twice or of another scene, uses unsafe names, or moves sensors on their mounts. Raises
+    `InputError`, a ValueError, where a linked image is truncated.
     """
     if isinstance(task, SceneTraffic):
         trace = source.trace(task.scene)
@@ -167,7 +167,7 @@ def _write(frames: Iterator[Frame], scene: str, part: Path, wrote_frame: Callabl
 
 
 def _name_files(frame: Frame) -> str:
-    """Return " of FILE" of a frame that has files; "" of any other."""
+    """Return " of FILE" for a frame that has files, else ""."""
     files = frame.files if isinstance(frame, LinkedFrame) else {}
     return f" of {next(iter(files.values()))}" if files else ""
 
@@ -180,10 +180,10 @@ def _check_names(frame: Frame, scene: str) -> None:
 
 
 class Engine:
-    """An executor of jobs, in any order, `slots` at a time."""
+    """An executor of jobs, `slots` at a time, in any order."""
 
     def __init__(self, slots: int, start: Callable[[Job], Future[None]], wrote: Callable[[int], None]) -> None:
-        """`start` begins a job; `wrote` is called with the number of frames of the parts that are completed."""
+        """Begin jobs by `start`; `wrote` is called with the number of frames of the completed parts."""
         self.slots, self._start, self._wrote = slots, start, wrote
         self._tasks: dict[Future[None], Job] = {}
         self._count = 0
@@ -200,7 +200,7 @@ class Engine:
         done: set[Future[None]] = set()
         while not done:
             done, _ = wait(self._tasks, timeout=POLL_S, return_when=FIRST_COMPLETED)
-            self._count += sum(task.frames for each in done if isinstance(task := self._tasks[each], ScenePart))
+            self._count += sum(task.frames for future in done if isinstance(task := self._tasks[future], ScenePart))
             self._wrote(self._count)
         for future in done:
             future.result()
@@ -208,7 +208,7 @@ class Engine:
 
 
 def find_pending(source: Source, scene: str, work: Path) -> list[ScenePart]:
-    """Return the parts of a scene that are not completed yet."""
+    """Return the parts of a scene that are not complete yet."""
     return [part for part in split_scene(source, scene) if not part.folder(work).is_dir()]
 
 
@@ -240,8 +240,8 @@ _job: Any = None  # in a worker process: source, folder, and the shared counter 
 def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
     """Yield an engine of `jobs` processes that perform jobs of `source` below the folder `work`.
 
-    It calls `wrote` with the number of frames written so far. A single one is this process, unless the source is
-    `Isolated`; others are child processes of one thread each, which end with this one, even if it is killed.
+    It calls `wrote` with the number of frames written so far. A single process is this one, unless the source is
+    `Isolated`; others are single-threaded child processes, which end with this one, even if it is killed.
     """
     if jobs == 1 and not isinstance(source, Isolated):
         count = itertools.count(1)
@@ -268,9 +268,9 @@ def start_processes(source: Source, work: Path, jobs: int, wrote: Callable[[int]
 def start_actors(source: Source, work: Path, jobs: int, wrote: Callable[[int], None]) -> Iterator[Engine]:
     """Yield an engine of `jobs` Ray actors that perform jobs of `source` below the folder `work`.
 
-    The folder must be on storage shared by all machines, and flcav installed on each. RAY_ADDRESS names the cluster;
-    without it, Ray is started on this machine. It calls `wrote` with the number of frames written so far, as parts are
-    completed. Raises `InputError` where Ray is not installed.
+    The folder must be on storage shared by all machines, and flcav installed on all of them. RAY_ADDRESS names the
+    cluster; without it, Ray is started on this machine. `wrote` is called with the number of frames written so far, as
+    parts are completed. Raises `InputError` where Ray is not installed.
     """
     with actor_pool(jobs, _Recorder, source, work.absolute()) as pool:
         yield Engine(jobs, lambda task: pool.lend(lambda actor: actor.call(_Recorder.perform, task)), wrote)
@@ -281,7 +281,7 @@ def _begin(*job: Any) -> None:
     _job = job
     if isinstance(job[0], Isolated):
         silent = os.open(os.devnull, os.O_WRONLY)
-        for stream in (1, 2):  # what its library prints; errors are returned
+        for stream in (1, 2):  # silences what the source's library prints; errors are returned
             os.dup2(silent, stream)
 
 
@@ -296,7 +296,7 @@ def _perform(task: Job) -> None:
 
 
 class _Recorder:
-    """A Ray actor that performs jobs in sequence; its source keeps the scene that it built last."""
+    """A Ray actor that performs jobs one after another; its source keeps the scene that it built last."""
 
     def __init__(self, source: Source, work: Path) -> None:
         self._source, self._work = source, work

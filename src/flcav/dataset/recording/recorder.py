@@ -2,9 +2,9 @@
 
 Parts of scenes are first written below the hidden folder `.recording`. When all are complete, their files are moved
 into the dataset, their tables are concatenated, and the manifest is written last. An interruption at any point loses
-only the parts that were under way. A part is on the disk before it counts as complete, and all before the manifest.
+only the parts in progress. A part is on disk before it counts as complete, and all parts before the manifest.
 
-A finished dataset of which files are missing or damaged is mended: the parts that they are of are recorded again.
+A finished dataset with missing or damaged files is mended: the parts to which they belong are recorded again.
 """
 
 import json
@@ -71,13 +71,13 @@ def record(
     engine: str = "processes",
     progress: Report = print_progress,
 ) -> bool:
-    """Record a source, or the built-in simulator with a recipe or that in a YAML file, into the folder `out`.
+    """Record a source, or the built-in simulator with a recipe or a recipe's YAML file, into the folder `out`.
 
     Returns True if anything was recorded, False if `out` already held this very dataset. An interrupted recording of
-    the same source is resumed. A dataset is mended, see `mend`, where files are missing or
-    have another size, or tables another hash. Raises `InputError` where `out` holds anything else, is written by
-    another process or cannot be mended, or `jobs`, `engine` or the recipe is wrong; ValueError where scenes have names
-    that no folder may have, before anything is touched; OSError where `out` cannot be written.
+    the same source is resumed. A dataset in which files are missing or have another size, or tables another checksum,
+    is mended, see `mend`. Raises `InputError` where `out` holds anything else, is being written by another process or
+    cannot be mended, or where `jobs`, `engine` or the recipe is wrong; ValueError where the name of a scene is unsafe
+    as a folder, before anything is touched; OSError where `out` cannot be written.
 
     Args:
         source: source of frames, recipe of the built-in simulator, or its YAML file.
@@ -126,7 +126,7 @@ def record(
 
 
 def drop_unbegun(out: Path) -> None:
-    """Remove what a failed recording left in `out` where no part of it was completed; otherwise it can be resumed."""
+    """Remove what a failed recording left in `out` where no part was completed; otherwise it can be resumed."""
     work = out / WORK
     if work.is_dir() and not any(path.is_dir() and path.suffix != ".part" for path in work.glob("*/*")):
         shutil.rmtree(work)
@@ -149,9 +149,9 @@ def _write(source: Source, work: Path, jobs: int, engine: str, progress: Report)
 
 
 def _claim(out: Path, header: Header) -> bool:
-    """Prepare `out` for this recording; return False if it holds the finished dataset already, with whole tables.
+    """Prepare `out` for this recording; return False if it already holds the finished dataset, with intact tables.
 
-    Where a table is damaged, the dataset is a recording that has just begun. Raises `InputError` where `out` is a file,
+    A dataset with a damaged table counts as a recording that has just begun. Raises `InputError` where `out` is a file,
     or holds another dataset, another recording or other files.
     """
     if out.exists() and not out.is_dir():
@@ -193,8 +193,9 @@ def _refuse_other(out: Path, what: str, held: Header, wanted: Header) -> None:
 
 
 def _assemble(source: Source, out: Path, header: Header) -> None:
-    """Assemble the dataset from the parts below `.recording`; can be repeated after an interruption."""
-    work, scenes = out / WORK, list(source.scenes())
+    """Assemble the dataset from the parts below `.recording`; this can be repeated after an interruption."""
+    work = out / WORK
+    scenes = list(source.scenes())
     joined = work / JOINED
     joined.mkdir(exist_ok=True)
     folders = [part.folder(work) for scene in scenes for part in split_scene(source, scene)]
@@ -244,7 +245,7 @@ def _assemble(source: Source, out: Path, header: Header) -> None:
 
 
 def _write_town(source: Source, work: Path, out: Path) -> bool:
-    """Write the source's town files and their listing; return whether there are any."""
+    """Write the source's town files and their listing; return whether it has any."""
     files = source.town_files() if isinstance(source, TownSource) else {}
     if not files:
         return False
@@ -256,39 +257,40 @@ def _write_town(source: Source, work: Path, out: Path) -> bool:
 
 
 def _list(files: Mapping[str, Path], folder: Path) -> None:
-    """Write the listing of `files`, path in the dataset -> file, into `folder`."""
+    """Write the listing of `files`, which maps paths in the dataset to files, into `folder`."""
     rows = [(name, path.stat().st_size, sha256(path)) for name, path in files.items()]
     write_rows(pa.table(dict(zip(FILES_SCHEMA.names, zip(*rows))), schema=FILES_SCHEMA), folder / table_path(FILES))
 
 
 def _move_traffic(folder: Path, scene: str, out: Path) -> Path | None:
-    """Move the traffic of a scene, and navigation logs, into the dataset; return the file of their listing.
+    """Move the traffic of a scene, and its navigation logs, into the dataset; return the file of their listing.
 
-    None without traffic.
+    Returns None where there is no traffic.
     """
-    traffic, listing = folder / TRAFFIC, folder / table_path(FILES)
+    traffic = folder / TRAFFIC
+    listing = folder / table_path(FILES)
     if traffic.exists():
         made = {trace_path(scene): traffic, navigation_path(scene): folder / LOGS}
-        held = {name: path if path.exists() else out / name for name, path in made.items()}  # moved before
+        held = {name: path if path.exists() else out / name for name, path in made.items()}  # else moved earlier
         _list({name: path for name, path in held.items() if path.exists()}, folder)
-        for name in reversed(made):  # the traffic last: with it all is done
+        for name in reversed(made):  # the traffic last: its move marks the scene as done
             if made[name].exists():
                 _move(made[name], out / name)
     return listing if listing.exists() else None
 
 
 def _calibrations(folders: list[Path]) -> dict[str, Json]:
-    """Return the calibration file's content: the union of those of all parts; raises ValueError if they differ."""
-    found: dict[str, Json] = {}
+    """Return the content of the calibration file, the union over all parts; raises ValueError where parts differ."""
+    calibrations: dict[str, Json] = {}
     for folder in folders:
         for agent, calibration in json.loads((folder / CALIBRATION).read_text()).items():
-            if found.setdefault(agent, calibration) != calibration:
+            if calibrations.setdefault(agent, calibration) != calibration:
                 raise ValueError(f"{folder.parent.name}: {agent} is calibrated otherwise than in another scene")
-    return found
+    return calibrations
 
 
 def _values(path: Path, column: str) -> pa.Array:
-    """Return the values of a column of a Parquet file; of a column of lists, their concatenated elements."""
+    """Return the values of a column of a Parquet file, for a column of lists their concatenated elements."""
     values = pq.ParquetFile(path).read(columns=[column])[column].combine_chunks()
     return values.flatten() if isinstance(values, pa.ListArray) else values
 
@@ -299,19 +301,19 @@ def _move(source: Path, target: Path) -> None:
 
 
 def open_source(recipe: Recipe, beside: Path | None = None) -> Source:
-    """Return the source of a recipe's frames; a town's folder may be relative to `beside`, the folder of the recipe.
+    """Return the source of a recipe's frames; `beside` is the recipe's folder, to which a town's path may be relative.
 
-    Raises `InputError` where the recipe and its town do not go together, and where CARLA's client is not installed.
+    Raises `InputError` where the recipe and its town do not match, and where CARLA's client is not installed.
     """
     if isinstance(recipe, CarlaRecipe):
-        from flcav.carla.recording.source import CarlaSource  # not all have CARLA's client
+        from flcav.carla.recording.source import CarlaSource  # CARLA's client is an optional dependency
 
         return CarlaSource(recipe, beside)
     return EmbeddedSource(recipe, beside)
 
 
 def find_damaged_files(out: Path) -> set[str]:
-    """Return the files of the dataset in `out`, all but its tables, that are missing or of another size."""
+    """Return the files of the dataset in `out`, without its tables, that are missing or of another size."""
     manifest = read_manifest(out)
     listed = list_files(out, manifest)
     kept = {name: size for name, (size, _) in listed.items() if name not in manifest.tables}
@@ -321,16 +323,17 @@ def find_damaged_files(out: Path) -> set[str]:
 def has_damaged_table(out: Path) -> bool:
     """Return whether a table of the dataset in `out` is missing or altered."""
     tables = read_manifest(out).tables
-    return any(_size(out / name) != own.bytes or sha256(out / name) != own.sha256 for name, own in tables.items())
+    return any(_size(out / name) != table.bytes or sha256(out / name) != table.sha256 for name, table in tables.items())
 
 
 def mend(source: Source, out: Path, damaged: Collection[str], record: Callable[[], None]) -> None:
-    """Put the files `damaged` of the dataset in `out` in place again.
+    """Restore the `damaged` files of the dataset in `out`.
 
-    `record` performs the remaining jobs of the source below `.recording`; these are the parts that have a damaged file.
-    Raises `InputError` for a file that is not recorded as it was, by other versions of packages.
+    `record` performs the remaining jobs of the source below `.recording`: those of the parts that have a damaged file.
+    Raises `InputError` for a file that cannot be recorded identically, because package versions differ.
     """
-    work, listed = out / WORK, list_files(out, read_manifest(out))
+    work = out / WORK
+    listed = list_files(out, read_manifest(out))
     shutil.rmtree(work, ignore_errors=True)
     made = _make_parts(source, out, damaged, record)
     if isinstance(source, TownSource):
@@ -349,7 +352,7 @@ def mend(source: Source, out: Path, damaged: Collection[str], record: Callable[[
 
 
 def _make_parts(source: Source, out: Path, damaged: Collection[str], record: Callable[[], None]) -> dict[str, Path]:
-    """Record the parts that have a damaged file; return the new files by their names in the dataset."""
+    """Record the parts that have a damaged file; return the new files by their path in the dataset."""
     frames = read_table(out / table_path("frames"), "frames").to_pydict()
     keys: dict[str, list[str]] = defaultdict(list)
     for scene, key in zip(frames["scene"], frames["key"]):
@@ -358,11 +361,11 @@ def _make_parts(source: Source, out: Path, damaged: Collection[str], record: Cal
     touched = {name[:end] for name in names for end, letter in enumerate(name) if letter == "."}
     parts = [part for scene in source.scenes() for part in split_scene(source, scene)]
     for part in parts:
-        whole = len(keys[part.scene]) == source.frame_count(part.scene)  # else no frame's part is known, as of windows
-        own = keys[part.scene][part.first : part.first + part.frames] if whole else keys[part.scene]
+        whole = len(keys[part.scene]) == source.frame_count(part.scene)  # else frames can't be assigned to parts
+        part_keys = keys[part.scene][part.first : part.first + part.frames] if whole else keys[part.scene]
         moving = {trace_path(part.scene), navigation_path(part.scene)}
-        if touched.isdisjoint(own) and (part.number or moving.isdisjoint(damaged)):
-            part.folder(out / WORK).mkdir(parents=True)  # as if it were recorded
+        if touched.isdisjoint(part_keys) and (part.number or moving.isdisjoint(damaged)):
+            part.folder(out / WORK).mkdir(parents=True)  # counts as recorded, so that it is skipped
     (out / WORK).mkdir(exist_ok=True)
     record()
     made = {trace_path(scene): out / WORK / scene / TRAFFIC for scene in keys}

@@ -1,1 +1,1 @@
-"""Simulated clock of federated rounds: from bytes, radio links and speeds to seconds."""
+"""Simulated clock of federated rounds: durations from message sizes, radio links and computing times."""

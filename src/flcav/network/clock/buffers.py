@@ -1,9 +1,9 @@
-"""Clock of buffered asynchronous rounds: clients begin again as soon as they may, and a round ends with a full buffer.
+"""Clock of buffered asynchronous rounds: clients train at their own pace, and a full buffer ends a round.
 
-Every client downloads the newest version of the weights, trains, uploads, and waits until a buffer with its update is
-full: so no version is trained on twice by a client, and no two updates of a buffer are of one client (the algorithm of
-Nguyen et al., AISTATS 2022, leaves that open). A client that is lost on the network begins again as soon as it is in
-the town and in coverage.
+Every client downloads the latest version of the weights, trains, uploads, and waits until a buffer with its update is
+full. Hence no client trains twice on the same version, and the updates of a buffer are of different clients (the
+algorithm of Nguyen et al., AISTATS 2022, leaves that open). A client whose update is lost on the network starts again
+as soon as it is in the town and in coverage.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,39 +16,41 @@ from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.clock.rounds import TIE, ClientPhases, Phase, RoundRules
 from flcav.network.radio.links import RadioLinks
 
-PATIENCE = 10  # passes through all scenes, with the longest training each, in which one update has to arrive
+PATIENCE = 10  # number of passes through all scenes, with the longest training each, in which an update has to arrive
 
 
 @dataclass(frozen=True)
 class BufferTiming:
     """A full buffer: time, updates with their versions of the weights, and the attempts that failed meanwhile."""
 
-    number: int  # from 1; the version of the weights that it leads to
-    start_s: float  # when the buffer before was full
+    number: int  # from 1; the version of the weights after it
+    start_s: float  # when the previous buffer was full
     end_s: float
     updates: tuple[ClientTiming, ...]  # in the order in which they arrived
-    versions: Mapping[str, int]  # that each update began with, by client
-    broken: tuple[ClientTiming, ...]  # attempts, some of them of one client
+    versions: Mapping[str, int]  # by client, the version of the weights that its update started from
+    broken: tuple[ClientTiming, ...]  # failed attempts, possibly several of a client
 
     def as_round(self) -> RoundTiming:
-        """Return the buffer as a round; its clients may have begun before the round."""
+        """Return the buffer as a round; its clients may have started before the round."""
         return RoundTiming(self.number, self.start_s, self.end_s, 0.0, 0.0, (*self.updates, *self.broken))
 
 
 def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
-    """Return the links of scenes that follow one another without a gap, and how long they last together [s].
+    """Return the links of scenes that follow one another without a gap, and their total duration [s].
 
-    The clock begins at 0 s. A vehicle that is not in a scene is absent in it. Raises `InputError` where all scenes
-    have one instant, or other units.
+    The clock starts at 0 s. A vehicle that is not in a scene is absent in it. Raises `InputError` where every scene has
+    a single instant, or the roadside units differ.
     """
     names = tuple(dict.fromkeys(name for links in scenes for name in links.vehicle))
-    first, spans = scenes[0], [float(links.time_s[-1] - links.time_s[0]) for links in scenes]
+    first = scenes[0]
+    spans = [float(links.time_s[-1] - links.time_s[0]) for links in scenes]
     if not sum(spans):
         raise InputError("scenes of one instant: vehicles that go on at their own pace need time to pass")
     if any(links.unit != first.unit for links in scenes):
         raise InputError("scenes with other roadside units")
     times, distances, states, losses = [], [], [], []
     for number, links in enumerate(scenes):
+        # Without the last instant, which coincides with the first of the next scene.
         times.append(links.time_s[:-1] - links.time_s[0] + sum(spans[:number]))
         shape = (len(links.time_s) - 1, len(names), len(first.unit))
         distance, state, loss = np.full(shape, np.nan), np.full(shape, -1, np.int8), np.full(shape, np.inf)
@@ -58,7 +60,7 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
         distances.append(distance)
         states.append(state)
         losses.append(loss)
-    joined = (np.concatenate(each) for each in (distances, states, losses))
+    joined = (np.concatenate(parts) for parts in (distances, states, losses))
     return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined), sum(spans)
 
 
@@ -66,23 +68,23 @@ class BufferClock(ClientPhases):
     """Clock of a region's clients, who train at their own pace and fill buffers; the scenes repeat in order."""
 
     def __init__(self, scenes: Sequence[RadioLinks], work: Sequence[ClientWork], size: int, rules: RoundRules) -> None:
-        """Begin at 0 s, with updates of `size` clients in a buffer; `work` is that of each time.
+        """Start at 0 s, with `size` updates in a full buffer; `work` is that of every training of a client.
 
-        Clients that no scene has are left out. Raises `InputError` as `chain_links`, and where fewer than `size` are
-        left.
+        Clients that are in no scene are left out. Raises `InputError` as `chain_links`, and where fewer than `size`
+        remain.
         """
         links, self._period_s = chain_links(scenes)
-        there = [each for each in work if each.client in links.vehicle]
-        if len(there) < size:
-            raise InputError(f"a buffer of {size} updates, and {len(there)} vehicles on the network")
-        super().__init__(links, there, 0, 0.0, rules)
+        in_scenes = [client_work for client_work in work if client_work.client in links.vehicle]
+        if len(in_scenes) < size:
+            raise InputError(f"a buffer of {size} updates, and {len(in_scenes)} vehicles on the network")
+        super().__init__(links, in_scenes, 0, 0.0, rules)
         self._size, self._version, self._ended_s, self._limit_s = size, 0, 0.0, np.inf
         self._reach = links.rate_bps[:, self.column] > 0  # (T, K, U)
-        self._longest_s = PATIENCE * (self._period_s + max(each.compute_s for each in there))
+        self._longest_s = PATIENCE * (self._period_s + max(client_work.compute_s for client_work in in_scenes))
         self.phase[:] = Phase.OVER
-        self._waits = np.zeros(len(there), bool)  # whether an update is in the buffer
-        self._begun = np.zeros(len(there), np.int64)  # version
-        self._arrived: list[int] = []  # clients, in the order of their updates
+        self._waits = np.zeros(len(in_scenes), bool)  # (K,) whether an update is in the buffer
+        self._begun = np.zeros(len(in_scenes), np.int64)  # (K,) version of the weights that training started from
+        self._arrived: list[int] = []  # clients in the order in which their updates arrived
         self._broken: list[ClientTiming] = []
 
     @property
@@ -92,43 +94,47 @@ class BufferClock(ClientPhases):
 
     @property
     def _phase_s(self) -> float:
-        """The time in the present pass through the scenes [s], and what counts as the same time."""
+        """The time since the start of the current pass through the scenes [s], plus `TIE`."""
         return (self.time_s + TIE) % self._period_s
 
     @property
     def until_next_s(self) -> float:
-        """The time until the next instant, or until the clock is to stop [s]."""
+        """The time until the next instant, or until the limit of `hold` [s]."""
         n = self.instant
         following = float(self.links.time_s[n + 1]) if n + 1 < len(self.links.time_s) else self._period_s
         return min(following - self._phase_s + TIE, self._limit_s - self.time_s)
 
     @property
     def ends(self) -> bool:
-        """Whether the trace ends here: scenes repeat."""
+        """Whether the trace ends: never, since scenes repeat."""
         return False
 
     def fill(self) -> BufferTiming:
         """Advance the clock until the buffer is full, and return it; raises `InputError` where no update arrives."""
         last_s = self.time_s
         while len(self._arrived) < self._size:
-            before = len(self._arrived)
+            arrived = len(self._arrived)
             self._step(begin=True)
-            last_s = self.time_s if len(self._arrived) > before else last_s
+            last_s = self.time_s if len(self._arrived) > arrived else last_s
             if self.time_s - last_s > self._longest_s:
                 raise InputError(f"no vehicle's update arrives within {self._longest_s:g} s on the network")
-        full, self._arrived = self._arrived[: self._size], self._arrived[self._size :]
+        full = self._arrived[: self._size]
+        self._arrived = self._arrived[self._size :]
         number = self._version + 1
         updates = tuple(replace(self._timing(k), round=number) for k in full)
         versions = {self.work[k].client: int(self._begun[k]) for k in full}
-        broken = tuple(replace(each, round=number) for each in self._broken)
-        found = BufferTiming(number, self._ended_s, self.time_s, updates, versions, broken)
-        self._version, self._ended_s, self._broken, self._waits[full] = number, self.time_s, [], False
-        return found
+        broken = tuple(replace(timing, round=number) for timing in self._broken)
+        buffer = BufferTiming(number, self._ended_s, self.time_s, updates, versions, broken)
+        self._version = number
+        self._ended_s = self.time_s
+        self._broken = []
+        self._waits[full] = False
+        return buffer
 
     def hold(self, until_s: float) -> None:
-        """Advance the clock to `until_s` [s]: updates arrive, and no client begins before the server has new weights.
+        """Advance the clock to `until_s` [s]: updates arrive, and no client starts before the server has new weights.
 
-        In a time that is over nothing happens.
+        A time in the past has no effect.
         """
         self._limit_s = until_s
         while self.time_s < until_s - TIE:
@@ -136,7 +142,7 @@ class BufferClock(ClientPhases):
         self._limit_s = np.inf
 
     def _step(self, *, begin: bool) -> None:
-        """Advance the clock to the next event."""
+        """Advance the clock to the next event; clients start only with `begin`."""
         under_way = self.phase < Phase.OVER
         self._drop()
         self._broken += [self._timing(k) for k in np.flatnonzero(under_way & (self.phase == Phase.OVER)).tolist()]
@@ -152,7 +158,7 @@ class BufferClock(ClientPhases):
             self._waits[k] = True
 
     def _begin(self) -> None:
-        """Start the clients that neither train nor wait, and are in the town and in coverage."""
+        """Start the clients that neither train nor wait, and are in the town and in coverage of the nearest unit."""
         n = self.instant
         distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)
         nearest = distance.argmin(axis=1)

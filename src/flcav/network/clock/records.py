@@ -1,4 +1,4 @@
-"""Records of the clock of rounds: the work of each client, when it did what, and why its update did not arrive."""
+"""Records of the clock of rounds: work and times of each client, and why its update did not arrive."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -19,17 +19,17 @@ _TYPES: dict[Any, pa.DataType] = {str: pa.string(), int: pa.int64(), float: pa.f
 
 @dataclass(frozen=True)
 class ClientTiming:
-    """The time of one client in one round [s], on the trace's clock."""
+    """The times of one client in one round [s], on the trace's clock."""
 
     client: str  # e.g. "cav0"
     server: str  # edge server at the start of the round, e.g. "pole3"
     round: int
-    start_s: float  # when its edge server begins to send the model
-    download_s: float  # duration, as far as it came
+    start_s: float  # its edge server starts to send the model
+    download_s: float  # duration; until it was dropped, if it was
     compute_s: float
     upload_s: float
     end_s: float  # its update has arrived, or it was dropped
-    downloaded_bytes: int
+    downloaded_bytes: int  # received by it
     uploaded_bytes: int
     dropped: str  # why its update did not arrive, e.g. "left the town"; empty where it did
 
@@ -41,8 +41,8 @@ class RoundTiming:
     round: int  # from 1
     start_s: float
     end_s: float
-    wireline_down_s: float  # cloud to edge servers; 0 where the round takes no part in that
-    wireline_up_s: float  # edge servers to cloud
+    wireline_down_s: float  # duration from cloud to edge servers; 0 where the round does not start a cloud round
+    wireline_up_s: float  # duration from edge servers to cloud; 0 where the round does not end a cloud round
     clients: tuple[ClientTiming, ...]
 
     @property
@@ -88,16 +88,16 @@ def load_rounds(path: Path) -> tuple[RoundTiming, ...]:
         raise InputError(f"{path}: a table of rounds with an empty field")
     records = []
     for number, group in groupby(rows, key=lambda row: row["round"]):
-        own = list(group)
-        about = {field.name: own[0][f"round_{field.name}"] for field in _ROUND}
-        clients = (ClientTiming(**{field.name: row[field.name] for field in fields(ClientTiming)}) for row in own)
+        of_round = list(group)
+        about = {field.name: of_round[0][f"round_{field.name}"] for field in _ROUND}
+        clients = (ClientTiming(**{field.name: row[field.name] for field in fields(ClientTiming)}) for row in of_round)
         records.append(RoundTiming(round=number, clients=tuple(clients), **about))
     return tuple(records)
 
 
 @dataclass(frozen=True)
 class ClientWork:
-    """The work of a client in a round. Raises `InputError` for a negative number."""
+    """The work of a client in a round. Raises `InputError` for a number that is negative or not finite."""
 
     client: str  # a vehicle of the links
     download_bytes: int  # the model, from its edge server
@@ -112,20 +112,21 @@ class ClientWork:
 
 
 def work_of_messages(entries: Iterable[LedgerEntry], compute_s: Mapping[str, float]) -> dict[str, ClientWork]:
-    """Return the work of the clients of one round, by vehicle, with the bytes of its messages by wireless.
+    """Return the work of the clients of one round, by vehicle, with the bytes of their wireless messages.
 
-    A client of the ledger, "region/vehicle", is the vehicle; `compute_s` has its time to compute [s]. Raises
-    `InputError` for a vehicle that is not in `compute_s`, and for entries of several rounds, stages, tasks or regions.
+    The vehicle is the last part of a client's name in the ledger, "region/vehicle"; `compute_s` has its computing time
+    [s]. Raises `InputError` for a vehicle that is not in `compute_s`, and for entries of several rounds, stages, tasks
+    or regions.
     """
     moved: dict[str, Counter[str]] = {}
-    found = set()
+    rounds = set()
     for entry in entries:
         if entry.link == "wireless":
             region, _, vehicle = entry.client.rpartition("/")
-            found.add((entry.stage, entry.task, entry.round, region))
+            rounds.add((entry.stage, entry.task, entry.round, region))
             moved.setdefault(vehicle, Counter())[entry.direction] += entry.bytes
-    if len(found) > 1:
-        raise InputError(f"messages of {len(found)} rounds, stages, tasks or regions: those of one round are wanted")
+    if len(rounds) > 1:
+        raise InputError(f"messages of {len(rounds)} rounds, stages, tasks or regions: those of one round are wanted")
     if unknown := [vehicle for vehicle in moved if vehicle not in compute_s]:
         raise InputError(f"{unknown[0]}: has no time to compute")
     return {name: ClientWork(name, sizes["down"], compute_s[name], sizes["up"]) for name, sizes in moved.items()}

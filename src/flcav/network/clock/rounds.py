@@ -1,7 +1,7 @@
-"""Simulated clock of federated rounds: download and upload over links that change as vehicles move, and computing.
+"""Simulated clock of federated rounds: transfers over links whose rates change as vehicles move, and computing.
 
 All rates are constant between two events (an instant of the trace, the end of a transfer or of a computation), so that
-the bytes are the exact integral of the rates over time.
+the transferred bytes are the exact integral of the rates over time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -21,7 +21,7 @@ NO_COVERAGE = "out of coverage"
 NEARER = "nearer to {unit}"
 DEADLINE = "past the deadline"
 TRACE_ENDS = "the trace ends"
-TIE = 1e-9  # [s] within which events are at the same time
+TIE = 1e-9  # [s] within which events are simultaneous
 
 
 class RoundRules(Config):
@@ -50,18 +50,18 @@ class Phase(IntEnum):
 
 
 class ClientPhases:
-    """State of K clients on the clock: phase, what is left of it, and the time spent in each phase."""
+    """State of K clients on the clock: phase, remaining work, and the time spent in each phase."""
 
     def __init__(
         self, links: RadioLinks, work: Sequence[ClientWork], number: int, start_s: float, rules: RoundRules
     ) -> None:
         self.links, self.work, self.number, self.rules = links, tuple(work), number, rules
         self.time_s = start_s
-        self.start_s = np.full(len(work), start_s)  # (K,) of each client
-        self.column = np.array([links.vehicle.index(each.client) for each in work], dtype=np.int64)
-        self.received = links.received_dbm[:, self.column]  # (T, K, U)
+        self.start_s = np.full(len(work), start_s)  # (K,) [s]
+        self.column = np.array([links.vehicle.index(w.client) for w in work], dtype=np.int64)  # (K,) in the links
+        self.received = links.received_dbm[:, self.column]  # (T, K, U) [dBm]
         self.amount = np.array([(8 * w.download_bytes, w.compute_s, 8 * w.upload_bytes) for w in work], np.float64)
-        self.left = self.amount.copy()  # (K, 3) bits, seconds, bits
+        self.left = self.amount.copy()  # (K, 3) remaining bits, seconds, bits
         self.spent = np.zeros_like(self.amount)  # (K, 3) [s]
         self.phase = np.zeros(len(work), np.int64)
         self.stalled_since = np.full(len(work), np.inf)
@@ -94,10 +94,10 @@ class ClientPhases:
             self._advance(active)
 
     def _advance(self, active: Mask) -> None:
-        """Advance the active clients, one or more, to the next event, and end the phases that are complete."""
+        """Advance the active clients, at least one, to the next event, and end the phases that are complete."""
         transfers = active & (self.phase != Phase.COMPUTE)
         rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
-        speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s, or seconds a second
+        speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s; for computing, seconds per second
         self.stalled_since[~(transfers & (speed == 0))] = np.inf
         self.stalled_since[transfers & (speed == 0) & np.isinf(self.stalled_since)] = self.time_s
         rows = np.flatnonzero(active)
@@ -121,14 +121,15 @@ class ClientPhases:
 
     def _drop(self) -> None:
         """Drop the clients that cannot continue at this time, each for the first reason that applies."""
-        n, rules = self.instant, self.rules
+        n = self.instant
+        rules = self.rules
         distance = np.nan_to_num(self.links.distance_m[n, self.column], nan=np.inf)  # (K, U)
         nearest = distance.argmin(axis=1)
-        own = distance[np.arange(len(self.work)), self.server]
+        to_server = distance[np.arange(len(self.work)), self.server]
         late = self.time_s + TIE >= self.start_s + (np.inf if rules.deadline_s is None else rules.deadline_s)
         reasons = {
             LEFT_TOWN: ~self.links.present[n, self.column],
-            NEARER: distance.min(axis=1) + rules.handover_margin_m < own,
+            NEARER: distance.min(axis=1) + rules.handover_margin_m < to_server,
             NO_COVERAGE: self.stalled_since + rules.outage_s <= self.time_s + TIE,
             DEADLINE: late,
             TRACE_ENDS: np.full(len(self.work), self.ends),
@@ -158,18 +159,20 @@ class ClientPhases:
 def time_round(
     links: RadioLinks, work: Sequence[ClientWork], number: int, start_s: float, rules: RoundRules
 ) -> tuple[ClientTiming, ...]:
-    """Return the times of the clients of round `number`, which all begin at `start_s` [s] on the trace's clock.
+    """Return the times of the clients of round `number`, which all start at `start_s` [s] on the trace's clock.
 
-    Each is served by the nearest unit at that time and drops out once another is nearer, or it leaves the town, or has
-    no rate for `rules.outage_s`, or at the deadline, or where the trace ends; the others go on. Raises `InputError` for
-    a start outside the trace, no clients, unknown ones, one named twice, and one that is not in the town at the start.
+    A client is served by the unit that is nearest at that time. It drops out once another is nearer, or it leaves the
+    town, or has no rate for `rules.outage_s`, or at the deadline, or where the trace ends; the others continue. Raises
+    `InputError` for a start outside the trace, for no clients, unknown or repeated ones, and for one that is not in the
+    town at the start.
     """
-    first, last = float(links.time_s[0]), float(links.time_s[-1])
+    first = float(links.time_s[0])
+    last = float(links.time_s[-1])
     if not first <= start_s < last:
         raise InputError(f"round {number} begins at {start_s:g} s, but the trace is from {first:g} to {last:g} s")
     if not work:
         raise InputError(f"round {number}: no client is in the town at {start_s:g} s")
-    names = [each.client for each in work]
+    names = [client.client for client in work]
     if odd := [name for name in names if name not in links.vehicle or names.count(name) > 1]:
         raise InputError(f"round {number}: '{odd[0]}' is no vehicle of the links, or named twice")
     instant = int(np.searchsorted(links.time_s, start_s, side="right")) - 1
@@ -190,13 +193,13 @@ def simulate_rounds(
 ) -> tuple[RoundTiming, ...]:
     """Return the timed rounds of a federation over radio links, one after another.
 
-    Every vehicle of a round's work that is in the town when the round begins takes part. Before each group of edge
-    rounds of a cloud round the cloud's model reaches the edge servers, and after it theirs the cloud, over
-    `settings.wireline`. Raises `InputError` as `time_round`, and where there is no round, or no multiple of k.
+    Every vehicle with work in a round that is in the town at its start takes part. Before the edge rounds of a cloud
+    round the cloud's model is sent to the edge servers, and after them their models to the cloud, over
+    `settings.wireline`. Raises `InputError` as `time_round`, and where the number of rounds is 0, or no multiple of k.
 
     Args:
         links: radio links of the vehicles.
-        works: work of each round, by name of vehicle.
+        works: work of each round, by vehicle.
         settings: settings of the network and its clock.
         start_s: time at which the first round begins [s]; None: the start of the links' trace.
         edge_rounds_per_cloud_round: k, number of edge rounds in a cloud round; None: there is no cloud.
@@ -213,7 +216,9 @@ def simulate_rounds(
         up = wire if k is not None and number % k == 0 else 0.0
         begins = now + down
         instant = int(np.searchsorted(links.time_s, begins, side="right")) - 1
-        here = [name for name, there in zip(links.vehicle, links.present[instant].tolist()) if there and name in work]
+        here = [
+            name for name, present in zip(links.vehicle, links.present[instant].tolist()) if present and name in work
+        ]
         clients = time_round(links, [work[name] for name in here], number, begins, settings.rounds)
         ends = max(client.end_s for client in clients) + up
         records.append(RoundTiming(number, now, ends, down, up, clients))

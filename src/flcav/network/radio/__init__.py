@@ -1,1 +1,1 @@
-"""Radio links of vehicles to roadside units: line of sight, loss, link budget, rate."""
+"""Radio links of vehicles to roadside units: line of sight, path loss, link budget, rate."""

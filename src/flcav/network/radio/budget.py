@@ -23,7 +23,7 @@ from flcav.config import Config
 
 Environment = Literal["urban", "highway"]
 
-NEAREST_M = 3.0  # nearer links lose what they lose here: TR 36.885, Table A.1.4-1
+NEAREST_M = 3.0  # shorter links have the path loss of this distance: TR 36.885, Table A.1.4-1
 
 
 class PathState(IntEnum):
@@ -92,12 +92,14 @@ def blockage_moments_db(
 ) -> tuple[Array, Array]:
     """Return mean and standard deviation (...) [dB] of the loss by a vehicle in the direct path of a link.
 
-    `lower_m` and `higher_m` (...) are the heights of the two antennas, `blocker_m` (...) that of the vehicle [m].
-    TR 37.885, clause 6.2.1: case 1, both antennas above the vehicle: none; case 2, both below it; case 3, otherwise.
+    `distance_m` (...) is the length of the path, `lower_m` and `higher_m` (...) are the heights of the two antennas,
+    `blocker_m` (...) that of the vehicle [m]. TR 37.885, clause 6.2.1: case 1, both antennas above the vehicle: no
+    loss; case 2, both below it; case 3, otherwise.
     """
     distance = np.maximum(np.asarray(distance_m, dtype=np.float64), NEAREST_M)
     far = np.maximum(0.0, 15 * np.log10(distance) - 41)
-    above, below = np.greater(lower_m, blocker_m), np.less(higher_m, blocker_m)
+    above = np.greater(lower_m, blocker_m)
+    below = np.less(higher_m, blocker_m)
     mean = np.where(above, 0.0, np.where(below, 9.0, 5.0) + far)
     return mean, np.broadcast_to(np.where(above, 0.0, np.where(below, 4.5, 4.0)), mean.shape)
 
@@ -117,8 +119,8 @@ def correlate_along_path(moved_m: Array, correlation_m: Array, draws: Array) -> 
     """Return a standard normal process (T, ...) that is correlated along a path, from independent draws (T, ...).
 
     S(n) = r S(n - 1) + sqrt(1 - r^2) N(n) with r = exp(-D / D_corr): TR 36.885, clause A.1.4, to which TR 37.885,
-    clause 6.2.2, refers. `moved_m` (T, ...) is the distance D from the instant before [m], infinite where the path
-    begins anew; `correlation_m` (T, ...) is D_corr [m]. Row 0 of `moved_m` is not used.
+    clause 6.2.2, refers. `moved_m` (T, ...) is the distance D from the previous instant [m], infinite where a new path
+    starts; `correlation_m` (T, ...) is D_corr [m]. Row 0 of `moved_m` is not used.
     """
     process = np.array(draws, dtype=np.float64)
     kept = np.exp(-moved_m / correlation_m)
@@ -128,12 +130,12 @@ def correlate_along_path(moved_m: Array, correlation_m: Array, draws: Array) -> 
 
 
 def _by_state(state: ArrayLike, environment: Environment, field: str) -> Array:
-    """Return a field of the law of each state (...)."""
+    """Return a field of the path loss law of each state (...)."""
     laws = LAWS[environment]
     states = np.asarray(state, dtype=np.int64)
     if unknown := set(np.unique(states).tolist()) - set(laws):
         raise ValueError(f"the {environment} environment has no state {PathState(min(unknown)).name}")
-    return np.array([getattr(laws[each], field) if each in laws else np.nan for each in PathState])[states]
+    return np.array([getattr(laws[path], field) if path in laws else np.nan for path in PathState])[states]
 
 
 THERMAL_DBM_HZ = -174.0  # thermal noise at 290 K
@@ -169,7 +171,7 @@ def noise_dbm(bandwidth_hz: ArrayLike, noise_figure_db: float) -> Array:
 
 
 def received_dbm(loss_db: ArrayLike, radio: Radio) -> Array:
-    """Return the power (...) [dBm] that arrives over links with losses (...) [dB], antennas included."""
+    """Return the received power (...) [dBm] over links with losses (...) [dB], antenna gains included."""
     return radio.power_dbm + 2 * radio.antenna_gain_dbi - np.asarray(loss_db, dtype=np.float64)
 
 
@@ -187,23 +189,24 @@ def spectral_efficiency(sinr_db: ArrayLike, radio: Radio) -> Array:
 
 
 def lone_rate_bps(received: ArrayLike, radio: Radio) -> Array:
-    """Return the rates (...) [bit/s] of signals (...) [dBm] that have the whole band, without interference."""
+    """Return the rates (...) [bit/s] for received powers (...) [dBm] with the whole band and without interference."""
     sinr_db = np.asarray(received, dtype=np.float64) - noise_dbm(radio.bandwidth_hz, radio.noise_figure_db)
     return radio.bandwidth_hz * spectral_efficiency(sinr_db, radio)
 
 
 def shared_rates_bps(received: Array, server: Ints, active: Mask, radio: Radio) -> Array:
-    """Return the rates (V,) [bit/s] of vehicles that transmit at once; 0 where one is not `active` (V,).
+    """Return the rates (V,) [bit/s] of vehicles that transmit simultaneously; 0 where one is not `active` (V,).
 
-    `received` (V, U) is the power of each vehicle at each edge server [dBm], `server` (V,) the column of its own. The n
-    active vehicles of a server have 1/n of the band each, at full power, and do not disturb each other. Those of the
-    other servers use the same band; on average over it their power is spread evenly.
+    `received` (V, U) is the power of each vehicle at each edge server [dBm], `server` (V,) the column of the vehicle's
+    edge server. The n active vehicles of a server have 1/n of the band each, at full power, and are orthogonal. Those
+    of the other servers interfere in the same band, with a power that is spread evenly over it on average.
     """
     power = np.where(active[:, None], 10 ** (received / 10), 0.0)  # [mW]
-    own = server[:, None] == np.arange(received.shape[1])
-    interference = np.where(own, 0.0, power).sum(axis=0)  # (U,) in the whole band
-    sharing = np.maximum((own & active[:, None]).sum(axis=0), 1)  # (U,)
+    serving = server[:, None] == np.arange(received.shape[1])
+    interference = np.where(serving, 0.0, power).sum(axis=0)  # (U,) in the whole band
+    sharing = np.maximum((serving & active[:, None]).sum(axis=0), 1)  # (U,)
     noise = 10 ** (noise_dbm(radio.bandwidth_hz, radio.noise_figure_db) / 10)
+    # A vehicle concentrates its power in its share of the band; interference and noise there are that share of all.
     share = 1 / sharing[server]
     signal = power[np.arange(len(server)), server]
     with np.errstate(divide="ignore"):

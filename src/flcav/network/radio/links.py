@@ -1,8 +1,8 @@
 """Radio links of the connected vehicles of a trace to roadside units, instant by instant; wireline links to the cloud.
 
 The direct path between a vehicle and a unit is free, blocked by vehicles, or blocked by buildings. TR 37.885 draws the
-state of urban links along a street by distance; here it follows from the town and its traffic: buildings are the town's
-meshes, and vehicles are boxes as in the report.
+state of urban links along a street at random by distance; here it is determined by ray casting: buildings are the
+town's meshes, and vehicles are boxes as in the report.
 """
 
 from collections.abc import Mapping, Sequence
@@ -30,12 +30,12 @@ from flcav.world.trace import Trace
 class RadioLinks:
     """Links of V vehicles to U roadside units at T instants of a trace; a state holds until the next instant."""
 
-    radio: Radio
+    radio: Radio  # settings
     time_s: Array  # (T,) ascending, the trace's clock
     vehicle: tuple[str, ...]  # (V,) track ids
     unit: tuple[str, ...]  # (U,) e.g. "pole3"
     distance_m: Array  # (T, V, U) between the antennas; NaN where the vehicle is absent
-    state: NDArray[np.int8]  # (T, V, U) a State; -1 where the vehicle is absent
+    state: NDArray[np.int8]  # (T, V, U) `PathState`; -1 where the vehicle is absent
     loss_db: Array  # (T, V, U) path loss, blockage and shadowing; infinite where the vehicle is absent
 
     @property
@@ -45,7 +45,7 @@ class RadioLinks:
 
     @property
     def received_dbm(self) -> Array:
-        """Return the power (T, V, U) [dBm] that arrives."""
+        """Return the received power (T, V, U) [dBm]."""
         return received_dbm(self.loss_db, self.radio)
 
     @property
@@ -55,7 +55,7 @@ class RadioLinks:
 
 
 def unit_positions(town: Town, poles: Sequence[int]) -> dict[str, Array]:
-    """Return the mounts (3,) [m, world] of a town's poles by the name of their agent; raises `InputError`."""
+    """Return the positions (3,) [m, world] of a town's poles by the name of their agent; raises `InputError`."""
     known = town.poles.id.tolist()
     if odd := [pole for pole in poles if pole not in known]:
         raise InputError(f"{town.name}: has no pole {odd[0]}; its poles are {', '.join(map(str, known))}")
@@ -75,7 +75,7 @@ def check_units(town: Town, units: Mapping[str, Array], radio: Radio) -> None:
 
 
 def walls_of(town: Town, radio: Radio) -> Assembly | None:
-    """Return the buildings that block links in the radio's environment; None on a highway, which has none."""
+    """Return the buildings that block links in the radio's environment; None on a highway, where there are none."""
     return raise_walls(town) if radio.environment == "urban" else None
 
 
@@ -84,17 +84,17 @@ def link_vehicles(
 ) -> RadioLinks:
     """Return the radio links of vehicles to roadside units.
 
-    A vehicle's antenna is in the middle of its roof. Draws are named by seed, vehicle, unit and blocking vehicle, so
-    that another unit changes no other link; the loss by a vehicle in the path keeps its draw as long as that vehicle is
-    there. Raises `InputError` for an unknown vehicle, and as `check_units`.
+    A vehicle's antenna is in the middle of its roof. Random streams are named by seed, vehicle, unit and blocking
+    vehicle, so that a link does not depend on other units; on a link a blocking vehicle has the same draw at all
+    instants. Raises `InputError` for an unknown vehicle, and as `check_units`.
 
     Args:
-        town: the town, whose buildings are in the way.
+        town: the town, whose buildings block links.
         trace: its traffic.
         vehicles: track ids of the trace.
         units: name -> (3,) position of the unit's antenna [m, world].
         radio: settings of the links.
-        seed: seed of shadowing and losses.
+        seed: seed of shadowing and of losses by blocking vehicles.
     """
     check_units(town, units, radio)
     actors = trace.actor.tolist()
@@ -104,8 +104,9 @@ def link_vehicles(
     sites = np.array(list(units.values()), dtype=np.float64)
     walls = walls_of(town, radio)
     shape = (len(trace.time_s), len(carriers), len(sites))
-    distance, state = np.full(shape, np.nan), np.full(shape, -1, np.int8)
-    blocker = np.full(shape, -1, np.int64)  # actors
+    distance = np.full(shape, np.nan)
+    state = np.full(shape, -1, np.int8)
+    blocker = np.full(shape, -1, np.int64)  # (T, V, U) actors
     antenna = trace.position[:, carriers] + trace.size[carriers] * (0.0, 0.0, 1.0)  # (T, V, 3)
     for n in range(shape[0]):
         here = np.flatnonzero(trace.present[n, carriers])
@@ -124,33 +125,37 @@ def link_vehicles(
 class _Paths(NamedTuple):
     """Geometry of the direct paths; `distance_m` and `state` as in `RadioLinks`."""
 
-    distance_m: Array  # (T, V, U)
+    distance_m: Array  # (T, V, U) [m]
     state: NDArray[np.int8]  # (T, V, U)
     antenna: Array  # (T, V, 3) of the vehicles [m, world]
-    site: Array  # (U, 3)
-    blocker: Ints  # (T, V, U) the actor in the path; -1 for none
+    site: Array  # (U, 3) of the units [m, world]
+    blocker: Ints  # (T, V, U) the actor that blocks the path; -1 for none
 
 
 def _losses(
     paths: _Paths, trace: Trace, vehicles: Sequence[str], units: Sequence[str], radio: Radio, seed: int
 ) -> Array:
-    """Return the losses (T, V, U) [dB] of the paths; any number where a vehicle is absent."""
-    state, distance = np.maximum(paths.state, 0), np.nan_to_num(paths.distance_m, nan=1.0)
-    shadow, blockage = np.zeros(distance.shape), np.zeros(distance.shape)  # standard normal draws
+    """Return the losses (T, V, U) [dB] of the paths; undefined where a vehicle is absent."""
+    state = np.maximum(paths.state, 0)
+    distance = np.nan_to_num(paths.distance_m, nan=1.0)
+    # Standard normal draws.
+    shadow = np.zeros(distance.shape)
+    blockage = np.zeros(distance.shape)
     if radio.shadowing:
         for (v, vehicle), (u, unit) in product(enumerate(vehicles), enumerate(units)):
             shadow[:, v, u] = stream(seed, "shadowing", vehicle, unit).standard_normal(len(shadow))
             for actor in sorted({*paths.blocker[:, v, u].tolist()} - {-1}):
                 draws = stream(seed, "blockage", vehicle, unit, str(trace.actor[actor]))
                 blockage[paths.blocker[:, v, u] == actor, v, u] = draws.standard_normal()
-    antenna_m, unit_m = paths.antenna[:, :, None, 2], paths.site[:, 2]
-    tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A)
+    antenna_m = paths.antenna[:, :, None, 2]
+    unit_m = paths.site[:, 2]
+    tops = trace.position[..., 2] + trace.size[:, 2]  # (T, A) [m]
     top_m = np.take_along_axis(tops, paths.blocker.reshape(len(tops), -1) % tops.shape[1], axis=1)
     blocked = laws.blockage_db(
         distance, np.minimum(antenna_m, unit_m), np.maximum(antenna_m, unit_m), top_m.reshape(distance.shape), blockage
     )
     moved = np.linalg.norm(np.diff(paths.antenna, axis=0, prepend=np.nan), axis=-1)
-    moved = np.nan_to_num(moved, nan=np.inf)[:, :, None]  # a path begins anew after an absence
+    moved = np.nan_to_num(moved, nan=np.inf)[:, :, None]  # the process starts anew after an absence
     correlation = laws.correlation_distance_m(state, radio.environment)
     shadowing = laws.shadowing_sigma_db(state, radio.environment) * laws.correlate_along_path(
         moved, correlation, shadow
@@ -166,8 +171,8 @@ BLOCKING = ("car", "van", "truck", "bus")  # the vehicle types of TR 37.885, cla
 class PathStates:
     """States of the direct paths from N antennas to U sites."""
 
-    state: NDArray[np.int8]  # (N, U) a State
-    blocker: Ints  # (N, U) row of the tallest vehicle in the path; -1 where none is
+    state: NDArray[np.int8]  # (N, U) `PathState`
+    blocker: Ints  # (N, U) row of the highest vehicle in the path; -1 where there is none
 
 
 def raise_walls(town: Town) -> Assembly:
@@ -194,8 +199,8 @@ def find_sight(
 ) -> PathStates:
     """Return the states of the paths from antennas (N, 3) to sites (U, 3) [m], all in the frame of the boxes.
 
-    `walls` are the buildings, None where there are none.
-    `carrier` (N,) is the row in `vehicles` of the vehicle that carries each antenna, -1 for none: it does not block.
+    `walls` are the buildings, None where there are none. `carrier` (N,) is the row in `vehicles` of the vehicle that
+    carries each antenna and does not block its paths; -1 for none.
     """
     starts = np.repeat(antennas, len(sites), axis=0)
     ends = np.tile(sites, (len(antennas), 1))
@@ -214,10 +219,10 @@ def find_sight(
 
 
 def _occlude(walls: Assembly, starts: Array, ends: Array) -> Mask:
-    """Return (S,) whether a wall is between starts and ends (S, 3) [m]."""
+    """Return (S,) whether a wall intersects the segments from `starts` to `ends` (S, 3) [m]."""
     length = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(length, 1e-9)[:, None]
-    return walls.find_occluded(*(each.astype(np.float32) for each in (starts, directions, length)))
+    return walls.find_occluded(*(array.astype(np.float32) for array in (starts, directions, length)))
 
 
 class Wireline(Config):

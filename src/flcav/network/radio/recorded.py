@@ -15,12 +15,12 @@ from flcav.network.radio.budget import PathState, Radio, lone_rate_bps, path_los
 from flcav.network.radio.links import RadioLinks, check_units, find_sight, link_vehicles, unit_positions, walls_of
 from flcav.world.map.town import Town
 
-POLE = re.compile(r"pole([0-9]{1,9})")  # what agents on poles are called
+POLE = re.compile(r"pole([0-9]{1,9})")  # names of agents on poles
 
 
 @dataclass(frozen=True)
 class RecordedScene:
-    """The links of the connected vehicles of a scene, with the town, units and paths that they follow from."""
+    """The links of the connected vehicles of a scene, with the town, units and paths that determine them."""
 
     scene: str
     town: Town
@@ -48,7 +48,8 @@ def link_scene(
     name = scenes[0] if scene is None else scene
     if name not in scenes:
         raise InputError(f"{data.folder}: no scene '{name}'; the first is '{scenes[0]}'")
-    trace, town = data.trace(name), data.town()
+    trace = data.trace(name)
+    town = data.town()
     if trace is None or town is None:
         raise InputError(f"{data.folder}: has no {'traffic' if trace is None else 'town'}, which radio links need")
     agents = list(dict.fromkeys(key.agent for key in data.keys if key.scene == name))
@@ -66,7 +67,7 @@ def link_scene(
 
 @dataclass(frozen=True)
 class LinkSummary:
-    """The link of a vehicle to a unit while it is in the town; rates are those of `RadioLinks.rate_bps`."""
+    """The link of a vehicle to a unit while the vehicle is in the town; rates are those of `RadioLinks.rate_bps`."""
 
     vehicle: str
     unit: str
@@ -75,7 +76,7 @@ class LinkSummary:
     most_mbps: float
     nearest_m: float
     farthest_m: float
-    los: float  # fraction of the instants
+    los: float  # fractions of the instants in each state
     nlosv: float
     nlos: float
 
@@ -83,58 +84,63 @@ class LinkSummary:
 def summarise_links(links: RadioLinks) -> tuple[LinkSummary, ...]:
     """Return a summary of every link whose vehicle is in the town at some instant, vehicle by vehicle."""
     rates = links.rate_bps / 1e6
-    found = []
+    summaries = []
     for v, vehicle in enumerate(links.vehicle):
         here = links.present[:, v]
         if not here.any():
             continue
         for u, unit in enumerate(links.unit):
-            rate, distance, state = rates[here, v, u], links.distance_m[here, v, u], links.state[here, v, u]
+            rate = rates[here, v, u]
+            distance = links.distance_m[here, v, u]
+            state = links.state[here, v, u]
             numbers = (rate.mean(), rate.min(), rate.max(), distance.min(), distance.max())
-            shares = ((state == each).mean() for each in (PathState.LOS, PathState.NLOSV, PathState.NLOS))
-            found.append(LinkSummary(vehicle, unit, *map(float, (*numbers, *shares))))
-    return tuple(found)
+            shares = ((state == path_state).mean() for path_state in (PathState.LOS, PathState.NLOSV, PathState.NLOS))
+            summaries.append(LinkSummary(vehicle, unit, *map(float, (*numbers, *shares))))
+    return tuple(summaries)
 
 
 ANTENNA_M = 1.6  # height of a vehicle's antenna: TR 37.885, clause 6.1.2, type 2
-FINEST_M = 0.5
+FINEST_M = 0.5  # least step of the grid
 
 
 @dataclass(frozen=True)
 class Coverage:
-    """Median rates on a grid of X times Y places in a town, at the unit that serves each best."""
+    """Median rates on a grid of X times Y places in a town, each served by the unit of least path loss."""
 
     unit: tuple[str, ...]  # (U,)
     site: Array  # (U, 3) [m, world]
     x: Array  # (X,) centres of the cells [m, world]
-    y: Array  # (Y,)
+    y: Array  # (Y,) [m, world]
     rate_bps: Array  # (Y, X)
-    state: NDArray[np.int8]  # (Y, X) State.LOS or State.NLOS, to the unit that serves
+    state: NDArray[np.int8]  # (Y, X) `PathState` LOS or NLOS, to the serving unit
 
 
 def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: float = 2.0) -> Coverage:
     """Return the radio coverage of a town by roadside units, on a grid.
 
-    Rates are those of a vehicle alone in the band, without shadowing: medians over it. Raises `InputError` as
-    `links.check_units`, and for a step below `FINEST_M`.
+    Rates are those of a vehicle alone in the band, without shadowing, which is their median over it. Raises
+    `InputError` as `links.check_units`, and for a step below `FINEST_M`.
 
     Args:
         town: the town.
         units: name -> (3,) position of the unit's antenna [m, world].
         radio: settings of the links.
-        step_m: distance of the grid's points [m].
+        step_m: distance between the grid's points [m].
     """
     check_units(town, units, radio)
     if not step_m >= FINEST_M:
         raise InputError(f"a grid of {step_m:g} m: at least {FINEST_M:g} m are wanted")
     sites = np.array(list(units.values()), dtype=np.float64)
-    walls, nobody = walls_of(town, radio), Boxes.empty()
+    walls = walls_of(town, radio)
+    no_vehicles = Boxes.empty()
     x_low, y_low, x_high, y_high = town.bounds
-    x, y = np.arange(x_low + step_m / 2, x_high, step_m), np.arange(y_low + step_m / 2, y_high, step_m)
-    rate, state = np.empty((len(y), len(x))), np.empty((len(y), len(x)), np.int8)
+    x = np.arange(x_low + step_m / 2, x_high, step_m)
+    y = np.arange(y_low + step_m / 2, y_high, step_m)
+    rate = np.empty((len(y), len(x)))
+    state = np.empty((len(y), len(x)), np.int8)
     for row, north in enumerate(y):
         places = np.stack((x, np.full(len(x), north), np.full(len(x), ANTENNA_M)), axis=1)
-        seen = find_sight(places, sites, walls, nobody).state  # (X, U)
+        seen = find_sight(places, sites, walls, no_vehicles).state  # (X, U)
         distance = np.linalg.norm(places[:, None] - sites, axis=-1)
         loss = path_loss_db(distance, seen, radio.frequency_ghz, radio.environment)
         best = loss.argmin(axis=1)[:, None]

@@ -1,8 +1,8 @@
 """MLGRA (multi-layer graph resource allocation): samples, edge rounds and cloud rounds per task under uplink budgets.
 
-Plans are in whole numbers and within both budgets. The objective is the weighted error (`solvers.weighted`), the
-largest error (`solvers.fairness`), or the area of the accuracy polygon (`solvers.area`), which is maximised. Plans for
-the first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3), 2023, solved exactly.
+Plans are in integers and within both budgets. The objective is the weighted error (`solvers.weighted`), the largest
+error (`solvers.fairness`), or the area of the accuracy polygon (`solvers.area`), which is maximised. Plans for the
+first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3), 2023, solved exactly.
 """
 
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ NO_CERTIFICATE = "the area is not concave in the plan: this is the best of sever
 
 @dataclass(frozen=True)
 class LearnerError:
-    """The predicted error of one member of a cluster."""
+    """The predicted error of a member of a cluster."""
 
     name: str
     predicted_error: float
@@ -39,7 +39,7 @@ class LearnerError:
 
 @dataclass(frozen=True)
 class TaskAllocation:
-    """The plan of one task: its samples and rounds, predicted error and uplink cost."""
+    """The plan of a task: its samples and rounds, predicted error and uplink cost."""
 
     name: str
     samples: int
@@ -55,10 +55,10 @@ class TaskAllocation:
 
 @dataclass(frozen=True)
 class Dual:
-    """A solution of the Lagrangian dual over whole plans, which proves a lower bound by itself.
+    """A solution of the Lagrangian dual over integer plans, which proves a lower bound by itself.
 
-    Of the weighted error the bound is the least Lagrangian, sum of errors + multipliers * (cost - budget). Of the
-    largest error it is a level: at prices equal to the multipliers, no plan of less costs as little as the budgets.
+    For the weighted error the bound is the least Lagrangian, sum of errors + multipliers * (cost - budget). For the
+    largest error it is a level: at prices equal to the multipliers, every plan below it costs more than the budgets.
     """
 
     multipliers: tuple[float, ...]  # (L,) per unit of each budget: wireless, wireline [MB], then of clocks [s]
@@ -98,11 +98,11 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     """Return the best plan within both budgets, with its certificate: MLGRA of Wang et al., IEEE Network 37(3), 2023.
 
     It is sought to a relative `gap`, of at most 1e-9 for up to `EXACT_TASKS` tasks. Robust plans minimise the upper
-    bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum by each budget,
-    times 1000 MB: a shadow price at these budgets, not a forecast of what 1000 MB more bring, for which see
-    `budget_sweep.compute_savings`. Of limits of time only the problem's `shared_clock` and `clocks` are kept; for those
-    of vehicles with names see `fleet.allocate_fleet`. Raises `Infeasible`, naming the budget, the cost of the least
-    plan within the limits and the excess, and `InputError` where the solver cannot handle the problem's numbers.
+    bands of the learning curves. `marginal_error_per_gb` is the derivative of the continuous optimum with respect to
+    each budget, times 1000 MB: a shadow price at these budgets, not a forecast of the gain from 1000 MB more, for which
+    see `budget_sweep.compute_savings`. Only the problem's `shared_clock` and `clocks` limit time; for the time of named
+    vehicles see `fleet.allocate_fleet`. Raises `Infeasible`, naming the budget, the cost of the least plan within the
+    limits and the excess, and `InputError` where the solver cannot handle the problem's numbers.
 
     >>> from flcav import allocate, load_problem
     >>> plan = allocate(load_problem("recipes/allocation/objects.yaml"))
@@ -111,15 +111,15 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     """
     if not isinstance(problem, Problem):
         raise InputError("allocate: a problem is wanted; flcav.load_problem(path) reads one")
-    asked = resolve_problem(problem)
+    resolved = resolve_problem(problem)
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
     method = _METHODS[problem.objective]
-    found = solve_branches(
-        asked, lambda branch: replace(method(branch, build_instance(branch, clocks), sought, clocks), branch=branch)
+    solved = solve_branches(
+        resolved, lambda branch: replace(method(branch, build_instance(branch, clocks), sought, clocks), branch=branch)
     )
-    best = (max if problem.objective == "area" else min)(found, key=lambda each: each.objective)
-    plans = build_task_plans(_call(problem, best.branch or asked), best.x)
-    bounds = [each.lower for each in found if each.lower is not None]
+    best = (max if problem.objective == "area" else min)(solved, key=lambda plan: plan.objective)
+    tasks = build_task_plans(_call(problem, best.branch or resolved), best.x)
+    bounds = [plan.lower for plan in solved if plan.lower is not None]
     lower = min(*bounds, best.objective) if bounds else None
     achieved = None if lower is None else relative_gap(best.objective, lower)
     return Allocation(
@@ -127,29 +127,30 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
         objective=best.objective,
         lower_bound=lower,
         gap=achieved,
-        tasks=plans,
-        used_mb=sum_prices(plans),
+        tasks=tasks,
+        used_mb=sum_prices(tasks),
         marginal_error_per_gb=LinkMegabytes(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
-        busy_s=_busy_s(asked, plans),
+        busy_s=_busy_s(resolved, tasks),
         note=NO_CERTIFICATE if lower is None else None,
-        warnings=(*_idle_horizon(problem), *_beyond(problem, plans)),
-        certificate=tuple(each.dual for each in found if each.dual is not None),
+        warnings=(*_idle_horizon(problem), *_beyond(problem, tasks)),
+        certificate=tuple(plan.dual for plan in solved if plan.dual is not None),
     )
 
 
 def _busy_s(problem: Problem, plans: Sequence[TaskAllocation]) -> float | None:
     """Return the time [s] on the problem's `shared_clock`; None where it has none."""
-    clock, k = shared_clock(problem), problem.edge_rounds_per_cloud_round
+    clock = shared_clock(problem)
+    k = problem.edge_rounds_per_cloud_round
     if clock is None:
         return None
-    return sum(each * (plan.edge_rounds + k * plan.cloud_rounds) for each, plan in zip(clock.per_round, plans))
+    return sum(train_s * (plan.edge_rounds + k * plan.cloud_rounds) for train_s, plan in zip(clock.per_round, plans))
 
 
 def _call(problem: Problem, branch: Problem) -> Problem:
-    """Return the problem with as many vehicles called as in one of its branches."""
+    """Return the problem with as many vehicles called as in `branch`, one of its branches."""
     tasks = tuple(
-        task if own.called is None else call_vehicles(task, *own.called, problem.edge_rounds_per_cloud_round)
-        for task, own in zip(problem.tasks, branch.tasks, strict=True)
+        task if chosen.called is None else call_vehicles(task, *chosen.called, problem.edge_rounds_per_cloud_round)
+        for task, chosen in zip(problem.tasks, branch.tasks, strict=True)
     )
     return problem.model_copy(update={"tasks": tasks})
 
@@ -160,7 +161,7 @@ def relative_gap(objective: float, lower: float) -> float:
 
 
 def resolve_problem(problem: Problem) -> Problem:
-    """Return the problem that is solved: with upper bands as curves if robust, importances as weights if given.
+    """Return the problem to solve: with upper bands as curves if it is robust, and importances as weights if given.
 
     The importance of a task is the performance lost when it is left out, `performance` - `performance_without`, at
     least 0; importances are scaled to sum to 1.
@@ -176,7 +177,7 @@ def resolve_problem(problem: Problem) -> Problem:
 
 
 def build_task_plans(problem: Problem, x: Array) -> tuple[TaskAllocation, ...]:
-    """Return the tasks' plans for x (3N,): samples, edge rounds and cloud rounds of each task in order."""
+    """Return the tasks' plans for x (3N,): samples, edge rounds and cloud rounds of the tasks, in order."""
     return tuple(_task_plan(problem, task, row) for task, row in zip(problem.tasks, x.reshape(-1, 3)))
 
 
@@ -197,30 +198,30 @@ def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskAlloca
 
 
 def sum_prices(plans: tuple[TaskAllocation, ...]) -> LinkMegabytes:
-    """Return the total cost of the plans."""
+    """Return the total cost of the plans on each link [MB]."""
     return LinkMegabytes(sum(plan.wireless_mb for plan in plans), sum(plan.wireline_mb for plan in plans))
 
 
 def weighted_error(problem: Problem, plans: Sequence[TaskAllocation]) -> float:
-    """Return the weighted sum of the predicted errors; of robust plans, of the upper errors."""
+    """Return the weighted sum of the predicted errors, for robust plans of the upper errors."""
     errors = (plan.predicted_error if plan.upper_error is None else plan.upper_error for plan in plans)
     return sum(task.weight * error for task, error in zip(problem.tasks, errors, strict=True))
 
 
 def evaluate_objective(problem: Problem, plans: Sequence[TaskAllocation]) -> float:
-    """Return the value of the problem's objective at the plans: weighted error, largest error or area."""
+    """Return the value of the problem's objective for the plans: weighted error, largest error or area."""
     if problem.objective == "weighted":
         return weighted_error(problem, plans)
     counts = [(plan.samples, plan.edge_rounds, plan.cloud_rounds) for plan in plans]
     k = problem.edge_rounds_per_cloud_round
     errors = [
-        float(learner.curve.error(*own, k=k)) for task, own in zip(problem.tasks, counts) for learner in task.learners
+        float(learner.curve.error(*row, k=k)) for task, row in zip(problem.tasks, counts) for learner in task.learners
     ]
     return max(errors) if problem.objective == "max-min" else area(1 - np.array(errors))
 
 
 def _idle_horizon(problem: Problem) -> tuple[str, ...]:
-    """Return a warning where the problem has a horizon, and nothing in it takes time."""
+    """Return a warning where the problem has a horizon but nothing in it takes time."""
     if problem.horizon_s is None or any(
         task.uplink_mbps or task.train_s or task.vehicle_train_s for task in problem.tasks
     ):
@@ -229,7 +230,7 @@ def _idle_horizon(problem: Problem) -> tuple[str, ...]:
 
 
 def _beyond(problem: Problem, plans: tuple[TaskAllocation, ...]) -> tuple[str, ...]:
-    """Return a warning for each quantity planned beyond the range in which its curve was measured."""
+    """Return a warning for every quantity planned beyond the range in which its curve was measured."""
     return tuple(
         f"task {task.name!r}: {getattr(plan, name)} {name.replace('_', ' ')} are beyond the {most:g} that its curve "
         "was measured to"

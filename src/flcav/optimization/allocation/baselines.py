@@ -1,6 +1,6 @@
 """Baseline allocations without joint optimisation: equal shares, most messages, and the article's rounded optimum.
 
-Plans are in whole numbers and within both budgets.
+Plans are in integers and within both budgets.
 """
 
 from collections.abc import Callable, Sequence
@@ -48,20 +48,20 @@ class Baseline:
 def baseline(problem: Problem, name: str) -> Baseline:
     """Return the plan of `BASELINES[name]` with its predicted objective.
 
-    Baselines call as many vehicles as may be, and respect the fleet's budgets alone: `note` says where the vehicles'
-    samples or links do not suffice. Raises `Infeasible` as `allocate` does, `InputError` for an unknown name.
+    Baselines call as many vehicles as allowed, and respect only the fleet's budgets: `note` says where the vehicles'
+    samples or links do not suffice. Raises `Infeasible` as `allocate` does, and `InputError` for an unknown name.
     """
     if name not in BASELINES:
         raise InputError(f"baseline {shorten(name)}: unknown; known baselines: {', '.join(BASELINES)}")
     problem = problem.model_copy(update={"tasks": tuple(map(_call_most, problem.tasks))})
-    asked = resolve_problem(problem)
-    plans = build_task_plans(problem, BASELINES[name](asked, build_instance(asked)))
+    resolved = resolve_problem(problem)
+    plans = build_task_plans(problem, BASELINES[name](resolved, build_instance(resolved)))
     try:
         split_plan(problem, plans)
     except Infeasible:
         note = NOT_IN_TIME if trains(problem) else NOT_CARRIED
-        return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans), note)
-    return Baseline(name, evaluate_objective(asked, plans), plans, sum_prices(plans))
+        return Baseline(name, evaluate_objective(resolved, plans), plans, sum_prices(plans), note)
+    return Baseline(name, evaluate_objective(resolved, plans), plans, sum_prices(plans))
 
 
 def _call_most(task: AllocationTask) -> AllocationTask:
@@ -97,8 +97,8 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
     x = low.copy()
     for number, task in enumerate(problem.tasks):
         alone = problem.model_copy(update={"tasks": (task,)})
-        own = slice(number, number + 1)
-        limited = _limited(alone, low[own], high[own], low[number] @ cost[number] + share)
+        row = slice(number, number + 1)
+        limited = _limited(alone, low[row], high[row], low[number] @ cost[number] + share)
         x[number] = _minimise(limited)
     return x.ravel()
 
@@ -120,10 +120,10 @@ def _least(plans: Sequence[tuple[float, Array]]) -> Array:
 
 
 def max_throughput(problem: Problem, made: Instance) -> Array:
-    """Return the plan (3N,) of maximum throughput: most messages, where a sample and a model update count 1 each."""
+    """Return the plan (3N,) of maximum throughput: most messages, where a sample or a model update counts as one."""
     k = problem.edge_rounds_per_cloud_round
     groups = [task.edge_groups for task in problem.tasks]
-    messages = np.array([(1, sum(own), len(own) + k * sum(own)) for own in groups], dtype=np.float64).ravel()
+    messages = np.array([(1, sum(sizes), len(sizes) + k * sum(sizes)) for sizes in groups], dtype=np.float64).ravel()
     found = milp(
         -messages,
         integrality=np.ones(len(messages)),
@@ -138,7 +138,7 @@ def max_throughput(problem: Problem, made: Instance) -> Array:
 def round_down_optimum(problem: Problem, _made: Instance) -> Array:
     """Return the continuous optimum rounded down (3N,), the last step of the article's allocator.
 
-    Where each cloud round costs accuracy, it is that of the error's convex envelope.
+    Where every cloud round costs accuracy, the optimum is that of the error's convex envelope.
     """
     return _least(solve_branches(problem, _round_down))
 
@@ -157,9 +157,9 @@ def _round_down(branch: Problem) -> tuple[float, Array]:
 
 
 def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:
-    """Return `problem` with other limits (N, 3) and budgets (L,): of both links, and the horizon if time is limited.
+    """Return `problem` with other limits (N, 3) and budgets (L,): of the links [MB], and the horizon [s] if it has one.
 
-    `price_once` comes on top of the wireless budget.
+    The constant cost `price_once` is added to the wireless budget.
     """
     tasks = []
     for task, least, most in zip(problem.tasks, low, high):

@@ -1,7 +1,7 @@
-"""Sensitivity to the budgets: the optimal objective over scaled budgets (a Pareto front), solved at each.
+"""Sensitivity to the budgets: the optimal objective at multiples of the budgets (a Pareto front), each solved anew.
 
-Plans are in whole samples and rounds, so the objective falls in steps: the gain of a larger budget is computed, not
-extrapolated from the derivative at the present one.
+Plans are in integers, so that the objective falls in steps: the gain of a larger budget is computed, not extrapolated
+from the derivative at the present one.
 """
 
 from collections.abc import Sequence
@@ -21,9 +21,9 @@ ADDED = (0.1, 0.5)  # shares of a budget that are added to it
 
 @dataclass(frozen=True)
 class BudgetPoint:
-    """The optimal objective at one pair of budgets."""
+    """The optimal objective at a pair of budgets."""
 
-    factor: float  # of the problem's own budgets, on the links that were scaled
+    factor: float  # of the problem's budgets, on the links that were scaled
     budgets_mb: LinkMegabytes
     objective: float
     lower_bound: float | None  # proven: no plan within these budgets has less; None for the area
@@ -46,11 +46,11 @@ class Saving:
 def sweep_budgets(
     problem: Problem, plan: Allocation, scaled: Sequence[str] = LINKS, factors: Sequence[float] = FACTORS
 ) -> tuple[BudgetPoint, ...]:
-    """Return the optimal objective at each of `factors`, ascending, times the budgets of the `scaled` links.
+    """Return the optimal objective at `factors`, ascending, times the budgets of the `scaled` links.
 
-    Factors whose budgets allow no plan are left out. `plan` is the one at the problem's own budgets (factor 1). The
-    plan of a smaller budget is kept where solving again finds no better one, which can happen where vehicles' links
-    limit the plans: it is within the larger budget too.
+    Factors whose budgets allow no plan are left out. `plan` is the plan at the problem's budgets (factor 1). The plan
+    of a smaller budget is kept where solving again finds no better one, as may happen where the vehicles' links limit
+    plans: it fits the larger budget, too.
     """
     points: list[BudgetPoint] = []
     best: Allocation | None = None
@@ -71,7 +71,7 @@ def sweep_budgets(
 
 
 def compute_savings(problem: Problem, plan: Allocation) -> tuple[Saving, ...]:
-    """Return the gains over `plan` of 10 % and of 50 % more budget on each link alone, each solved again."""
+    """Return the gains over `plan` from 10 % and from 50 % more budget on one link at a time, each solved anew."""
     found = []
     for link in LINKS:
         points = sweep_budgets(problem, plan, (link,), (1.0, *(1 + added for added in ADDED)))

@@ -1,4 +1,4 @@
-"""A plan beside other plans of its problem: at scaled budgets, with more of one budget, and by simpler methods."""
+"""Comparison of a plan with other plans of its problem: scaled budgets, one larger budget, and simpler methods."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -26,9 +26,9 @@ class PlanComparison:
 
 
 def compare_plan(problem: Problem, plan: Allocation, shares: Shares, savings: tuple[Saving, ...]) -> PlanComparison:
-    """Solve `problem` at multiples of its budgets and by each baseline, and return that beside its `plan`.
+    """Solve `problem` at multiples of its budgets and by every baseline; return the results with its `plan`.
 
-    Of a problem with one task "equal-tasks" is left out. Raises `Infeasible` as `baseline` does.
+    For a problem with one task "equal-tasks" is left out. Raises `Infeasible` as `baseline` does.
     """
     factors = FACTORS if plan.note is None else COARSE
     sweeps = {name: sweep_budgets(problem, plan, links, factors) for name, links in SCALED.items()}

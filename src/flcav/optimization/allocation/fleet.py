@@ -1,22 +1,22 @@
-"""Allocation under the fleet budgets and the limits of each vehicle: samples held, and its time within a horizon.
+"""Allocation under the fleet budgets and the limits of every vehicle: the samples it holds, and its time in a horizon.
 
 The budgets constrain the fleet as a whole, and the optimum within them may ask more of slow vehicles than `horizon_s`
-allows. Then relaxations are solved, each with one budget reduced by bisection until the plan can be split over the
-vehicles (`split_plan`). Where links alone take time:
+allows. In that case relaxations are solved, with one budget reduced by bisection until the plan can be split over the
+vehicles (`split_plan`). Where only sending takes time:
 
 - *all join*: every vehicle joins every round, as the budgets are priced; the wireless budget is reduced.
 - *one joins*: one vehicle per edge group joins each round, the least that a split needs; the wireless budget is
   replaced by what all links together carry within the horizon, and that is reduced.
 
-Where vehicles also take time to train, time is the third budget (`Clock`) and is reduced:
+Where vehicles also take time to train, time is the third budget (`Clock`), and is reduced:
 
 - *all join*: the slowest vehicle joins every round; with and without the time in which the fleet sends the samples.
-- *one joins*: one vehicle per edge group joins each round. The time of all vehicles, each weighted by its speed, is
-  limited to the horizon, and no split takes less of it than the quickest vehicles by weight would.
+- *one joins*: one vehicle per edge group joins each round. The time of all vehicles, weighted by speed, is limited
+  to the horizon, and no split takes less of it than the quickest vehicles by weight would.
 
-The problem without a horizon, and *one joins* at full size, are lower bounds of the error of any feasible plan; the
+The problem without a horizon, and *one joins* at full size, are lower bounds on the error of any feasible plan; the
 larger of the two bounds is kept. The best of the plans is returned, with its gap to that bound; its `certificate` is
-that of the problem without a horizon of vehicles with names.
+that of the problem without a horizon for named vehicles.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,37 +54,37 @@ Relaxation = Callable[[float], Allocation]  # the plan of a relaxation by the sh
 def allocate_fleet(problem: Problem) -> Carried:
     """Return the best plan that the vehicles can carry out, and each vehicle's share of it, by task.
 
-    Tasks that do not name their vehicles are planned under the budgets alone and have no shares. Raises `Infeasible`
-    where the limits ask for more than the budgets or the samples held, and `TooSlow` where no plan fits the horizon.
+    Tasks without named vehicles are planned under the budgets only and have no shares. Raises `Infeasible` where the
+    limits ask for more than the budgets or the samples held, and `TooSlow` where no plan fits the horizon.
     """
-    asked = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
-    plan = allocate(asked)
+    bounded = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
+    plan = allocate(bounded)
     try:
-        return _timed(asked, (plan, split_plan(asked, plan.tasks)))
+        return _timed(bounded, (plan, split_plan(bounded, plan.tasks)))
     except TooSlow as error:
-        training = trains(asked)
-        relaxations = _all_join_in_time(asked) if training else [_all_join(asked, plan)]
+        training = trains(bounded)
+        relaxations = _all_join_in_time(bounded) if training else [_all_join(bounded, plan)]
         bounds = [plan.lower_bound]
-        if training or all(task.vehicles for task in asked.tasks):
-            relaxations.insert(0, (_one_joins_in_time if training else _one_joins)(asked))
+        if training or all(task.vehicles for task in bounded.tasks):
+            relaxations.insert(0, (_one_joins_in_time if training else _one_joins)(bounded))
             bounds.append(_bound(relaxations[0]))
         lower = max((bound for bound in bounds if bound is not None), default=None)
-        found: list[Carried] = []
+        feasible: list[Carried] = []
         for relaxed in relaxations:
-            if carried := _largest(asked, relaxed):
-                found.append(carried)
+            if carried := _largest(bounded, relaxed):
+                feasible.append(carried)
                 if lower is not None and carried[0].objective <= lower * (1 + ROUNDING):
                     break  # no plan is better
-        if not found:
+        if not feasible:
             raise error
-        carried, shares = _certified(asked, found, lower, IN_TIME if training else CARRIED)
-        return _timed(asked, (replace(carried, certificate=plan.certificate), shares))
+        carried, shares = _certified(bounded, feasible, lower, IN_TIME if training else CARRIED)
+        return _timed(bounded, (replace(carried, certificate=plan.certificate), shares))
 
 
 def _within_held(task: AllocationTask) -> AllocationTask:
-    """Return the task with its upper limit of samples at most what its vehicles hold.
+    """Return the task with its upper limit of samples lowered to what its vehicles hold.
 
-    Raises `Infeasible` if its lower limit is more.
+    Raises `Infeasible` if its lower limit exceeds that.
     """
     vehicles = task.vehicles
     if not vehicles or any(vehicle not in task.samples_held for vehicle in vehicles):
@@ -112,19 +112,19 @@ def _one_joins(asked: Problem) -> Relaxation:
 
 
 def _of_one_each(asked: Problem) -> tuple[AllocationTask, ...]:
-    """Return the tasks, of those whose vehicles have names with one vehicle in each edge group."""
+    """Return the tasks, with one vehicle per edge group in those whose vehicles are named."""
     ones = ({"edge_groups": (1,) * len(task.edge_groups)} if task.vehicles else {} for task in asked.tasks)
     return tuple(task.model_copy(update=update) for task, update in zip(asked.tasks, ones))
 
 
 def _all_join_in_time(asked: Problem) -> list[Relaxation]:
-    """Return the plans by the rounds that the slowest vehicle has time for, with and without time for the samples."""
+    """Return the plans by the rounds that the slowest vehicle has time for, without and with the time for samples."""
     horizon_s = _horizon_s(asked)
     vehicles = {name for task in asked.tasks for name in task.vehicles}
     slowest = max(vehicles, key=lambda name: (sum(t.round_s(name) for t in asked.tasks if name in t.vehicles), name))
     per_round = tuple(task.round_s(slowest) if slowest in task.vehicles else 0.0 for task in asked.tasks)
     mbps = [sum(link.wireless for link in (task.uplink_mbps or {}).values()) for task in asked.tasks]
-    sending = (BITS_PER_BYTE * task.sample_mb / each if each else 0.0 for task, each in zip(asked.tasks, mbps))
+    sending = (BITS_PER_BYTE * task.sample_mb / rate if rate else 0.0 for task, rate in zip(asked.tasks, mbps))
     return [
         _reduced(asked, Clock((0.0,) * len(per_round), per_round, horizon_s)),
         _reduced(asked, Clock(tuple(sending), per_round, 2 * horizon_s)),
@@ -136,7 +136,7 @@ def _one_joins_in_time(asked: Problem) -> Relaxation:
     for task in asked.tasks:
         for name in task.vehicles:
             times.setdefault(name, []).append(task.round_s(name))
-    speed = {name: 1 / max(float(np.mean(own)), SHORTEST_S) for name, own in times.items()}
+    speed = {name: 1 / max(float(np.mean(rounds_s)), SHORTEST_S) for name, rounds_s in times.items()}
     per_sample = tuple(
         min((speed[name] * task.sample_s(name) for name in task.vehicles), default=0.0) for task in asked.tasks
     )
@@ -148,7 +148,7 @@ def _one_joins_in_time(asked: Problem) -> Relaxation:
 
 
 def _groups(task: AllocationTask) -> list[tuple[str, ...]]:
-    """Return the names of the vehicles of each edge group; no group where they have no names."""
+    """Return the names of the vehicles by edge group; no groups where they are not named."""
     left = iter(task.vehicles)
     return [tuple(islice(left, size)) for size in task.edge_groups] if task.vehicles else []
 
@@ -168,9 +168,10 @@ def _with_wireless(asked: Problem, wireless_mb: float, tasks: tuple[AllocationTa
 
 
 def _largest(asked: Problem, relaxed: Relaxation) -> Carried | None:
-    """Return the plan of the largest share of the budget that can be carried, by bisection; None if none was found."""
+    """Return the plan of the largest share of the budget that can be carried out, by bisection; None if none can."""
     low, high, share, found = 0.0, 1.0, 1.0, None
     for _ in range(HALVINGS + 1):
+        # Bisection on feasibility: TooSlow asks for less of the budget, Infeasible for more.
         try:
             found, low = _carried(asked, relaxed(share)), share
         except TooSlow:
@@ -204,7 +205,7 @@ def _bound(relaxed: Relaxation) -> float | None:
 
 
 def _timed(asked: Problem, carried: Carried) -> Carried:
-    """Return the plan with the time of the busiest vehicle, with a name or without, where vehicles train."""
+    """Return the plan with the time of the busiest vehicle, named or not, where vehicles train."""
     plan, shares = carried
     if asked.horizon_s is None or not trains(asked):
         return carried
@@ -212,9 +213,9 @@ def _timed(asked: Problem, carried: Carried) -> Carried:
 
 
 def _certified(asked: Problem, found: Sequence[Carried], bound: float | None, limit: str) -> Carried:
-    """Return the best plan with its certificate; its derivative by the wireless budget is not known and set to 0.
+    """Return the best plan with its certificate; its derivative by the wireless budget is unknown and set to 0.
 
-    `limit` is a sentence on what limits it.
+    `limit` is a sentence on what limits the plan.
     """
     larger = asked.objective == "area"
     plan, shares = (max if larger else min)(found, key=lambda carried: carried[0].objective)

@@ -62,7 +62,7 @@ def explain_objective(problem: Problem, objective: float) -> str:
 
 @dataclass(frozen=True)
 class FittedFields:
-    """The fields of a task in an allocation problem that a history determines."""
+    """The fields of a task in an allocation problem that are determined by a history."""
 
     curve: OwnCurve
     upper: OwnCurve | None  # of the upper band; None: too few points for one
@@ -89,8 +89,8 @@ def format_problem(tasks: Mapping[str, FittedFields], k: int, history: str) -> s
         f"edge_rounds_per_cloud_round: {k}",
         "tasks:",
     ]
-    for name, own in tasks.items():
-        limits, *fitted = [_entry(field, value) for field, value in _fields(own).items() if value is not None]
+    for name, fitted_fields in tasks.items():
+        limits, *fitted = [_entry(field, value) for field, value in _fields(fitted_fields).items() if value is not None]
         lines += [
             f"  - {_entry('name', name)}",
             "    weight: 1",
@@ -104,25 +104,25 @@ def format_problem(tasks: Mapping[str, FittedFields], k: int, history: str) -> s
 
 
 def read_task_names(text: str, origin: str) -> list[str]:
-    """Return the names of the tasks in the `text` of a problem; raises `InputError` where it is no problem."""
+    """Return the names of the tasks in the `text` of a problem; raises `InputError` where it is not a problem."""
     return list(_tasks(text, origin)[1])
 
 
 def insert_curves(text: str, tasks: Mapping[str, FittedFields], k: int, origin: str) -> str:
-    """Return the `text` of a problem (a list of tasks or a graph) with the fitted fields of `tasks` put in, by name.
+    """Return the `text` of a problem (a list of tasks or a graph) with the fitted fields of `tasks`, by name, inserted.
 
-    Existing limits are kept. `k` are the edge rounds per cloud round of fits over effective samples. Raises
+    Existing limits are kept. `k` is the number of edge rounds per cloud round in fits over effective samples. Raises
     `InputError` where the problem has no task of a name or another `k`, or where its text cannot be edited in place.
     """
-    (values, found), edits = _tasks(text, origin), []
+    (values, known), edits = _tasks(text, origin), []
     planned = values.get("edge_rounds_per_cloud_round", 1)
-    if planned != k and not all(isinstance(own.curve, Additive) for own in tasks.values()):
+    if planned != k and not all(isinstance(fitted.curve, Additive) for fitted in tasks.values()):
         raise InputError(f"{origin}: edge_rounds_per_cloud_round = {planned}, and the curves are fitted with {k}")
-    for name, own in tasks.items():
-        if name not in found:
-            raise InputError(f"{origin}: the history is of task {name!r}, which is none of {', '.join(found)}")
-        held, node = found[name]
-        fields = {field: value for field, value in _fields(own).items() if _wanted(field, value, held)}
+    for name, fitted in tasks.items():
+        if name not in known:
+            raise InputError(f"{origin}: the history is of task {name!r}, which is none of {', '.join(known)}")
+        held, node = known[name]
+        fields = {field: value for field, value in _fields(fitted).items() if _wanted(field, value, held)}
         if "networks" in values:  # a graph, whose tasks have a curve and no more
             fields = {"curve": fields["curve"]}
         held |= fields
@@ -134,13 +134,13 @@ def insert_curves(text: str, tasks: Mapping[str, FittedFields], k: int, origin: 
     return text
 
 
-def _fields(own: FittedFields) -> dict[str, Any]:
+def _fields(fitted: FittedFields) -> dict[str, Any]:
     """Return the fields of a task, as in a problem file."""
     return {
-        "limits": dict(own.limits),
-        "curve": _written(own.curve),
-        "upper": None if own.upper is None else _written(own.upper),
-        "measured": _rounded(own.measured),
+        "limits": dict(fitted.limits),
+        "curve": _written(fitted.curve),
+        "upper": None if fitted.upper is None else _written(fitted.upper),
+        "measured": _rounded(fitted.measured),
     }
 
 
@@ -151,22 +151,22 @@ def _wanted(field: str, value: Any, held: Mapping[str, Any]) -> bool:
 
 
 def _tasks(text: str, origin: str) -> tuple[dict[str, Any], dict[str, tuple[dict[str, Any], yaml.MappingNode]]]:
-    """Return the values in `text`, and by name each task: its values (part of the former) and its YAML node."""
+    """Return the values in `text`, and the tasks by name: their values (part of the former) and their YAML nodes."""
     if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text)):
         raise InputError(f"{origin}: curves cannot be put into YAML with aliases (*): write out what they stand for")
     values, root = yaml.safe_load(text), yaml.compose(text)
     tasks = values.get("tasks") if isinstance(values, dict) else None
     node = _entries(root).get("tasks")
-    own: list[tuple[Any, Any, yaml.Node]]
+    listed: list[tuple[Any, Any, yaml.Node]]
     if isinstance(tasks, dict):
-        own = [(name, tasks.get(name), each) for name, each in _entries(node).items()]
+        listed = [(name, tasks.get(name), each) for name, each in _entries(node).items()]
     elif isinstance(tasks, list) and isinstance(node, yaml.SequenceNode):
-        own = [(task.get("name"), task, each) for task, each in zip(tasks, node.value) if isinstance(task, dict)]
+        listed = [(task.get("name"), task, each) for task, each in zip(tasks, node.value) if isinstance(task, dict)]
     else:
         raise InputError(f"{origin}: not an allocation problem: it has no tasks")
     return values, {
         name: (task, each)
-        for name, task, each in own
+        for name, task, each in listed
         if isinstance(name, str) and isinstance(task, dict) and isinstance(each, yaml.MappingNode)
     }
 

@@ -1,6 +1,6 @@
 """Replanning during a run: resources spent are lower limits, and learning curves are rescaled to observed accuracies.
 
-Stages follow each other: after the first edge round no sample is added, after the first cloud round no edge round.
+Stages follow one another: no sample is added after the first edge round, and no edge round after the first cloud round.
 """
 
 from collections.abc import Mapping
@@ -77,7 +77,7 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
 
 
 def _call(problem: Problem, task: AllocationTask, spent: TaskState | None) -> AllocationTask:
-    """Return the task with the vehicles that were called to the edge rounds done."""
+    """Return the task with the number of vehicles that were called to the edge rounds done."""
     if spent is None or spent.called is None:
         return task
     if task.called is None or not task.called[0] <= spent.called <= task.called[1]:
@@ -125,7 +125,7 @@ def _smaller(decay: Decay, factor: float) -> Decay:
 
 
 def _left(problem: Problem, progress: PlanState) -> Budgets:
-    """Return the budgets less the difference of the megabytes sent and the cost of the counts."""
+    """Return the budgets [MB], reduced by the difference of the megabytes sent and the cost of the counts."""
     budgets = problem.budgets_mb
     if progress.used_mb is None:
         return budgets

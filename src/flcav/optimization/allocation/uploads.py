@@ -1,4 +1,4 @@
-"""Shares of the vehicles in the samples of stage I: by what they hold, or by what their uplinks carry."""
+"""Division of stage I's samples over the vehicles: by what they hold, or by what their uplinks carry."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,17 +13,17 @@ LEAST_MBPS = 1e-3  # rate of a vehicle that is never in coverage: it uploads las
 
 @dataclass(frozen=True)
 class UploadDemand:
-    """The samples of stage I of a task, and who holds how many."""
+    """The samples of stage I of a task, and how many each vehicle holds."""
 
     samples: int
-    sample_mb: float  # of one
+    sample_mb: float  # size of a sample
     held: Mapping[str, int]  # by vehicle
 
 
 def share_by_held(asked: UploadDemand) -> dict[str, int]:
-    """Return each vehicle's number of samples, in proportion to what it holds, by the method of largest remainders.
+    """Return the vehicles' numbers of samples, in proportion to what they hold, by the method of largest remainders.
 
-    Equal remainders go to the vehicle that is named first.
+    Ties go to the vehicle that is named first.
     """
     total = sum(asked.held.values())
     shares = {name: asked.samples * count // total for name, count in asked.held.items()}
@@ -34,27 +34,27 @@ def share_by_held(asked: UploadDemand) -> dict[str, int]:
 
 
 def share_by_links(tasks: Mapping[str, UploadDemand], mbps: Mapping[str, float]) -> dict[str, dict[str, int]]:
-    """Return each vehicle's number of samples by task, by which the last sample arrives earliest: see `split_plan`.
+    """Return the vehicles' numbers of samples, by task, with which the last sample arrives earliest: see `split_plan`.
 
-    mbps: rate of the wireless uplink of every vehicle [Mbit/s]. A vehicle sends the samples of all tasks one after
+    `mbps` is the wireless uplink rate of every vehicle [Mbit/s]. A vehicle sends the samples of all tasks one after
     another.
     """
     units, plans = [], []
-    for name, asked in tasks.items():
-        links = {vehicle: Uplink(wireless=max(mbps[vehicle], LEAST_MBPS)) for vehicle in asked.held}
-        limits = Limits(samples=(asked.samples, asked.samples), edge_rounds=(0, 0), cloud_rounds=(0, 0))
+    for name, demand in tasks.items():
+        links = {vehicle: Uplink(wireless=max(mbps[vehicle], LEAST_MBPS)) for vehicle in demand.held}
+        limits = Limits(samples=(demand.samples, demand.samples), edge_rounds=(0, 0), cloud_rounds=(0, 0))
         units.append(
             AllocationTask(
                 name=name,
-                sample_mb=asked.sample_mb,
-                model_mb=1.0,  # of no round
-                edge_groups=(len(asked.held),),
+                sample_mb=demand.sample_mb,
+                model_mb=1.0,  # no round is planned, so that any size will do
+                edge_groups=(len(demand.held),),
                 uplink_mbps=links,
-                samples_held=asked.held,
+                samples_held=demand.held,
                 limits=limits,
                 curve=Additive(),
             )
         )
-        plans.append(TaskAllocation(name, asked.samples, 0, 0, 0.0, 0.0, 0.0))
+        plans.append(TaskAllocation(name, demand.samples, 0, 0, 0.0, 0.0, 0.0))
     shares = split_plan(Problem(budgets_mb=Budgets(wireless=1.0, wireline=1.0), tasks=tuple(units)), plans)
-    return {name: {share.vehicle: share.samples for share in own} for name, own in shares.items()}
+    return {name: {share.vehicle: share.samples for share in task_shares} for name, task_shares in shares.items()}

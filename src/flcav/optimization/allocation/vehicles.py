@@ -1,18 +1,18 @@
-"""Split of a plan over the vehicles of a fleet: a lexicographic mixed-integer program under each vehicle's own time.
+"""Split of a plan over the vehicles of a fleet: a lexicographic mixed-integer program under every vehicle's time.
 
-A plan gives the number of samples and rounds of each task for the whole fleet. The split has whole x samples and y
-rounds for every task and vehicle, with
+A plan gives the number of samples and rounds of each task for the whole fleet. The split has integers x (samples) and y
+(rounds) for every task and vehicle, with
 
 - sum(x) = the planned samples of the task, and x at most the samples that the vehicle holds;
 - at least one vehicle of each edge group in every round;
-- within the horizon, each vehicle's own training in its rounds and all its uplink messages, one after the other, over
-  all tasks; on its edge server's wireline all samples sent on its behalf.
+- within the horizon, every vehicle's training in its rounds and all its uplink messages, one after another, over all
+  tasks; on its edge server's wireline all samples sent on its behalf.
 
 The objectives, in this order: most rounds joined (a straggler drops out of rounds only where its time is too short for
 them); samples of most worth; both weighted by data quality; then the earliest end of stage I, when all samples have
-arrived. For IID data all samples have the same worth and throughput decides. Each objective is a program for HiGHS,
-solved to optimality for small fleets; for large ones the search ends after `NODES` nodes, so that the result does not
-depend on the machine's speed.
+arrived. For IID data all samples have the same worth, and throughput decides. Each objective is a program for HiGHS,
+solved to optimality for small fleets; for large ones the search ends after `NODES` nodes rather than after a time, so
+that the result does not depend on the machine's speed.
 """
 
 from collections.abc import Sequence
@@ -41,13 +41,13 @@ class TooSlow(Infeasible):
 
 @dataclass(frozen=True)
 class VehicleShare:
-    """One vehicle's share of a task's plan: samples to upload, rounds to join, and their size."""
+    """A vehicle's share of a task's plan: samples to upload, rounds to join, their size, and the time they take."""
 
     vehicle: str
     samples: int  # uploaded in stage I
     rounds: tuple[int, ...]  # joined, of 1 ... edge_rounds + k * cloud_rounds, in the order of the run
     wireless_mb: float  # uplink
-    busy_s: float  # time to send them on the own link, as far as that is known, and to train in the rounds
+    busy_s: float  # time to send them on the vehicle's link, as far as that is known, and to train in the rounds
 
 
 Shares = dict[str, tuple[VehicleShare, ...]]  # by task
@@ -55,7 +55,7 @@ Shares = dict[str, tuple[VehicleShare, ...]]  # by task
 
 @dataclass(frozen=True)
 class _TaskOnVehicle:
-    """One task on one vehicle: two consecutive variables of the program, samples and rounds."""
+    """A task on a vehicle: two consecutive variables of the program, samples and rounds."""
 
     task: AllocationTask
     group: int  # index of its edge group
@@ -69,14 +69,14 @@ class _TaskOnVehicle:
 
 
 def trains(problem: Problem) -> bool:
-    """Return whether the vehicles' time to train is known for any task, so that a horizon limits it."""
+    """Return whether the time to train is known for a vehicle of any task, so that a horizon limits it."""
     return any(task.train_s > 0 or any(task.vehicle_train_s.values()) for task in problem.tasks)
 
 
 def split_plan(problem: Problem, plans: Sequence[TaskAllocation]) -> Shares:
     """Return the split of `plans` (one per task, in their order) over the vehicles: by task, a share per vehicle.
 
-    Tasks that do not name their vehicles are left out. Raises `Infeasible` where the vehicles hold too few samples,
+    Tasks without named vehicles are left out. Raises `Infeasible` where the vehicles hold too few samples, and
     `TooSlow` where they need longer than `horizon_s`.
     """
     planned = [(task, plan) for task, plan in zip(problem.tasks, plans, strict=True) if task.vehicles]
@@ -95,8 +95,8 @@ def split_plan(problem: Problem, plans: Sequence[TaskAllocation]) -> Shares:
     shares: Shares = {}
     for task, plan in planned:
         labelled_mb = (plan.edge_rounds + (plan.cloud_rounds > 0)) * (task.labels_mb or 0.0)
-        own = [(part, row) for part, row in zip(parts, counts) if part.task is task]
-        joined = _rounds([part.group for part, _ in own], [int(row[1]) for _, row in own], own[0][0].rounds)
+        rows = [(part, row) for part, row in zip(parts, counts) if part.task is task]
+        joined = _rounds([part.group for part, _ in rows], [int(row[1]) for _, row in rows], rows[0][0].rounds)
         shares[task.name] = tuple(
             VehicleShare(
                 *(part.vehicle, int(row[0]), rounds),
@@ -105,13 +105,13 @@ def split_plan(problem: Problem, plans: Sequence[TaskAllocation]) -> Shares:
                 ),
                 busy_s=float(row[0] * part.sample_s + len(rounds) * part.round_s),
             )
-            for (part, row), rounds in zip(own, joined)
+            for (part, row), rounds in zip(rows, joined)
         )
     return shares
 
 
 def sum_busy(shares: Shares) -> dict[str, float]:
-    """Return how long each vehicle is busy with its shares of all tasks [s]."""
+    """Return the time [s] that every vehicle needs for its shares of all tasks."""
     busy: dict[str, float] = {}
     for share in chain.from_iterable(shares.values()):
         busy[share.vehicle] = busy.get(share.vehicle, 0.0) + share.busy_s
@@ -138,7 +138,7 @@ def _parts(problem: Problem, task: AllocationTask, plan: TaskAllocation) -> list
 def _split(
     parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskAllocation], horizon_s: float | None, subject: str
 ) -> Array:
-    """Return the samples and rounds (P, 2) of every part; raises `TooSlow` of `subject` where none fits the horizon."""
+    """Return the samples and rounds (P, 2) of all parts; raises `TooSlow` of `subject` where none fits the horizon."""
     size = 2 * len(parts) + 1  # the last variable is a time [s]: the end of stage I, or of the plan
     needs, least = _needs(parts, plans)
     joined_by_all = LinearConstraint(needs, least[:, 0], least[:, 1])  # pyright: ignore[reportArgumentType]
@@ -147,9 +147,12 @@ def _split(
     busy = LinearConstraint(_busy(parts, with_rounds=True), ub=np.inf if horizon_s is None else horizon_s)
     stage_one = LinearConstraint(_busy(parts, with_rounds=False, less_last=True), ub=0.0)  # pyright: ignore[reportArgumentType]
     quality = np.array([part.quality for part in parts])
-    joined, worth = np.zeros(size), np.zeros(size)
+    joined = np.zeros(size)
+    worth = np.zeros(size)
     joined[1:-1:2], worth[0:-1:2] = -quality, -quality
-    fixed, found = [joined_by_all, busy, stage_one], None
+    fixed = [joined_by_all, busy, stage_one]
+    # Lexicographic: every optimum, less a tolerance, becomes a constraint of the programs that follow.
+    found = None
     for aim, gap in ((joined, GAP), (worth, GAP), (end, END_GAP)):
         better = _least(aim, fixed, high, gap)
         if better is None and found is not None:
@@ -167,7 +170,7 @@ def _split(
 def _needs(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskAllocation]) -> tuple[csr_array, Array]:
     """Return constraint rows and their bounds (rows, 2) for the samples of each task and the rounds of each group.
 
-    All planned samples are uploaded; the rounds that the vehicles of a group join are together at least the task's.
+    All planned samples are uploaded; the vehicles of a group together join at least as many rounds as the task has.
     """
     wanted = {plan.name: plan.samples for plan in plans}
     names: dict[tuple[str, int], int] = {}
@@ -187,7 +190,7 @@ def _needs(parts: Sequence[_TaskOnVehicle], plans: Sequence[TaskAllocation]) -> 
 
 
 def _busy(parts: Sequence[_TaskOnVehicle], *, with_rounds: bool, less_last: bool = False) -> csr_array:
-    """Return the time of each vehicle and its wireline [s], a row each; with `less_last`, minus the last variable."""
+    """Return the time of vehicles and their wirelines [s], one row each; with `less_last`, minus the last variable."""
     lines: dict[tuple[str, str], Array] = {}
     for number, part in enumerate(parts):
         times = {"own": (part.sample_s, part.round_s)}
@@ -222,10 +225,10 @@ def _too_slow(soonest: Array | None, horizon_s: float | None, subject: str) -> T
 
 
 def _rounds(groups: Sequence[int], counts: Sequence[int], rounds: int) -> list[tuple[int, ...]]:
-    """Return the rounds that each vehicle joins, round robin: a vehicle starts where the one before in its group ended.
+    """Return the rounds that each vehicle joins, round robin: a vehicle starts where its predecessor in a group ended.
 
-    `counts` are the numbers of rounds per vehicle. So every round of a group is joined, and the numbers of vehicles in
-    its rounds differ by at most one.
+    `counts` are the vehicles' numbers of rounds. In this way every round of a group is joined, and the numbers of
+    vehicles in its rounds differ by at most one.
     """
     ends = np.cumsum(counts, dtype=np.int64) - np.array(
         [sum(c for c, h in zip(counts, groups) if h < g) for g in groups]

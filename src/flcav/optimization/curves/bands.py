@@ -2,8 +2,8 @@
 
 Every repeat draws n residuals of the fit with replacement, adds them to the fitted errors, and fits the same form
 again. Residuals are scaled by sqrt(n / (n - P)) for n independent points, as P fitted parameters make them smaller than
-the errors of measurement; the band of a saturated fit, n <= P, is not known. Residuals are drawn rather than points: a
-draw of five points often has too few different ones for a fit.
+the measurement errors; the band of a saturated fit, n <= P, is unknown. Residuals are drawn rather than points, because
+a draw of five points often has too few different ones for a fit.
 """
 
 from collections.abc import Sequence
@@ -40,7 +40,7 @@ class Bands:
 def bootstrap_bands(
     fit: CurveFit, *, level: float = 0.9, repeats: int = 200, seed: int = 0, k: int = 1
 ) -> Bands | None:
-    """Return the confidence band of `fit`; None where it is saturated: its residuals are no errors of measurement."""
+    """Return the confidence band of `fit`; None for a saturated fit, whose residuals are no measurement errors."""
     fitted = fit.fitted
     if fitted is None or fitted.spare < 1:
         return None
@@ -57,7 +57,7 @@ def bootstrap_bands(
 
 
 def fit_upper_curve(fit: CurveFit, found: Bands) -> OwnCurve:
-    """Return a curve of the fit's form that is not below the upper band: the worst case of a robust plan.
+    """Return a curve of the fit's form that lies nowhere below the upper band: the worst case of a robust plan.
 
     It is fitted to the band, then its floor is raised until it is not below the band at the measured resources and at
     1, 2 and 4 times the largest of them all.
@@ -75,7 +75,7 @@ def fit_upper_curve(fit: CurveFit, found: Bands) -> OwnCurve:
 
 
 def tabulate_bands(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
-    """Return the curve with its bands at every row of `resources` (n, 3), a dictionary per row.
+    """Return the curve with its bands at every row of `resources` (n, 3), as one dictionary per row.
 
     Keys: samples, edge_rounds, cloud_rounds, error, low and high; without bands, low and high are None.
     """

@@ -1,8 +1,8 @@
 """Learning curves: models of the error as a function of samples, edge rounds and cloud rounds.
 
-`Additive` sums an inverse power law per stage, and what the first cloud round costs; `Effective` is one inverse power
-law of effective samples; `Federated` is one, too, in which cloud rounds bring the samples of the other regions and may
-cost accuracy; `SharedCurve` is the weighted mean of the curves of tasks with the same network.
+`Additive` sums an inverse power law per stage, and the cost of the first cloud round; `Effective` is one inverse power
+law of effective samples; `Federated` is such a law, too, in which cloud rounds bring the samples of the other regions
+and may cost accuracy; `SharedCurve` is the weighted mean of the curves of tasks with the same network.
 """
 
 from collections.abc import Sequence
@@ -32,8 +32,8 @@ def effective_samples(
 ) -> float | Array:
     """Return the effective samples n = alpha * samples + group * (1 - 1 / (t + 1)) after `t` rounds, elementwise.
 
-    `alpha` is the worth of an uploaded sample; `group` is the number of the vehicles' own samples times their worth,
-    of which the share 1 - 1 / (t + 1) is learned from in t rounds.
+    `alpha` is the worth of an uploaded sample; `group` is the number of samples that stay on the vehicles times their
+    worth, of which the share 1 - 1 / (t + 1) is learned in t rounds.
     """
     return alpha * samples + group * (1 - 1 / (t + 1))
 
@@ -70,8 +70,9 @@ class Decay(CurveConfig):
 class Additive(CurveConfig):
     """Additive learning curve: error = floor + the sum of an inverse power law per stage + merge from z = 1 on.
 
-    `merge` is what the first cloud round costs, beside what cloud rounds bring: it averages networks that drifted apart
-    in different regions (client drift; Karimireddy et al., 2020, "SCAFFOLD", ICML), and later ones start from the mean.
+    `merge` is the cost of the first cloud round, in addition to what cloud rounds bring: it averages networks that
+    drifted apart in different regions (client drift; Karimireddy et al., 2020, "SCAFFOLD", ICML); later ones start from
+    the mean.
     """
 
     model: Literal["additive"] = "additive"
@@ -108,7 +109,7 @@ class Effective(CurveConfig):
     a: Sizeable
     b: Sizeable
     alpha: Sizeable  # worth of an uploaded sample
-    beta: NonNegative  # worth of a vehicle's own sample
+    beta: NonNegative  # worth of a sample that stays on its vehicle
     group_samples: NonNegative  # held by the vehicles of all edge groups
 
     def __str__(self) -> str:
@@ -134,10 +135,10 @@ class Federated(CurveConfig):
 
         n = alpha * samples + beta * (G / R * (1 - 1 / (t + 1)) + gamma * (G - G / R) * (1 - 1 / (z + 1))):
 
-    rounds bring the samples of a region's own vehicles, cloud rounds also those of the other regions. The drift part
-    max(drift, 0) - drift / (z + 1) changes the error by `drift` from no cloud round to endless ones. Where it is
-    positive, cloud rounds cost accuracy: averaging networks that drifted apart in different regions, the client drift
-    of Karimireddy et al. (2020, "SCAFFOLD", ICML).
+    rounds bring the samples of the region's vehicles, cloud rounds also those of the other regions. The drift part
+    max(drift, 0) - drift / (z + 1) changes the error by `drift` from no cloud round to infinitely many. Where it is
+    positive, cloud rounds cost accuracy: they average networks that drifted apart in different regions, the client
+    drift of Karimireddy et al. (2020, "SCAFFOLD", ICML).
     """
 
     model: Literal["federated"]
@@ -145,10 +146,10 @@ class Federated(CurveConfig):
     a: Sizeable
     b: Sizeable
     alpha: Sizeable  # worth of an uploaded sample
-    beta: NonNegative  # worth of a sample that a vehicle of the own region holds
+    beta: NonNegative  # worth of a sample that a vehicle of the same region holds
     gamma: NonNegative = 0.0  # worth of a sample of another region, relative to beta
     group_samples: Annotated[tuple[NonNegative, ...], Field(min_length=2)]  # held by the vehicles of each region
-    drift: Change = 0.0  # change of the error by endless cloud rounds, beside what they bring
+    drift: Change = 0.0  # change of the error by infinitely many cloud rounds, in addition to what they bring
 
     def __str__(self) -> str:
         """Return the formula in x samples, t rounds and z cloud rounds."""
@@ -177,12 +178,12 @@ class Federated(CurveConfig):
         """Return the number of effective samples n, elementwise, at `k` edge rounds per cloud round."""
         z = np.asarray(cloud_rounds, np.float64)
         t = np.asarray(edge_rounds, np.float64) + k * z
-        own = effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.own)
-        return np.asarray(effective_samples(own, z, 1.0, self.others), dtype=np.float64)
+        effective = effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.own)
+        return np.asarray(effective_samples(effective, z, 1.0, self.others), dtype=np.float64)
 
 
 def split_regions(group_samples: Sequence[float]) -> tuple[float, float]:
-    """Return the samples held in a region, and in all others, in the mean over regions that hold `group_samples`."""
+    """Return the samples held in a region, and in all others, as means over the regions that hold `group_samples`."""
     total = sum(group_samples)
     return total / len(group_samples), total - total / len(group_samples)
 

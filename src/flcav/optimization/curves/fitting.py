@@ -1,9 +1,9 @@
 """Fits of learning curves to history: bounded, robust least squares with model selection by AICc.
 
-AICc (Hurvich and Tsai 1989) decides whether the floor and each x0 are fitted; of `Federated` curves the floor, gamma
+AICc (Hurvich and Tsai 1989) decides whether the floor and each x0 are fitted; for `Federated` curves the floor, gamma
 and drift. For few points none is, and the fit is plain least squares: the article's curve, accuracy = 1 - a x^(-b).
-From `ROBUST_FROM` points on, the loss is soft L1,
-which turns from squares to absolute values at three standard deviations (estimated by the median absolute residual).
+From `ROBUST_FROM` points on, the loss is soft L1, which turns from squares to absolute values at three standard
+deviations (estimated by the median absolute residual).
 """
 
 from collections.abc import Sequence
@@ -30,7 +30,7 @@ from flcav.optimization.curves.forms import (
 from flcav.optimization.curves.history import History, load_history
 from flcav.optimization.curves.levels import level_seeds
 
-ROBUST_FROM = 10  # independent points: the spread of fewer residuals does not tell which of them are outliers
+ROBUST_FROM = 10  # independent points: the spread of fewer residuals does not show which of them are outliers
 SAME_COST = 1e-3  # relative difference of equal costs
 EXACT, ROUGH = 1e-14, 1e-6  # tolerances of the solver: for the curve that is returned; for comparisons and repeats
 QUANTITIES = ("samples", "edge_rounds", "cloud_rounds")
@@ -66,34 +66,34 @@ class Fit(Generic[CurveT]):
         """Reasons to distrust the curve, a sentence each: too few points, a steep exponent, or a low R^2."""
         if self.fitted is None:
             return ()
-        said = []
+        reasons = []
         if self.fitted.spare < 1:
             counts = f"{self.fitted.independent} independent points for {len(self.fitted.parameters)} parameters"
-            said.append(f"{counts}: nothing is left to check them, and the band is not known")
+            reasons.append(f"{counts}: nothing is left to check them, and the band is not known")
         decays = zip(STAGES, self.curve.decays()) if isinstance(self.curve, Additive) else [("samples", self.curve)]
-        said += [told for stage, decay in decays if (told := explain_exponent(stage, decay.b)) is not None]
+        reasons += [reason for stage, decay in decays if (reason := explain_exponent(stage, decay.b)) is not None]
         if self.r_squared is None:
-            said.append("the accuracy is the same at all points: nothing is known of what more would bring")
+            reasons.append("the accuracy is the same at all points: nothing is known of what more would bring")
         elif self.r_squared < 0.5:
-            said.append(f"the curve explains {max(self.r_squared, 0):.0%} of the variance of the accuracy")
-        return tuple(said)
+            reasons.append(f"the curve explains {max(self.r_squared, 0):.0%} of the variance of the accuracy")
+        return tuple(reasons)
 
     def explain_extrapolation(self, samples: float, edge_rounds: float, cloud_rounds: float) -> str | None:
         """Return a sentence that names the quantities above the largest in the history; None where there are none."""
         if self.fitted is None:
             return None
         over = [
-            f"{asked:g} {name.replace('_', ' ')} (measured up to {most:g})"
-            for name, asked, most in zip(
+            f"{value:g} {name.replace('_', ' ')} (measured up to {most:g})"
+            for name, value, most in zip(
                 QUANTITIES, (samples, edge_rounds, cloud_rounds), self.fitted.resources.max(axis=0)
             )
-            if asked > most
+            if value > most
         ]
         return f"extrapolated beyond the history: {', '.join(over)}" if over else None
 
 
 def explain_exponent(stage: str, b: float) -> str | None:
-    """Return a sentence on an exponent at a bound of the search, or hardly that of a power law; else None."""
+    """Return a sentence on an exponent at a bound of the search, or too large for a power law; else None."""
     for bound, which in ((FLATTEST, "least"), (STEEPEST, "largest")):
         if np.isclose(b, bound, rtol=1e-3, atol=0):
             return f"{stage}: exponent {b:.3g} is the {which} that is tried: it is not identified by this history"
@@ -118,7 +118,7 @@ class FitState(Generic[CurveT]):
 
     @property
     def independent(self) -> int:
-        """Number of different points of a positive weight: a repeated point tells nothing new."""
+        """Number of different points of a positive weight; a repeated point adds no information."""
         points = np.column_stack((self.resources, self.error))
         return len(np.unique(points[self.weight > 0], axis=0))
 
@@ -137,18 +137,18 @@ def fit(
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> CurveFit:
-    """Return the learning curve fitted to the history of one task, or to that in a CSV file.
+    """Return the learning curve fitted to the history of a task, or to that in a CSV file.
 
-    It is the error by samples, edge rounds and cloud rounds.
+    It is the error as a function of samples, edge rounds and cloud rounds.
 
     The best model is the additive or, where there are several regions and cloud rounds vary, the federated one,
-    whichever has the smaller AICc; runs are planned by it. Where runs of several seeds are in the history, the curve is
-    that of a mean seed (`level_seeds`). The data determine beta / alpha alone. Raises `InputError` where there are too
-    few points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
+    whichever has the smaller AICc; runs are planned by it. Where a history has runs of several seeds, the curve is that
+    of a mean seed (`level_seeds`). The data determine only beta / alpha. Raises `InputError` where there are too few
+    points, where the effective model lacks `group_samples` for a history with rounds, and as `fit_federated` does.
 
     Args:
-        history: accuracies at samples, edge rounds and cloud rounds, or their CSV file.
-        model: `Additive`, `Effective`, `Federated`, or the best one; the settings below are of the latter ones.
+        history: accuracies at samples, edge rounds and cloud rounds, or the CSV file that holds them.
+        model: `Additive`, `Effective`, `Federated`, or the best one; the arguments below apply to the latter ones.
         group_samples: number of samples that the vehicles hold, of all regions, or of each.
         k: number of edge rounds per cloud round.
         alpha: worth of an uploaded sample.
@@ -185,7 +185,7 @@ def fit_additive(
     accuracy: ArrayLike,
     weight: ArrayLike | None = None,
 ) -> Fit[Additive]:
-    """Return the additive curve fitted jointly over all stages to accuracies (n,) at samples and rounds (n,) each.
+    """Return the additive curve fitted jointly over all stages to accuracies (n,) at samples and rounds, (n,) each.
 
     `weight` (n,) multiplies the squared residuals; by default it is 1. A stage that never varies is left out. Raises
     `InputError` where there are too few points or all weights are 0.
@@ -206,12 +206,12 @@ def fit_effective(
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> Fit[Effective]:
-    """Return the effective-samples curve fitted to accuracies (n,) at samples and rounds (n,) each.
+    """Return the effective-samples curve fitted to accuracies (n,) at samples and rounds, (n,) each.
 
-    `group_samples` is the number of samples that the vehicles of all groups hold, `k` the edge rounds per cloud round,
-    `weight` (n,) as in `fit_additive`. The data determine beta / alpha alone: alpha is given, and beta is fitted unless
-    it is given too, or the rounds never vary (then it is the article's 0.5). Raises `InputError` where there are too
-    few different points, a point has no samples, or all weights are 0.
+    `group_samples` is the number of samples that the vehicles of all groups hold, `k` the number of edge rounds per
+    cloud round, `weight` (n,) as in `fit_additive`. The data determine only beta / alpha: alpha is given, and beta is
+    fitted unless it is given, too, or the rounds never vary (then it is the article's 0.5). Raises `InputError` where
+    there are too few different points, a point has no samples, or all weights are 0.
     """
     spent = _columns(samples, edge_rounds, cloud_rounds)
     return _chosen(effective_forms(spent, alpha, beta, group_samples, k), spent, accuracy, weight)
@@ -229,7 +229,7 @@ def fit_federated(
     alpha: float = 0.1,
     beta: float | None = None,
 ) -> Fit[Federated]:
-    """Return the `Federated` curve fitted to accuracies (n,) at samples and rounds (n,) each.
+    """Return the `Federated` curve fitted to accuracies (n,) at samples and rounds, (n,) each.
 
     `group_samples` are the samples that the vehicles of each region hold, the rest is as in `fit_effective`. AICc
     decides whether other regions' samples are worth something, and whether the curve has a drift. Raises `InputError`
@@ -244,7 +244,8 @@ def refit(fitted: FitState[Any], error: Array) -> Array:
 
     The search starts from the parameters of `fitted`.
     """
-    start, scale = fitted.parameters, fitted.scale
+    start = fitted.parameters
+    scale = fitted.scale
     return _least(fitted.form, fitted.resources, error, fitted.weight, [start], scale, ROUGH)[1]
 
 
@@ -253,10 +254,10 @@ def _columns(*columns: ArrayLike) -> Array:
 
 
 def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, weight: ArrayLike | None) -> Fit[CurveT]:
-    """Return the fit of least AICc: forms are fitted roughly, then the best one exactly from where it ended.
+    """Return the fit of least AICc: forms are fitted roughly, then the best one exactly, from where that ended.
 
-    Least squares have no larger AICc than the refined fit of the same form, so that forms are refined in the order of
-    their squares' AICc, until that of the next is no less than the best refined one.
+    The rough least-squares fit of a form has no larger AICc than its refined fit. Forms are therefore refined in the
+    order of their rough AICc, until that of the next one is no less than the best refined one.
     """
     error = 1 - np.asarray(accuracy, dtype=np.float64)
     weights = np.ones(len(error)) if weight is None else np.asarray(weight, dtype=np.float64)
@@ -264,13 +265,13 @@ def _chosen(forms: Sequence[Form[CurveT]], spent: Array, accuracy: ArrayLike, we
         raise InputError("the weights of the history are all 0")
     level = max(float(np.median(error)), 1e-3)
     squares = [_fit_squares(form, spent, error, weights, form.starts(level), ROUGH) for form in forms]
-    found: list[tuple[float, FitState[CurveT]]] = []
+    refined_fits: list[tuple[float, FitState[CurveT]]] = []
     for aicc, rough in sorted(((_measured(each).aicc, each) for each in squares), key=lambda pair: pair[0]):
-        if found and aicc >= min(found, key=lambda pair: pair[0])[0]:
+        if refined_fits and aicc >= min(refined_fits, key=lambda pair: pair[0])[0]:
             break
         refined = _refine(rough, ROUGH)
-        found.append((_measured(refined).aicc, refined))
-    best = min(found, key=lambda pair: pair[0])[1]
+        refined_fits.append((_measured(refined).aicc, refined))
+    best = min(refined_fits, key=lambda pair: pair[0])[1]
     return _measured(_refine(_fit_squares(best.form, spent, error, weights, [best.parameters], EXACT), EXACT))
 
 
@@ -303,7 +304,7 @@ def _least(
 ) -> tuple[float, Array]:
     """Return the least cost over the local optima from `starts`, and its parameters (P,).
 
-    Where two starts come to the same cost, the others are left out.
+    Starts are left out once two of them have reached the same cost.
     """
     root = np.sqrt(weight)
 
@@ -334,7 +335,8 @@ def _measured(fitted: FitState[CurveT]) -> Fit[CurveT]:
     form, weight = fitted.form, fitted.weight
     residual = form.predict(fitted.parameters, fitted.resources) - fitted.error
     mean_square = float((weight * residual**2).sum() / weight.sum())
-    n, parameters = fitted.independent, len(fitted.parameters) + 1  # the variance is one more parameter
+    n = fitted.independent
+    parameters = len(fitted.parameters) + 1
     spare = n - parameters - 1
     correction = 2 * parameters * (parameters + 1) / spare if spare > 0 else (1e9 if form.simplest else np.inf)
     aicc = n * np.log(max(mean_square, 1e-18)) + 2 * parameters + correction

@@ -2,7 +2,8 @@
 
 A decay a (x + x0)^(-b) is fitted as h ((x + x0) / (m + x0))^(-b), where m is the geometric mean of the resources. h is
 the error in the middle of the data, of order 1 and almost independent of b, whereas a varies by orders of magnitude
-with b. Parameters but the drift are bounded to be >= 0, so curves without drift or merge fall with every resource.
+with b. Parameters other than the drift are bounded to be >= 0, so curves without drift or merge fall with every
+resource.
 """
 
 from collections.abc import Sequence
@@ -68,10 +69,10 @@ class Form(Protocol[CurveT]):
 
 @dataclass(frozen=True)
 class AdditiveForm:
-    """Form of an additive curve: floor + a decay per stage that varies + the cost of the first cloud round.
+    """The form of an additive curve: floor + a decay per varying stage + the cost of the first cloud round.
 
-    The parameters p are h of each stage, b of each stage, the floor if it is fitted, the fitted x0, and the cost if it
-    is fitted.
+    The parameters p are h per stage, b per stage, the floor if it is fitted, every fitted x0, and the cost if it is
+    fitted.
     """
 
     stages: tuple[int, ...]  # those that vary, as indices into `STAGES`
@@ -95,7 +96,7 @@ class AdditiveForm:
         return least, most + [1.0] * self.merge
 
     def starts(self, level: float) -> list[list[float]]:
-        """Return one start per exponent of `STARTS`; with a `merge` one of the middle exponent."""
+        """Return one start per exponent of `STARTS`; with a `merge` only that of the middle exponent."""
         n, rest = len(self.stages), self._middle_shifts() + [START_DRIFT] * self.merge
         exponents = STARTS[1:2] if self.merge else STARTS
         return [[level / n] * n + [b] * n + [level / 10] * self.floor + rest for b in exponents]
@@ -145,8 +146,9 @@ class AdditiveForm:
 def additive_forms(resources: Array) -> list[AdditiveForm]:
     """Return the candidate forms for `resources` (n, 3): with and without a fitted floor, each fitted x0 and a `merge`.
 
-    A stage that never varies is left out, and the cost of the first cloud round where there are not several cloud
-    rounds beside none: it would be the decay of the first. Raises `InputError` where there are too few points.
+    A stage that never varies is left out; so is the cost of the first cloud round unless the history has two different
+    positive numbers of cloud rounds and 0: it could not be distinguished from the decay. Raises `InputError` where
+    there are too few points.
     """
     stages = tuple(stage for stage in range(3) if len(np.unique(resources[:, stage])) > 1)
     if not stages or len(resources) < 2 * len(stages):
@@ -166,10 +168,10 @@ def additive_forms(resources: Array) -> list[AdditiveForm]:
 
 @dataclass(frozen=True)
 class EffectiveForm:
-    """Form of an effective-samples curve: floor + a n^(-b) of n effective samples.
+    """The form of an effective-samples curve: floor + a n^(-b) for n effective samples.
 
     The parameters p are h, b, the floor if it is fitted, and beta if it is fitted. Scaling alpha and beta together is
-    the same as scaling a, so alpha is given; beta is fitted where the rounds vary.
+    equivalent to scaling a, so that alpha is given; beta is fitted where the rounds vary.
     """
 
     floor: bool  # whether the floor is fitted; else it is 0
@@ -207,7 +209,8 @@ class EffectiveForm:
         by_h, by_b, slope = _power_derivatives(
             p[0], p[1], self.alpha * resources[:, 0] + self._beta(p) * held, self.middle
         )
-        floor, beta = [np.ones(len(t))] * self.floor, [slope * held] * (self.beta is None)
+        floor = [np.ones(len(t))] * self.floor
+        beta = [slope * held] * (self.beta is None)
         return np.stack([by_h, by_b, *floor, *beta], axis=1)
 
     def curve(self, p: Array) -> Effective:
@@ -262,7 +265,7 @@ def effective_forms(
 
 @dataclass(frozen=True)
 class FederatedForm:
-    """Form of a `Federated` curve: floor + a n^(-b) of n effective samples, and the drift part of the cloud rounds.
+    """The form of a `Federated` curve: floor + a n^(-b) of n effective samples, and the drift part of the cloud rounds.
 
     The parameters p are h, b, and those of floor, gamma, drift and beta that are fitted; the first three are 0 where
     they are not.
@@ -299,8 +302,8 @@ class FederatedForm:
         """Return the errors (n,) at `resources` (n, 3)."""
         floor, gamma, drift, beta = self._named(p)
         samples, edge_rounds, cloud_rounds = resources.T
-        own, others = split_regions(self.group_samples)
-        effective = effective_samples(samples, edge_rounds + self.k * cloud_rounds, self.alpha, beta * own)
+        region, others = split_regions(self.group_samples)
+        effective = effective_samples(samples, edge_rounds + self.k * cloud_rounds, self.alpha, beta * region)
         effective = effective_samples(effective, cloud_rounds, 1.0, beta * gamma * others)
         return p[0] * (effective / self.middle) ** -p[1] + floor + drift_part(cloud_rounds, drift)
 
@@ -308,9 +311,9 @@ class FederatedForm:
         """Return the Jacobian (n, P) of the errors at `resources` (n, 3) with respect to the parameters."""
         _, gamma, drift, beta = self._named(p)
         samples, edge_rounds, cloud_rounds = resources.T
-        own, others = split_regions(self.group_samples)
+        region, others = split_regions(self.group_samples)
         others_held = effective_samples(0.0, cloud_rounds, 0.0, others)
-        held = effective_samples(0.0, edge_rounds + self.k * cloud_rounds, 0.0, own) + gamma * others_held
+        held = effective_samples(0.0, edge_rounds + self.k * cloud_rounds, 0.0, region) + gamma * others_held
         by_h, by_b, slope = _power_derivatives(p[0], p[1], self.alpha * samples + beta * held, self.middle)
         by_floor, by_drift = np.ones(len(samples)), float(drift > 0) - 1 / (cloud_rounds + 1)
         fitted = self._fitted(by_floor, slope * beta * others_held, by_drift, slope * held)
@@ -327,12 +330,12 @@ class FederatedForm:
         return parse_config(Federated, values, FITTED)
 
     def _fitted(self, floor: ValueT, gamma: ValueT, drift: ValueT, beta: ValueT) -> list[ValueT]:
-        """Return those of the values whose parameters are fitted."""
+        """Return the values whose parameters are fitted."""
         fitted = (self.floor, self.gamma, self.drift, self.beta is None)
         return [value for value, wanted in zip((floor, gamma, drift, beta), fitted) if wanted]
 
     def _named(self, p: Array) -> tuple[float, float, float, float]:
-        """Return floor, gamma, drift and beta, each fitted or given."""
+        """Return floor, gamma, drift and beta, whether fitted or given."""
         left = iter(p[2:])
         floor, gamma, drift = (next(left) if fitted else 0.0 for fitted in (self.floor, self.gamma, self.drift))
         return floor, gamma, drift, next(left) if self.beta is None else self.beta
@@ -354,9 +357,10 @@ def federated_forms(
         raise InputError(
             "the cloud rounds of the history never vary, so nothing is known of what the samples of other regions bring"
         )
-    own, _ = split_regions(group_samples)
-    plain = effective_forms(resources, alpha, beta, own, k)[0]
-    middle, given = plain.middle, plain.beta
+    per_region, _ = split_regions(group_samples)
+    plain = effective_forms(resources, alpha, beta, per_region, k)[0]
+    middle = plain.middle
+    given = plain.beta
     return [
         FederatedForm(floor, gamma, drift, alpha, given, tuple(group_samples), k, middle)
         for floor, gamma, drift in product((False, True), repeat=3)

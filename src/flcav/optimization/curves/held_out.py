@@ -1,12 +1,12 @@
-"""Learning curves against runs that they were not fitted to: each run of a history is predicted from the others.
+"""Learning curves on runs that they were not fitted to: every run of a history is predicted from the others.
 
-What no curve can foresee is how a run's training turned out. `noise_of_runs` splits the residuals of a history into
-the differences between runs and the scatter within them, a random effect of the run (one-way analysis of variance by
-the method of moments, Searle, Casella and McCulloch, "Variance Components", 1992, sec. 3.6), and the rank correlation
-that a true curve would reach with as much noise says how far a prediction can get. How near it can come to a point is
-told without any curve, by other seeds' points with the same numbers of samples and rounds (pure error; Draper and
-Smith, "Applied Regression Analysis", 1998, sec. 2.1). The level of a run's seed is known from the other runs of the
-seed; of a seed held out whole it is not, until its run has pretrained.
+No curve can foresee how the training of a run turned out. `noise_of_runs` splits the residuals of a history into the
+differences between runs and the scatter within them, a random effect of the run (one-way analysis of variance by the
+method of moments, Searle, Casella and McCulloch, "Variance Components", 1992, sec. 3.6); the rank correlation that a
+true curve would reach under such noise is the limit of any prediction. The limit of the error at a point follows
+without any curve from other seeds' points with the same numbers of samples and rounds (pure error; Draper and Smith,
+"Applied Regression Analysis", 1998, sec. 2.1). The level of a run's seed is known from the other runs of the seed; that
+of a seed held out as a whole is not, until its run has pretrained.
 """
 
 from collections.abc import Callable
@@ -29,7 +29,7 @@ SIMULATED = 400  # histories drawn for the attainable rank correlation
 
 @dataclass(frozen=True)
 class HeldOut:
-    """Agreement of predicted and realised accuracy over all points of runs held out."""
+    """Agreement of predicted and realised accuracy over all points of held-out runs."""
 
     runs: int
     points: int
@@ -44,7 +44,7 @@ class HeldOut:
 
 @dataclass(frozen=True)
 class NewSeeds:
-    """Agreement over all points after pretraining, of seeds held out whole, before and after their runs pretrained."""
+    """Agreement over all points after pretraining of seeds held out whole, before and after their runs pretrained."""
 
     points: int
     mean_error: float  # mean absolute difference, predicted before the run
@@ -54,10 +54,9 @@ class NewSeeds:
 
 
 def hold_out_runs(history: History, fit: Callable[[History], CurveFit], k: int = 1) -> HeldOut:
-    """Return how well curves fitted by `fit` to all runs but one predict that one; `k`: edge rounds per cloud round.
+    """Return how well curves fitted by `fit` to all runs but one predict that one; `k` is edge rounds per cloud round.
 
-    `fit` returns the curve of a mean seed, see `level_seeds`; the run's is that times the factor of its seed.
-
+    `fit` returns the curve of a mean seed, see `level_seeds`; a run's curve is that times the factor of its seed.
     Raises `InputError` for a history of fewer than three runs, and as `fit` does.
     """
     names = np.array(history.runs)
@@ -90,12 +89,13 @@ def measure_pure_error(history: History) -> float | None:
     """Return the mean absolute error that the true curve would leave, from points with the same resources; else None.
 
     A run's point is compared with the mean of m points of other seeds, at its seed's level. Such a mean has 1 / m of a
-    point's variance, so that a curve without error would be off by sqrt(m / (m + 1)) of the difference. Points are left
-    out where no other run tells the level of their seed.
+    point's variance, so that a curve without error would be off by sqrt(m / (m + 1)) of the difference. Points of seeds
+    without another run, whose level is unknown, are left out.
     """
     if len(set(history.seeds)) < 2:
         return None
-    names, seeds = np.array(history.runs), np.array(history.seeds)
+    names = np.array(history.runs)
+    seeds = np.array(history.seeds)
     left: list[Array] = []
     for run in np.unique(names):
         held = names == run
@@ -104,24 +104,25 @@ def measure_pure_error(history: History) -> float | None:
         same = (history.resources[held][:, None] == others.resources[None]).all(axis=2)  # (points, others)
         same &= np.array(others.seeds) != seeds[held][:, None]
         count = same.sum(axis=1)
-        found = (count > 0) & np.isin(seeds[held], list(levelled.factors))
-        mean = (same @ (1 - others.accuracy))[found] / count[found]
-        factor = np.array([levelled.of(seed) for seed in seeds[held][found]])
-        off = np.abs(1 - factor * mean - history.accuracy[held][found])
-        left.append(off * np.sqrt(count[found] / (count[found] + 1)))
+        usable = (count > 0) & np.isin(seeds[held], list(levelled.factors))
+        mean = (same @ (1 - others.accuracy))[usable] / count[usable]
+        factor = np.array([levelled.of(seed) for seed in seeds[held][usable]])
+        off = np.abs(1 - factor * mean - history.accuracy[held][usable])
+        left.append(off * np.sqrt(count[usable] / (count[usable] + 1)))
     differences = np.concatenate(left)
     return float(differences.mean()) if len(differences) else None
 
 
 def _predict(curve: OwnCurve, levelled: Levelled, history: History, k: int) -> Array:
-    """Return the accuracy (n,) that the curve of a mean seed predicts for the points of a history."""
+    """Return the accuracy (n,) that the curve of a mean seed, times the seeds' factors, predicts for a history."""
     factor = np.array([levelled.of(seed) for seed in history.seeds]) if history.seeds else 1.0
     return 1 - factor * curve.error(*history.resources.T, k=k)
 
 
 def _hold_out_seeds(history: History, fit: Callable[[History], CurveFit], k: int) -> NewSeeds | None:
-    """Return how well curves fitted to all seeds but one predict that one; None for one seed."""
-    seeds, names = np.array(history.seeds), np.array(history.runs)
+    """Return how well curves fitted to all seeds but one predict that one; None for a single seed."""
+    seeds = np.array(history.seeds)
+    names = np.array(history.runs)
     if len(np.unique(seeds)) < 2:
         return None
     pretrained = ~history.resources[:, 1:].any(axis=1)
@@ -131,17 +132,17 @@ def _hold_out_seeds(history: History, fit: Callable[[History], CurveFit], k: int
         curve = fit(history.select(~held)).curve
         before[held] = 1 - curve.error(*history.resources[held].T, k=k)
         for run in np.unique(names[held]):
-            own = held & (names == run)
-            reached = (1 - history.accuracy[own & pretrained]).mean() / (1 - before[own & pretrained]).mean()
-            after[own] = 1 - reached * (1 - before[own])
+            of_run = held & (names == run)
+            reached = (1 - history.accuracy[of_run & pretrained]).mean() / (1 - before[of_run & pretrained]).mean()
+            after[of_run] = 1 - reached * (1 - before[of_run])
     rest = ~pretrained
-    found = history.accuracy[rest]
+    realised = history.accuracy[rest]
     return NewSeeds(
         int(rest.sum()),
-        float(np.abs(before[rest] - found).mean()),
-        rank_correlation(before[rest], found),
-        float(np.abs(after[rest] - found).mean()),
-        rank_correlation(after[rest], found),
+        float(np.abs(before[rest] - realised).mean()),
+        rank_correlation(before[rest], realised),
+        float(np.abs(after[rest] - realised).mean()),
+        rank_correlation(after[rest], realised),
     )
 
 
@@ -153,10 +154,10 @@ def rank_correlation(one: ArrayLike, other: ArrayLike) -> float:
 
 
 def noise_of_runs(residual: Array, runs: NDArray[np.str_]) -> tuple[float, float]:
-    """Return the standard deviations between and within runs of residuals (n,), each of the run in `runs` (n,).
+    """Return the standard deviations between and within runs of residuals (n,), whose runs are named in `runs` (n,).
 
-    That between runs is 0 where their means differ by less than the scatter within them explains; that within them is 0
-    where each has one point.
+    The former is 0 where the runs' means differ by less than the scatter within them explains; the latter is 0 where
+    every run has one point.
     """
     names, run, count = np.unique(runs, return_inverse=True, return_counts=True)
     means = np.bincount(run, residual) / count

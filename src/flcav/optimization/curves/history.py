@@ -2,10 +2,9 @@
 
 Tables of two forms are read:
 
-- Long: `task, stage, resource, accuracy[, weight]`. A row gives the resource of its own stage. Stages follow each
-  other, so its other resources are the largest of each earlier stage, and 0 of each later one.
-- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]`, as the project's own runs
-  write it.
+- Long: `task, stage, resource, accuracy[, weight]`. A row gives the resource of its stage. Stages follow one another,
+  so its other resources are the largest of each earlier stage, and 0 of each later one.
+- Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]`, as flcav's runs write it.
 
 Either may have `error`, which is 1 - accuracy, in place of `accuracy`. A row that equals an earlier one in every column
 was logged twice, and is no second measurement: it is left out. Rows of the same resources with another accuracy, run or
@@ -39,18 +38,18 @@ ROUNDED = 1.01e-3  # largest deviation from 1 of accuracy + error, both rounded 
 
 @dataclass(frozen=True)
 class History(Displayed):
-    """The points of one task's learning curve."""
+    """The points of a task's learning curve."""
 
     resources: Array  # (n, 3) samples, edge rounds, cloud rounds
     accuracy: Array  # (n,) 0 ... 1
     weight: Array  # (n,) of each point's squared residual in a fit
-    runs: tuple[str, ...] = ()  # that the points are of; none where the history does not name them
-    seeds: tuple[str, ...] = ()  # of the runs; runs of one seed share frames
+    runs: tuple[str, ...] = ()  # (n,) run of each point; empty where the history does not name runs
+    seeds: tuple[str, ...] = ()  # (n,) seed of each point's run; runs of one seed share frames
     repeats: int = 0  # rows of the table that are left out, as they equal an earlier one in every column
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence on the rows that are left out; none where there are none."""
+        """A sentence on the rows that are left out; empty where there are none."""
         if not self.repeats:
             return ()
         rows = "1 row repeats" if self.repeats == 1 else f"{self.repeats} rows repeat"
@@ -63,13 +62,13 @@ class History(Displayed):
 
 
 def load_history(path: Path | str) -> History:
-    """Return the history of one task in a CSV file; raises `InputError` where it holds none, or several."""
+    """Return the history of a task in a CSV file; raises `InputError` where it holds none, or several."""
     table = read_csv(path)
-    found = parse_histories(table.to_pydict(), str(path), Path(path).stem)
-    if len(found) != 1:
-        told = ", ".join(found) or "none"
-        raise InputError(f"{path}: a history of one task is wanted, and it has those of {told}")
-    return next(iter(found.values()))
+    histories = parse_histories(table.to_pydict(), str(path), Path(path).stem)
+    if len(histories) != 1:
+        names = ", ".join(histories) or "none"
+        raise InputError(f"{path}: a history of one task is wanted, and it has those of {names}")
+    return next(iter(histories.values()))
 
 
 def article_histories() -> dict[str, History]:
@@ -79,7 +78,7 @@ def article_histories() -> dict[str, History]:
 
 
 def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, History]:
-    """Return the history of each task, by name, from a table in either form.
+    """Return the histories of all tasks, by name, from a table in either form.
 
     `unnamed` is the task's name in a table without a column `task`. Raises `InputError` naming `origin`, the row (from
     1), the field and the value where a column is missing or a value is invalid.
@@ -103,19 +102,19 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
             if value is None or value != value or not str(value).strip():
                 raise InputError(f"{origin}: row {row}: {name} is empty: a row names its {name}, or the table has none")
     names = [str(name) for name in columns.get("task", [unnamed] * len(accuracy))]
-    found = {}
+    histories = {}
     whole = list(zip(*columns.values(), strict=True))
     for task in dict.fromkeys(names):
         logged = [row for row, name in enumerate(names) if name == task]
         rows = sorted({whole[row]: row for row in reversed(logged)}.values())
-        own = amounts[rows]
+        spent = amounts[rows]
         if not joint:
-            own = accumulate_resources([str(columns["stage"][row]) for row in rows], own[:, 0])
+            spent = accumulate_resources([str(columns["stage"][row]) for row in rows], spent[:, 0])
         runs, seeds = (
             tuple(str(columns[name][row]) for row in rows) if name in columns else () for name in ("run", "seed")
         )
-        found[task] = History(own, accuracy[rows], weight[rows], runs, seeds, len(logged) - len(rows))
-    return found
+        histories[task] = History(spent, accuracy[rows], weight[rows], runs, seeds, len(logged) - len(rows))
+    return histories
 
 
 def _with_accuracy(columns: Table, origin: str) -> Table:
@@ -139,12 +138,13 @@ def _with_accuracy(columns: Table, origin: str) -> Table:
 def accumulate_resources(stage: Sequence[str], resource: ArrayLike) -> Array:
     """Return samples, edge rounds and cloud rounds (n, 3) of a long table's rows.
 
-    Each row has its own stage's `resource` (n,), the largest of each earlier stage, and 0 of each later one.
+    Each row has its stage's `resource` (n,), the largest of each earlier stage, and 0 of each later one.
     """
-    amounts, number = np.asarray(resource, dtype=np.float64), np.array([STAGES.index(name) for name in stage])
+    amounts = np.asarray(resource, dtype=np.float64)
+    number = np.array([STAGES.index(name) for name in stage])
     largest = [amounts[number == s].max(initial=0.0) for s in range(3)]
-    own = np.where(number[:, None] == np.arange(3), amounts[:, None], 0.0)
-    return np.where(np.arange(3) < number[:, None], largest, own)
+    of_stage = np.where(number[:, None] == np.arange(3), amounts[:, None], 0.0)
+    return np.where(np.arange(3) < number[:, None], largest, of_stage)
 
 
 def _numbers(columns: Table, name: str, origin: str, most: float = MOST) -> Array:

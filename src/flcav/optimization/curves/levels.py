@@ -1,7 +1,7 @@
 """Levels of a history's seeds: random effects, which learning curves are fitted without.
 
 Runs of one seed share traffic, training frames and validation frames; some frames are harder than others. The error of
-a point is taken to be the curve's times a factor of its seed, as replanning scales a curve to the score that a run has
+a point is modelled as the curve's times a factor of its seed, as replanning scales a curve to the score that a run has
 reached. The logarithms of the factors are the seed effects of a two-way analysis of variance of the log errors, with
 the numbers of samples and rounds as the other classification, by weighted least squares (Searle, Casella and McCulloch,
 "Variance Components", 1992, ch. 5); their weighted mean is 0, so that the levelled points are those of a mean seed.
@@ -21,7 +21,7 @@ LEAST_ERROR = 1e-4  # an error of 0 has no logarithm
 
 @dataclass(frozen=True)
 class Levelled:
-    """A history without its seeds' levels."""
+    """A history with the levels of its seeds removed."""
 
     history: History  # points of a mean seed
     factors: Mapping[str, float]  # of the error, by seed; empty where the history has fewer than two seeds
@@ -34,7 +34,7 @@ class Levelled:
 def level_seeds(history: History) -> Levelled:
     """Return the points of a history as those of a mean seed, and the factor of each seed's errors.
 
-    Points whose numbers of samples and rounds several seeds have tell the factors.
+    The factors follow from numbers of samples and rounds at which several seeds have points.
     """
     names, seed = np.unique(np.array(history.seeds), return_inverse=True)
     if len(names) < 2:

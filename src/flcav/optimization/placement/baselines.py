@@ -22,10 +22,10 @@ class ExpectedCoverage:
 
 
 def place_by_score(candidates: Candidates, score: Array, budget: float) -> Placement:
-    """Return the placement of the candidates of greatest `score` (P * S,) over cost that fit into `budget`.
+    """Return the placement of the candidates with the greatest `score` (P * S,) over cost that fit into `budget`.
 
-    Overlap plays no part; among equals the earlier candidate. Candidates of the cost 1 make it a number of sensors.
-    `upper_bound` is the covered weight: nothing is proven.
+    Overlap is ignored; ties go to the earlier candidate. With unit costs the budget is a number of sensors. Nothing is
+    proven: `upper_bound` is the covered weight.
     """
     order = np.argsort(-score / np.maximum(candidates.cost, TIE), kind="stable")
     chosen = _fill(candidates, order, budget)
@@ -33,7 +33,7 @@ def place_by_score(candidates: Candidates, score: Array, budget: float) -> Place
 
 
 def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, seed: int = 0) -> ExpectedCoverage:
-    """Return the mean coverage of `draws` random placements: candidates in random order, as long as they fit."""
+    """Return the mean coverage of `draws` random placements, each filled in random order within `budget`."""
     random = stream(seed, "random-placements")
     errors, weight = np.zeros(draws), np.zeros(draws)
     for draw in range(draws):
@@ -44,7 +44,7 @@ def place_at_random(candidates: Candidates, budget: float, draws: int = DRAWS, s
 
 
 def _fill(candidates: Candidates, order: NDArray[np.int64], budget: float) -> list[int]:
-    """Return the candidates of `order` that still fit when it is their turn, one a pole, ascending."""
+    """Return the candidates, taken in `order`, that fit into the remaining budget, one per pole, ascending."""
     price, spent, taken = candidates.price.tolist(), 0, {}
     cheapest = min(price)
     for candidate in order.tolist():

@@ -1,8 +1,9 @@
 """The cheapest roadside sensors that cover a share of the errors: the converse of budgeted maximum coverage.
 
-Small instances are mixed-integer programs. Of large ones a choice is grown greedily, and reduced; the dual of the
-relaxation bounds the cost from below: covered weight <= spare + price * cost, so that cost >= (target - spare) / price;
-and so does the candidate that covers most weight per cost, since no choice covers more.
+Small instances are mixed-integer programs. For large ones a choice is grown greedily, then reduced. Two lower bounds on
+the cost hold: from the dual of the relaxation, covered weight <= spare + price * cost, so that
+cost >= (target - spare) / price; and from the candidate of greatest weight per cost, since no choice covers more per
+cost.
 """
 
 from collections.abc import Sequence
@@ -82,7 +83,7 @@ def minimise(instance: CoverageInstance, target: int, method: Method) -> Found:
         return _close(instance, instance, target, chosen, root, least)
     root = relax(instance, as_float(price))
     if method == "exact":
-        for _ in range(CUTS):
+        for _ in range(CUTS):  # try a budget .1 % lower, as long as the target is still reached
             tried = improve(instance, price * 999 // 1000, chosen[:0], root)
             if not _reaches(instance, tried, target):
                 break
@@ -115,8 +116,10 @@ def _close(
     claimed: float,
     proven: float = 0.0,
 ) -> Found:
-    """Return `chosen`, or a cheaper choice, with the largest bound on the cost that is proven, as in `maximise`."""
-    proven, prices, worth = max(proven, _least_cost(root, target)), instance.price.tolist(), instance.worth.tolist()
+    """Return `chosen`, or a cheaper choice, with the greatest proven lower bound on the cost (see `solve._close`)."""
+    proven = max(proven, _least_cost(root, target))
+    prices = instance.price.tolist()
+    worth = instance.worth.tolist()
     cost = as_float(instance.cost_of(chosen))
     if is_coarse(prices) and is_coarse(worth) and claimed > cost - as_float(common_unit(prices)) / 2:
         return Found(chosen, cost, root, cost)
@@ -132,7 +135,7 @@ def _close(
 
 
 def _cheapen_exactly(rest: CoverageInstance, target: int, chosen: list[int]) -> tuple[list[int], bool]:
-    """Return the cheapest choice that the search in whole numbers finds, and whether it proves that none is cheaper."""
+    """Return the cheapest choice that the search in integers finds, and whether it proves that none is cheaper."""
     if rest.covers.nnz > ENUMERATED:
         return chosen, False
     while True:
@@ -144,21 +147,21 @@ def _cheapen_exactly(rest: CoverageInstance, target: int, chosen: list[int]) -> 
 
 
 def _raise_to(instance: CoverageInstance, bound: float, cost: int) -> float:
-    """Return the exact `cost` as a float where `bound` proves that no smaller sum is enough; else the bound."""
+    """Return the exact `cost` as a float where `bound` excludes every smaller sum of costs; else `bound`."""
     if bound < as_float(cost) * (1 - TIE):
         return bound
     return as_float(cost) if Fraction(bound) / UNIT > cost - common_unit(instance.price.tolist()) else bound
 
 
 def _least_cost(root: Relaxation, target: int) -> float:
-    """Return the cost below which, by the dual of `root`, no choice covers the exact weight `target`."""
+    """Return the least cost at which, by the dual of `root`, a choice may cover the exact weight `target`."""
     if root.price <= 0:
         return 0.0
     return max(0.0, nextafter(float((target * UNIT - Fraction(root.spare)) / Fraction(root.price)), -inf))
 
 
 def _reaches(instance: CoverageInstance, chosen: Sequence[int], target: int) -> bool:
-    """Return whether the chosen candidates cover the exact weight `target`; of floats where these decide."""
+    """Return whether the chosen candidates cover the exact weight `target`; floats decide where they clearly can."""
     value, wanted = instance.value(chosen), as_float(target)
     if abs(value - wanted) > TIE * wanted:
         return value > wanted
@@ -166,7 +169,7 @@ def _reaches(instance: CoverageInstance, chosen: Sequence[int], target: int) -> 
 
 
 def _drop(instance: CoverageInstance, target: int, chosen: Sequence[int]) -> list[int]:
-    """Return the choice without those, the dearest first, that `target` does not need."""
+    """Return the choice without the candidates, the most expensive first, that `target` does not need."""
     kept = list(chosen)
     for candidate in sorted(chosen, key=lambda each: -instance.cost[each]):
         others = [other for other in kept if other != candidate]

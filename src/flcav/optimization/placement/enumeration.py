@@ -1,11 +1,11 @@
-"""Exact search for a better choice: every choice whose deviation from a dual bound is small enough, in whole numbers.
+"""Exact search for a better choice: enumeration of all choices close enough to a dual bound, in integers.
 
-With duals u_j of groups and a price l, the bound exceeds the covered weight of any choice by exactly the sum of these,
-none of which is negative: for each pole its largest net value less that of its sensor, where a sensor's is the u_j it
-covers less l times its cost; u_j for each time that a group is covered again; w_j - u_j of each group that is not
-covered; l times what is left of the budget. A search by depth therefore leaves out what exceeds the difference between
-the bound and the weight that is wanted: reduced-cost fixing (Nemhauser and Wolsey, "Integer and Combinatorial
-Optimization", 1988, sec. II.5), at every node.
+With duals u_j of groups and a price l, the bound exceeds the covered weight of a choice by exactly the sum of these
+non-negative terms: for each pole, its largest net value less that of the sensor chosen, where a sensor's net value is
+the sum of the u_j that it covers less l times its cost; u_j for each repeated covering of a group; w_j - u_j for each
+group that is not covered; l times the unspent budget. A depth-first search therefore prunes every node where the sum
+exceeds the difference between the bound and the wanted weight: reduced-cost fixing (Nemhauser and Wolsey, "Integer and
+Combinatorial Optimization", 1988, sec. II.5), at every node.
 """
 
 from collections.abc import Iterable
@@ -22,9 +22,9 @@ PRECISION = 40  # bits of the price, and of duals beyond `UNIT`
 def improve_exactly(
     instance: CoverageInstance, rest: CoverageInstance, relaxed: Relaxation, budget: int, chosen: list[int]
 ) -> tuple[list[int], bool]:
-    """Return the best choice that the search in whole numbers finds, and whether it proves that none is better.
+    """Return the best choice that the search in integers finds, and whether it proves that none is better.
 
-    `rest`: the candidates of which a better choice is, with any dual, `relaxed`.
+    `rest` holds the candidates among which a better choice may exist; `relaxed` is any dual solution of it.
     """
     if rest.covers.nnz > ENUMERATED:
         return chosen, False
@@ -38,31 +38,36 @@ def improve_exactly(
 def find_better(
     instance: CoverageInstance, relaxed: Relaxation, budget: int, wanted: int
 ) -> tuple[list[int] | None, bool]:
-    """Return a choice within `budget` that covers `wanted` weight, both exact, and whether the search has ended.
+    """Return a choice within `budget` that covers the weight `wanted`, both exact, and whether the search is complete.
 
-    None after a search that has ended: there is no such choice. `relaxed`: any dual of the instance.
+    None after a complete search proves that there is no such choice. `relaxed` is any dual solution of the instance.
     """
-    kinds, worth, price = instance.sensors, instance.worth.tolist(), instance.price.tolist()
+    kinds = instance.sensors
+    worth = instance.worth.tolist()
+    price = instance.price.tolist()
+    # Duals and price become integers, scaled by 2^bits, so that deviations add up without rounding.
     bits = PRECISION + (max(0, ceil(-log2(relaxed.price))) if relaxed.price > 0 else 0)
     rate = int(relaxed.price * 2.0**PRECISION * 2 ** (bits - PRECISION))
     weight = [each << bits for each in worth]
     dual = [min(_scale(u, bits), w) for u, w in zip(relaxed.dual.tolist(), weight, strict=True)]
     covered = [instance.covered_by(k).tolist() for k in range(len(price))]
-    net = [sum(dual[j] for j in own) - rate * cost for own, cost in zip(covered, price, strict=True)]
+    net = [sum(dual[j] for j in groups) - rate * cost for groups, cost in zip(covered, price, strict=True)]
     most = [max(0, *net[first : first + kinds]) for first in range(0, len(net), kinds)]
     slack = sum(weight) - sum(dual) + rate * budget + sum(most) - (wanted << bits)
 
-    masks = [sum(1 << j for j in own) for own in covered]
-    options: list[list[tuple[int, int]]] = []  # by pole, the least loss first: loss and candidate, -1 for none
+    masks = [sum(1 << j for j in groups) for groups in covered]
+    options: list[list[tuple[int, int]]] = []  # by pole, ascending by loss: loss and candidate, -1 for no sensor
     for pole, best in enumerate(most):
-        own = [(best, -1), *((best - net[k], k) for k in range(pole * kinds, (pole + 1) * kinds))]
-        options.append(sorted(each for each in own if each[0] <= slack))
+        choices = [(best, -1), *((best - net[k], k) for k in range(pole * kinds, (pole + 1) * kinds))]
+        options.append(sorted(each for each in choices if each[0] <= slack))
     if slack < 0 or not all(options):
         return None, True
-    options = sorted((own for own in options if [k for _, k in own] != [-1]), key=lambda own: -own[-1][0])
-    later = [0]  # groups that poles from each on can cover
-    for own in reversed(options):
-        later.append(later[-1] | _unite(masks[k] for _, k in own if k >= 0))
+    options = sorted(
+        (choices for choices in options if [k for _, k in choices] != [-1]), key=lambda choices: -choices[-1][0]
+    )
+    later = [0]  # bit mask of the groups that the poles from here on can cover
+    for choices in reversed(options):
+        later.append(later[-1] | _unite(masks[k] for _, k in choices if k >= 0))
     later.reverse()
     everything = (1 << len(weight)) - 1
 

@@ -1,10 +1,10 @@
-"""The lazy greedy algorithm of budgeted maximum coverage, and exchanges of the chosen.
+"""The lazy greedy algorithm for budgeted maximum coverage, and local search by exchanges.
 
-A candidate's gain only falls as others are chosen, so that one whose old gain is too small need not be recomputed
-(Minoux 1978). With unit costs the greedy choice covers at least 1 - 1/e of the optimum (Nemhauser, Wolsey and Fisher
-1978; here Euler's number); by gain over cost, or the best single candidate if that covers more, at least (1 - 1/e) / 2
-(Khuller, Moss and Naor 1999). One sensor a pole costs no part of this: ranges are nested, so that a longer one
-replaces a shorter one on its pole, for the difference in cost.
+A candidate's gain only falls as others are chosen, so that a candidate whose earlier gain is too small need not be
+recomputed (Minoux 1978). With unit costs the greedy choice covers at least 1 - 1/e of the optimum (Nemhauser, Wolsey
+and Fisher 1978; e is Euler's number here); by gain over cost, or the best single candidate if that covers more, at
+least (1 - 1/e) / 2 (Khuller, Moss and Naor 1999). One sensor per pole weakens neither: ranges are nested, so that a
+longer one replaces a shorter one on its pole, for the difference in cost.
 """
 
 import heapq
@@ -20,9 +20,9 @@ TRIALS = 1000  # exchanges tried at most
 
 
 def choose_greedily(instance: CoverageInstance, budget: float) -> list[int]:
-    """Return the candidates of greatest gain over cost within `budget`, or the best single one and what fits beside.
+    """Return the greedy choice by gain over cost within `budget`, or the best single candidate extended, if better.
 
-    Ascending; among equals the earliest candidate. Here and below `budget` is a whole number of `UNIT`, or infinite.
+    Ascending; ties go to the earliest candidate. Here and below `budget` is an integer multiple of `UNIT`, or infinite.
     """
     chosen = extend_greedily(instance, budget, ())
     single = np.where(instance.price <= budget, instance.covers @ instance.weight, 0.0)
@@ -37,9 +37,11 @@ def extend_greedily(
 ) -> list[int]:
     """Return `chosen` with candidates of greatest gain over cost added while they fit into `budget`, ascending.
 
-    Ends where nothing gains, or where `target` of the weight is covered.
+    Ends where no candidate adds weight, or where the weight `target` is covered.
     """
-    kinds, cost, exact = instance.sensors, instance.cost, instance.price
+    kinds = instance.sensors
+    cost = instance.cost
+    exact = instance.price
     on = {candidate // kinds: candidate for candidate in chosen}
     left = np.where(reach(instance.covers, [*on.values()]), 0.0, instance.weight)
     missing = target - (instance.weight.sum() - left.sum())
@@ -58,7 +60,8 @@ def extend_greedily(
         gain = float(left[instance.covered_by(candidate)].sum())
         return gain / max(float(cost[candidate] - held[candidate // kinds]), NOTHING)
 
-    gains, prices = instance.covers @ left, cost - np.repeat(held, kinds)
+    gains = instance.covers @ left
+    prices = cost - np.repeat(held, kinds)
     rates = gains / np.maximum(prices, NOTHING)
     useful = np.array([k for k in np.flatnonzero(gains > 0).tolist() if fits(k)], np.int64)
     heap = list(zip((-rates[useful]).tolist(), useful.tolist(), strict=True))
@@ -79,7 +82,8 @@ def extend_greedily(
             if candidate != best:
                 heapq.heappush(heap, (-now, candidate))
         spent += price(best)
-        on[best // kinds], held[best // kinds] = best, cost[best]
+        on[best // kinds] = best
+        held[best // kinds] = cost[best]
         groups = instance.covered_by(best)
         missing -= float(left[groups].sum())
         left[groups] = 0.0
@@ -89,8 +93,10 @@ def extend_greedily(
 
 
 def exchange(instance: CoverageInstance, budget: float, chosen: Sequence[int]) -> list[int]:
-    """Return `chosen` improved: one or two are taken out and the rest extended, while more weight is covered."""
-    best, value, trials = list(chosen), instance.value(chosen), 0
+    """Return `chosen` improved by exchanges: one or two are removed and the rest extended, while that covers more."""
+    best = list(chosen)
+    value = instance.value(chosen)
+    trials = 0
     improves = True
     while improves:
         improves = False
@@ -107,7 +113,7 @@ def exchange(instance: CoverageInstance, budget: float, chosen: Sequence[int]) -
 
 
 def _without(chosen: Sequence[int]) -> Iterator[list[int]]:
-    """Yield `chosen` without each one, and without each two."""
+    """Yield `chosen` without one, then without two of its candidates."""
     for number in (1, 2):
         for out in combinations(chosen, number):
             yield [candidate for candidate in chosen if candidate not in out]

@@ -1,10 +1,10 @@
-"""Instances of budgeted maximum coverage: which candidate covers what, what it costs.
+"""Instances of budgeted maximum coverage: candidates, the errors that they cover, and their costs.
 
-A candidate is a sensor on a pole. Sensors are in the order of their ranges, so that each covers what those before it
+A candidate is a sensor on a pole. Sensors are in the order of their ranges, so that each covers what the preceding ones
 cover from the same pole; a pole carries at most one.
 
-Weights and costs are decimals, as users write them, and what is claimed of their sums is exact: they are whole numbers
-of `UNIT`. Floats of them lead the search.
+Weights and costs are decimals as users write them. Statements about their sums are exact, in integer multiples of
+`UNIT`; floats only guide the search.
 """
 
 from collections.abc import Iterable
@@ -28,19 +28,19 @@ Units = NDArray[np.object_]  # of int: whole numbers of `UNIT`
 
 
 def in_units(values: ArrayLike) -> Units:
-    """Return the decimals that floats, 0 or at least 1e-9, are written with, as whole numbers of `UNIT`."""
+    """Return the decimals by which floats (0, or at least 1e-9) are written, as integer multiples of `UNIT`."""
     distinct, which = np.unique(np.asarray(values, np.float64), return_inverse=True)
     whole = [int(Decimal(repr(value)).scaleb(DECIMALS, EXACT)) for value in distinct.tolist()]
     return np.array(whole, dtype=object)[which]
 
 
 def limit_in_units(limit: float) -> int:
-    """Return the most whole numbers of `UNIT` within the decimal that `limit` is written with."""
+    """Return the greatest integer multiple of `UNIT` that does not exceed `limit` as a decimal."""
     return floor(Fraction(repr(float(limit))) / UNIT)
 
 
 def as_float(units: int) -> float:
-    """Return the float nearest to a whole number of `UNIT`."""
+    """Return the float nearest to an integer multiple of `UNIT`."""
     return units / 10**DECIMALS
 
 
@@ -51,7 +51,7 @@ def common_unit(units: Iterable[int]) -> int:
 
 @dataclass(frozen=True)
 class CoverageInstance:
-    """Budgeted maximum coverage over N candidates and K groups of errors that the same candidates cover.
+    """Budgeted maximum coverage over N candidates and K groups of errors; a group is covered by the same candidates.
 
     Candidate k is the sensor k % `sensors` on the pole k // `sensors`.
     """
@@ -66,19 +66,19 @@ class CoverageInstance:
 
     @cached_property
     def worth(self) -> Units:
-        """Return (K,) the exact weight of each group."""
+        """Return the exact weight (K,) of each group, in `UNIT`s."""
         return in_units(self.weight) if self.summed is None else self.summed
 
     def cost_of(self, chosen: Iterable[int]) -> int:
-        """Return the exact cost of the `chosen` candidates."""
+        """Return the exact cost of the `chosen` candidates, in `UNIT`s."""
         return sum(self.price[[*chosen]].tolist())
 
     def worth_of(self, chosen: ArrayLike) -> int:
-        """Return the exact weight that the `chosen` candidates cover together."""
+        """Return the exact weight that the `chosen` candidates cover together, in `UNIT`s."""
         return sum(self.worth[reach(self.covers, chosen)].tolist())
 
     def covered_by(self, candidate: int) -> NDArray[np.int32]:
-        """Return the numbers of the groups that a candidate covers."""
+        """Return the indices of the groups that a candidate covers."""
         return np.asarray(
             self.covers.indices[self.covers.indptr[candidate] : self.covers.indptr[candidate + 1]], np.int32
         )
@@ -89,7 +89,7 @@ class CoverageInstance:
 
 
 def reach(covers: csr_array, chosen: ArrayLike) -> NDArray[np.bool_]:
-    """Return (K,) which columns of `covers` (N, K) the `chosen` rows cover together."""
+    """Return the mask (K,) of the columns of `covers` (N, K) that the `chosen` rows cover together."""
     return np.bincount(covers[np.asarray(chosen, np.int64)].indices, minlength=covers.shape[1]) > 0  # pyright: ignore[reportOptionalSubscript]
 
 
@@ -115,7 +115,7 @@ def find_covered(errors: Array, poles: Array, ranges_m: ArrayLike) -> csr_array:
 
 
 def _within(squared: Array, errors: Array, site: Array, range_m: float) -> NDArray[np.bool_]:
-    """Return which errors (E, 3), at `squared` (E,) distances, are within the range: as decimals where it is close."""
+    """Return the mask (E,) of errors within the range, from distances `squared` (E,) [m^2]; close cases are exact."""
     inside = squared <= range_m**2
     for near in np.flatnonzero(np.abs(squared - range_m**2) <= _doubt(site, range_m)).tolist():
         axes = zip(errors[near].tolist(), site.tolist(), strict=True)
@@ -125,21 +125,23 @@ def _within(squared: Array, errors: Array, site: Array, range_m: float) -> NDArr
 
 
 def _doubt(site: Array, range_m: float) -> float:
-    """Return by how much rounding may change a squared distance near the range from a pole."""
+    """Return the largest rounding error of a squared distance near the range from a pole [m^2]."""
     return 1e-14 * range_m * (range_m + float(np.abs(site).max()))
 
 
 def merge_errors(
     covers: csr_array, weights: Array, cost: Array, sensors: int, price: Units, worth: Units
 ) -> CoverageInstance:
-    """Return the instance in which errors that the same candidates cover are one group.
+    """Return the instance in which errors that the same candidates cover are merged into one group.
 
-    `covers` (N, E), `weights` (E,) and `cost` (N,) are of single errors, `worth` (E,) and `price` (N,) exactly. Errors
-    that nobody covers are left out. Groups are in the lexical order of their columns.
+    `covers` (N, E), `weights` (E,) and `cost` (N,) are of single errors; `worth` (E,) and `price` (N,) are the exact
+    weights and costs. Errors that no candidate covers are left out. Groups are in the lexical order of their columns.
     """
     candidates, count = covers.shape  # pyright: ignore[reportGeneralTypeIssues]
     width = -(-candidates // 8)
-    by, error = np.repeat(np.arange(candidates), np.diff(covers.indptr)), covers.indices.astype(np.int64)
+    by = np.repeat(np.arange(candidates), np.diff(covers.indptr))
+    # Columns as packed bits: equal columns are equal byte strings, which `np.unique` sorts and merges.
+    error = covers.indices.astype(np.int64)
     bits = np.zeros(count * width, np.uint8)
     np.bitwise_or.at(bits, error * width + by // 8, (128 >> by % 8).astype(np.uint8))
     seen = np.flatnonzero(np.bincount(error, minlength=count))

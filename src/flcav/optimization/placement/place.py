@@ -1,4 +1,4 @@
-"""Placement of roadside sensors by VRCSP: as many as there are, within a budget, or to cover a share of the errors."""
+"""Placement of roadside sensors by VRCSP: a number of sensors, a budget, or a share of the errors to cover."""
 
 from collections.abc import Sequence
 from functools import partial
@@ -34,23 +34,22 @@ def place(
     weight: ArrayLike | None = None,
     method: Method = "exact",
 ) -> Placement:
-    """Return the sensors on poles (P, 3), at most one each, that cover most of the weight (E,) of the errors (E, 3).
+    """Return the sensors on poles (P, 3), at most one per pole, that cover most of the errors' (E, 3) weight (E,).
 
-    One limit is given: `count`, `budget` or `cover`. Among equal choices of a number earlier poles are preferred.
-    Raises `InputError` where positions, weights, ranges, costs, limits or method are invalid, or not one limit is
-    given.
+    Exactly one limit is given: `count`, `budget` or `cover`. With `count`, ties go to earlier poles. Raises
+    `InputError` where positions, weights, ranges, costs or the method are invalid, or not exactly one limit is given.
 
     Args:
         errors: (E, 3) positions of errors [m, world].
         poles: (P, 3) positions where a sensor may stand [m, world].
-        range_m: range of the sensors [m], or of each of S kinds of sensors.
+        range_m: range of the sensors, or of each of the S kinds of sensors [m].
         count: number of sensors.
         budget: largest cost of the sensors and their poles.
         cover: share of the weight, 0 to 1, that is covered for the least cost.
         sensor_cost: (S,) cost of a sensor of each kind; None: 0.
-        pole_cost: (P,) cost of a sensor's place; None: 0.
-        town: town, or its name, past whose buildings a pole has to see an error; None: nothing is in the way.
-        traces: traffic of the town that is in the way, too.
+        pole_cost: (P,) cost of using a pole; None: 0.
+        town: town, or its name, whose buildings hide errors from poles; None: nothing occludes.
+        traces: traffic of the town that occludes, too.
         weight: (E,) weight of each error; None: 1.
         method: "exact", a mixed-integer program, or "greedy".
 
@@ -77,13 +76,15 @@ def place(
         sensor_cost = None if sensor_cost is None else np.atleast_1d(np.asarray(sensor_cost, dtype=np.float64))
     except (TypeError, ValueError) as error:
         raise InputError(f"range_m, sensor_cost: numbers are wanted, or lists of them ({error})") from None
-    asked = partial(find_candidates, errors, poles, ranges, weight=weight, pole_cost=pole_cost, sensor_cost=sensor_cost)
-    candidates = asked()
+    list_candidates = partial(
+        find_candidates, errors, poles, ranges, weight=weight, pole_cost=pole_cost, sensor_cost=sensor_cost
+    )
+    candidates = list_candidates()
     if town is not None:
         stands = load_town(town) if isinstance(town, str) else town
         places, sites = np.asarray(errors, dtype=np.float64), np.asarray(poles, dtype=np.float64)
         check_inside(stands, places, sites)
-        candidates = asked(visible=find_seen(places, sites, float(ranges.max()), stands, traces))
+        candidates = list_candidates(visible=find_seen(places, sites, float(ranges.max()), stands, traces))
     if count is not None:
         return place_count(candidates, count, method=method)
     if budget is not None:
@@ -98,9 +99,9 @@ def check_inside(
     poles: NDArray[np.float64],
     names: tuple[Path | str, Path | str] = ("errors", "poles"),
 ) -> None:
-    """Raise `InputError` for a pole (P, 3) outside the town, or an error (E, 3) so far away that no map of it shows it.
+    """Raise `InputError` for a pole (P, 3) outside the town, or an error (E, 3) far beyond its map [m, world frame].
 
-    `names` are those of the two tables in the sentence.
+    `names` are those of the two tables, for the message.
     """
     low, high = np.array(town.bounds).reshape(2, 2)
     reach_m = FAR * float((high - low).max())
@@ -115,8 +116,9 @@ def check_inside(
 def find_seen(
     errors: NDArray[np.float64], poles: NDArray[np.float64], range_m: float, town: Town, traces: Sequence[Trace]
 ) -> csr_array:
-    """Return (P, E) 1.0 where a pole sees an error within `range_m` in the town, past the traffic."""
+    """Return (P, E) 1.0 where a pole sees an error within `range_m` [m], past buildings and traffic (world frame)."""
     visible = find_covered(errors, poles, [range_m])
-    pole, error = np.repeat(np.arange(len(poles)), np.diff(visible.indptr)), visible.indices.astype(np.int64)
+    pole = np.repeat(np.arange(len(poles)), np.diff(visible.indptr))
+    error = visible.indices.astype(np.int64)
     seen = find_visible_pairs(town, traces, poles, errors, (pole, error))
     return csr_array((seen.astype(np.float64), visible.indices, visible.indptr), shape=visible.shape)

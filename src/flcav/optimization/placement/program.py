@@ -11,13 +11,13 @@ from flcav.optimization.placement.instance import TIE, CoverageInstance, as_floa
 
 NODES = 2000  # of the search tree at most, where a limit is asked for
 CUTS = 20  # times that a choice beyond a limit, within HiGHS' tolerances, is excluded and the program solved again
-LARGEST = 1e6  # sum to which weights or costs are scaled, so that tolerances of 1e-6 are small beside it
+LARGEST = 1e6  # sum to which weights or costs are scaled, so that tolerances of 1e-6 are small relative to it
 SMALLEST = 1e-7  # of scaled weights and costs that are not 0
-COARSE = 100_000  # times their common unit up to which sums are told from each other by HiGHS
+COARSE = 100_000  # times their common unit up to which HiGHS can distinguish sums
 
 
 def bound_by_highs(instance: CoverageInstance, budget: float) -> tuple[float, Array]:
-    """Return the bound of the linear relaxation on the weight covered within `budget`, and its dual (K,) by group."""
+    """Return the bound of the linear relaxation on the weight covered within `budget`, and the dual (K,) by group."""
     groups = len(instance.weight)
     if not groups:
         return 0.0, np.zeros(0)
@@ -31,14 +31,16 @@ def bound_by_highs(instance: CoverageInstance, budget: float) -> tuple[float, Ar
 def maximise_coverage(
     instance: CoverageInstance, budget: int, *, limited: bool = False
 ) -> tuple[list[int] | None, float]:
-    """Return the candidates within the exact `budget` that cover most weight, and HiGHS' bound on it.
+    """Return the candidates within the exact `budget` that cover the most weight, and HiGHS' upper bound on it.
 
-    `limited`: search NODES nodes at most; None where no choice was found by then.
+    With `limited` at most NODES nodes are searched, and the choice is None where none was found by then.
     """
     objective, rows, limits, scale = _program(instance, as_float(budget))
-    chosen, bound = None, -np.inf
+    chosen = None
+    bound = -np.inf
     for _ in range(CUTS):
         chosen, bound = _solve(instance, objective, rows, limits, limited)
+        # HiGHS' tolerances may let a choice exceed the budget slightly: a cut excludes it, and it is solved again.
         if chosen is None or instance.cost_of(chosen) <= budget:
             break
         for candidate in sorted(chosen, key=lambda each: instance.price[each]):
@@ -46,7 +48,8 @@ def maximise_coverage(
                 chosen.remove(candidate)
         beyond = np.zeros(rows.shape[1])  # pyright: ignore[reportOptionalSubscript]
         beyond[chosen] = 1.0
-        rows, limits = csr_array(vstack((rows, csr_array(beyond[None])))), np.r_[limits, len(chosen) - 1.0]
+        rows = csr_array(vstack((rows, csr_array(beyond[None]))))
+        limits = np.r_[limits, len(chosen) - 1.0]
         chosen = None
     return chosen, -bound / scale
 
@@ -54,48 +57,54 @@ def maximise_coverage(
 def minimise_cost(instance: CoverageInstance, target: int, *, limited: bool = False) -> tuple[list[int] | None, float]:
     """Return the cheapest candidates that cover the exact weight `target`, and HiGHS' lower bound on the cost.
 
-    `limited` as in `maximise_coverage`.
+    `limited` is as in `maximise_coverage`.
     """
     objective, rows, limits, scale = _program(instance, np.inf)
     candidates = len(instance.cost)
     weight = csr_array(np.r_[np.zeros(candidates), objective[candidates:]][None])
-    rows, limits = csr_array(vstack((rows, weight))), np.r_[limits, -as_float(target) * scale]
+    rows = csr_array(vstack((rows, weight)))
+    limits = np.r_[limits, -as_float(target) * scale]
     costs, unit = _scale(instance.cost, instance.price.tolist())
     cost = np.r_[costs, np.zeros(len(instance.weight))]
-    chosen, bound = None, -np.inf
+    chosen = None
+    bound = -np.inf
     for _ in range(CUTS):
         chosen, bound = _solve(instance, cost, rows, limits, limited)
         if chosen is None or instance.worth_of(chosen) >= target:
             break
-        missing, has = target - instance.worth_of(chosen), reach(instance.covers, chosen)
-        for candidate in range(candidates):  # what covers too little still does with these
-            own = [group for group in instance.covered_by(candidate).tolist() if not has[group]]
-            if (gain := sum(instance.worth[own].tolist())) < missing:
+        missing = target - instance.worth_of(chosen)
+        has = reach(instance.covers, chosen)
+        for candidate in range(
+            candidates
+        ):  # extend the choice while it misses the target: a cut excludes all its subsets
+            groups = [group for group in instance.covered_by(candidate).tolist() if not has[group]]
+            if (gain := sum(instance.worth[groups].tolist())) < missing:
                 missing -= gain
-                has[own] = True
+                has[groups] = True
                 chosen.append(candidate)
         more = np.zeros(rows.shape[1])  # pyright: ignore[reportOptionalSubscript]
         more[:candidates] = -1.0
         more[chosen] = 0.0
-        rows, limits = csr_array(vstack((rows, csr_array(more[None])))), np.r_[limits, -1.0]
+        rows = csr_array(vstack((rows, csr_array(more[None]))))
+        limits = np.r_[limits, -1.0]
         chosen = None
     return chosen, bound / unit
 
 
 def is_coarse(units: Sequence[int]) -> bool:
-    """Return whether HiGHS, within its tolerances, tells the sums of such numbers from each other."""
+    """Return whether HiGHS can distinguish the sums of such numbers within its tolerances."""
     return sum(units) <= COARSE * common_unit(units)
 
 
 def is_wide(units: Sequence[int]) -> bool:
-    """Return whether HiGHS, within its tolerances, takes the least of such numbers for none beside their sum."""
+    """Return whether the least of such numbers is lost in HiGHS' tolerances relative to their sum."""
     return 2 * TIE * sum(units) > min(filter(None, units), default=0)
 
 
 def _scale(values: Array, units: Sequence[int]) -> tuple[Array, float]:
-    """Return weights or costs for HiGHS and their factor: whole numbers where these are small, else of the sum LARGEST.
+    """Return weights or costs scaled for HiGHS, and the factor: to small integers if possible, else to the sum LARGEST.
 
-    Then those too small for HiGHS beside the sum are 0. `units`: the values, exactly.
+    In the latter case values too small for HiGHS relative to the sum become 0. `units` are the exact values.
     """
     if is_coarse(units):
         factor = 1 / as_float(common_unit(units)) if any(units) else 1.0
@@ -105,10 +114,10 @@ def _scale(values: Array, units: Sequence[int]) -> tuple[Array, float]:
 
 
 def _program(instance: CoverageInstance, budget: float) -> tuple[Array, csr_array, Array, float]:
-    """Return objective, constraint rows and upper limits of the program over the variables (candidates, groups).
+    """Return objective, constraint rows, their upper limits, and the scale of weights in the objective.
 
-    A group is covered only where one of its candidates is chosen; the chosen cost at most `budget`, and a pole has one.
-    The last is the factor to weights in the objective.
+    Variables are (candidates, groups). A group is covered only where one of its candidates is chosen; the chosen ones
+    cost at most `budget`, and a pole has at most one.
     """
     weight, scale = _scale(instance.weight, instance.worth.tolist())
     candidates, groups = instance.covers.shape  # pyright: ignore[reportGeneralTypeIssues]
@@ -130,7 +139,7 @@ def _program(instance: CoverageInstance, budget: float) -> tuple[Array, csr_arra
 def _solve(
     instance: CoverageInstance, objective: Array, rows: csr_array, limits: Array, limited: bool
 ) -> tuple[list[int] | None, float]:
-    """Return the choice that minimises `objective`, and its bound."""
+    """Return the choice that minimises `objective`, and the dual bound on its value."""
     candidates, groups = instance.covers.shape  # pyright: ignore[reportGeneralTypeIssues]
     options = {"mip_rel_gap": 0.0} | ({"node_limit": NODES} if limited else {})
     result = milp(

@@ -28,7 +28,7 @@ EPS = 2.0**-52  # relative rounding of an operation with floats, rounded up
 
 @dataclass(frozen=True)
 class Relaxation:
-    """A dual solution: its bound on the covered weight, and what each candidate would take from it."""
+    """A dual solution: its bound on the covered weight, and by how much the choice of a candidate lowers it."""
 
     bound: float  # proven: no choice within the budget covers more
     share: Array  # (N,) in [0, 1], fractional choice
@@ -39,20 +39,27 @@ class Relaxation:
 
 
 def relax(instance: CoverageInstance, budget: float, enough: float = 0.0) -> Relaxation:
-    """Return the best bound found; ends early where it has converged, or is `enough` (a covered weight)."""
-    covers, weight, cost, kinds = instance.covers, instance.weight, instance.cost, instance.sensors
+    """Return the best bound found; stop early when it has converged, or has reached `enough` (a covered weight)."""
+    covers = instance.covers
+    weight = instance.weight
+    cost = instance.cost
+    kinds = instance.sensors
     by_group = covers.T.tocsr()
     poles = len(cost) // kinds
-    total, reached = float(weight.sum()), np.maximum(covers @ weight, NOTHING)
+    total = float(weight.sum())
+    reached = np.maximum(covers @ weight, NOTHING)
     of_pole = reached.reshape(poles, kinds).mean(axis=1)
     costs = max(float(cost.sum()), NOTHING)
     budget_scale = total / max(budget, NOTHING)
+    # Diagonal preconditioning (Pock and Chambolle 2011): a step is the inverse of its row's or column's absolute sum.
     step = 1.0 / (reached + budget_scale * cost + np.repeat(of_pole, kinds))
     step_u = weight / np.bincount(covers.indices, minlength=len(weight))
-    step_pole, step_price = of_pole / kinds, budget_scale / costs
+    step_pole = of_pole / kinds
+    step_price = budget_scale / costs
 
     x, u, pole, price = np.zeros(len(cost)), weight.copy(), np.zeros(poles), 0.0
-    sums, counted = (np.zeros(len(cost)), np.zeros(len(weight)), np.zeros(poles), 0.0), 0
+    sums = (np.zeros(len(cost)), np.zeros(len(weight)), np.zeros(poles), 0.0)
+    counted = 0
     best = bound_by(instance, budget, np.zeros(len(weight)), x)
     before = best.bound
     for number in range(1, STEPS + 1):
@@ -78,9 +85,10 @@ def relax(instance: CoverageInstance, budget: float, enough: float = 0.0) -> Rel
 
 
 def bound_by(instance: CoverageInstance, budget: float, u: Array, share: Array) -> Relaxation:
-    """Return the proven bound of the dual values `u` (K,) in [0, weight], with the price that is best for it."""
+    """Return the bound that the dual values `u` (K,) in [0, weight] prove, at the price that makes it least."""
     kinds = instance.sensors
-    gain, cost = (instance.covers @ u).reshape(-1, kinds), instance.cost.reshape(-1, kinds)
+    gain = (instance.covers @ u).reshape(-1, kinds)
+    cost = instance.cost.reshape(-1, kinds)
     rows = np.arange(len(gain))
     free = fsum((instance.weight - u).tolist())
 

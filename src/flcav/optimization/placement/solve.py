@@ -1,9 +1,9 @@
-"""Budgeted maximum coverage by roadside sensors, with a proven bound on what any other choice covers.
+"""Budgeted maximum coverage by roadside sensors, with a proven upper bound on the weight that any choice covers.
 
-Small instances are mixed-integer programs, solved by HiGHS to the optimum. Of large ones the linear relaxation is
-bounded by its dual (`relaxation.py`), its fractional choice is rounded and improved by exchanges, and candidates
-with which the bound falls below the best choice found are left out (fixing by reduced costs); the program of those that
-remain is small. The relaxation without variables for errors is that of Cordeau, Furini and Ljubic, "Benders
+Small instances are mixed-integer programs, which HiGHS solves to optimality. For large ones the dual of the linear
+relaxation gives the bound (`relaxation.py`), the fractional solution is rounded and improved by exchanges, and
+candidates whose selection would lower the bound below the incumbent are removed (reduced-cost fixing); the program of
+the remaining ones is small. The relaxation without variables for errors follows Cordeau, Furini and Ljubic, "Benders
 decomposition for very large scale partial set covering and maximal covering location problems" (EJOR 275, 2019).
 """
 
@@ -49,7 +49,7 @@ SURE = 0.05  # fractional choice from which a candidate is rounded up
 
 @dataclass(frozen=True)
 class Certificate:
-    """A solution of the linear relaxation's dual, which proves a bound by itself, and what a search claims above it.
+    """A dual solution of the linear relaxation, which proves a bound by itself, and the tighter bound of a search.
 
     For any budget, covered weight <= sum_e (w_e - u_e) + price budget + sum_poles max(0, max_sensors (sum of the u_e
     that the sensor covers - price cost)).
@@ -63,13 +63,13 @@ class Certificate:
 
 @dataclass(frozen=True)
 class Placement(Displayed):
-    """The chosen poles and their sensors, the errors they cover, and a certificate of optimality."""
+    """A placement of sensors: chosen poles, their sensors, the errors they cover, and a certificate of optimality."""
 
     chosen: tuple[int, ...]  # indices into the poles, ascending
     covered: int  # errors within range of a chosen pole
     covered_weight: float
     upper_bound: float  # proven: no choice of as many poles, or within the budget, covers more weight
-    optimal: bool  # whether `covered_weight` equals the bound; of `cover_share`, `cost` its own bound
+    optimal: bool  # whether `covered_weight` equals the bound; for `cover_share`, whether `cost` equals its bound
     sensors: tuple[int, ...] = ()  # index into the sensors of each chosen pole
     cost: float = 0.0  # of the chosen
     marginal_gain: tuple[float, ...] = ()  # weight that each of the chosen alone covers: lost if it were left out
@@ -111,12 +111,15 @@ class Candidates:
         return len(self.cost) // self.sensors
 
     def at_unit_cost(self) -> "Candidates":
-        """Return the same candidates, each of which costs 1."""
+        """Return the same candidates at a cost of 1 for every sensor."""
         ones = np.ones(len(self.cost))
         return replace(self, cost=ones, price=in_units(ones))
 
     def instance(self, method: Method = "exact") -> CoverageInstance:
-        """Return the instance with errors merged that the same candidates cover; greedy, not where it takes longest."""
+        """Return the coverage instance, with errors that the same candidates cover merged into groups.
+
+        Large instances are not merged for the greedy method, which takes less time than merging them.
+        """
         if method == "greedy" and self.covers.nnz > SEARCHED:
             return CoverageInstance(self.covers, self.weight, self.cost, self.price, self.sensors)
         return merge_errors(self.covers, self.weight, self.cost, self.sensors, self.price, self.worth)
@@ -167,7 +170,7 @@ def find_candidates(
 
 
 def place_count(candidates: Candidates, count: int, *, method: Method = "exact") -> Placement:
-    """Return the placement of `count` sensors, one a pole, that covers most weight; costs play no part in the choice.
+    """Return the placement of `count` sensors, at most one per pole, that covers the most weight; costs are ignored.
 
     Raises `InputError` where count or method are invalid.
     """
@@ -187,7 +190,7 @@ def place_count(candidates: Candidates, count: int, *, method: Method = "exact")
 
 
 def place_budget(candidates: Candidates, budget: float, *, method: Method = "exact") -> Placement:
-    """Return the placement of sensors, at most one a pole, that covers most weight for at most `budget`.
+    """Return the placement of sensors, at most one per pole, that covers the most weight at a cost of at most `budget`.
 
     Raises `InputError` where the method is invalid, or the budget is below the cheapest candidate.
     """
@@ -207,17 +210,19 @@ def place_budget(candidates: Candidates, budget: float, *, method: Method = "exa
 
 @dataclass(frozen=True)
 class Found:
-    """A choice of candidates with its proof."""
+    """A choice of candidates with the bound that proves its quality."""
 
     chosen: list[int]  # ascending
     bound: float  # proven: no choice covers more weight, or costs less
-    root: Relaxation  # whose dual proves a bound of its own
+    root: Relaxation  # the relaxation whose dual proves a bound
     search: float | None = None  # bound that a search states above it; None: none was made
 
 
 def maximise(instance: CoverageInstance, budget: int, method: Method) -> Found:
-    """Return the candidates that cover most weight within the exact `budget`, with a proven bound on that weight."""
-    chosen, limit, small = choose_greedily(instance, budget), as_float(budget), instance.covers.nnz <= WHOLE
+    """Return the candidates that cover the most weight within the exact `budget`, with a proven bound on the weight."""
+    chosen = choose_greedily(instance, budget)
+    limit = as_float(budget)
+    small = instance.covers.nnz <= WHOLE
     if method == "greedy":
         root = bound_at(instance, limit) if small else bound_of_choice(instance, limit, chosen)
         if small and root.bound <= instance.value(chosen) * (1 + TIE):
@@ -229,6 +234,7 @@ def maximise(instance: CoverageInstance, budget: int, method: Method) -> Found:
         root = relax(instance, limit, instance.value(chosen))
         chosen = improve(instance, budget, chosen, root)
         rest = keep_candidates(instance, root.bound - root.loss > instance.value(chosen) * (1 - TIE))
+        # Reduced-cost fixing: a choice with candidate k covers at most `bound - loss[k]`, so that k may be dropped.
         if rest.covers.nnz > SEARCHED:
             return Found(chosen, lower_to(instance, root.bound, chosen), root)
         if not rest.covers.nnz:
@@ -258,15 +264,17 @@ def _close(
 ) -> Found:
     """Return `chosen`, or a better choice, with the least bound that is proven.
 
-    `rest`: the candidates of which a better choice is. `claimed`: the bound of HiGHS' search; None: it was not asked.
-    That nothing is better is proven where `root` leaves no sum of weights above the choice's, where HiGHS does and
-    tells such sums from each other, or where the search in whole numbers ends; if none, HiGHS is believed to `TIE`.
+    `rest` holds the candidates among which a better choice may exist; `claimed` is the bound of HiGHS' search, None
+    where it was not run. Optimality is proven where `root` leaves no sum of weights above the choice's, where HiGHS
+    leaves none and can distinguish such sums, or where the search in integers completes; otherwise HiGHS is trusted to
+    `TIE`.
     """
     worth, value = instance.worth.tolist(), as_float(instance.worth_of(chosen))
     if claimed is None and lower_to(instance, root.bound, chosen) == value:
         return Found(chosen, value, root)
     claimed = root.bound if claimed is None else claimed
     if is_coarse(worth) and claimed < value + as_float(common_unit(worth)) / 2:
+        # Sums of weights are multiples of their common unit: none lies within half a unit above the value.
         return Found(chosen, value, root, value)
     if claimed <= value * (1 + NEARLY):
         chosen, ended = improve_exactly(instance, rest, bound_at(rest, as_float(budget)), budget, chosen)
@@ -283,7 +291,7 @@ def bound_at(instance: CoverageInstance, budget: float) -> Relaxation:
 
 
 def lower_to(instance: CoverageInstance, bound: float, chosen: Sequence[int]) -> float:
-    """Return what `chosen` covers where `bound` proves that no sum of weights above that can be covered; else it."""
+    """Return the covered weight of `chosen` where `bound` excludes every greater sum of weights; else `bound`."""
     value = instance.value(chosen)
     if bound > value * (1 + TIE):
         return bound
@@ -296,7 +304,7 @@ def lower_to(instance: CoverageInstance, bound: float, chosen: Sequence[int]) ->
 def certify(
     candidates: Candidates, instance: CoverageInstance, root: Relaxation, bound: float, search: float | None
 ) -> Certificate:
-    """Return the certificate of the `root` relaxation of `instance`; a group's dual is divided over its errors."""
+    """Return the certificate of the `root` relaxation; a group's dual is divided over its errors by their weights."""
     values = root.dual
     if instance.group is not None:
         share = np.divide(values, instance.weight, out=np.ones(len(values)), where=instance.weight > 0)
@@ -305,7 +313,7 @@ def certify(
 
 
 def bound_of_choice(instance: CoverageInstance, budget: float, chosen: Sequence[int]) -> Relaxation:
-    """Return the bound that a choice proves: what is covered counts in full, and of the rest what could be afforded."""
+    """Return the bound that a choice proves: its covered weight, and the most that the budget could add to it."""
     left = np.where(reach(instance.covers, chosen), 0.0, instance.weight)
     return bound_by(instance, budget, left, np.zeros(len(instance.cost)))
 
@@ -326,7 +334,7 @@ def improve(instance: CoverageInstance, budget: int, chosen: Sequence[int], rela
 
 
 def keep_candidates(instance: CoverageInstance, kept: NDArray[np.bool_]) -> CoverageInstance:
-    """Return the instance in which only the candidates `kept` (N,) cover anything, its groups merged again."""
+    """Return the instance in which only the candidates `kept` (N,) cover anything, with its groups merged again."""
     covers = csr_array(diags_array(kept.astype(np.float64)) @ instance.covers)
     covers.eliminate_zeros()
     return merge_errors(covers, instance.weight, instance.cost, instance.sensors, instance.price, instance.worth)
@@ -378,20 +386,21 @@ def _points(values: ArrayLike, name: str) -> Array:
 
 
 def _prefer_earlier(instance: CoverageInstance, chosen: Sequence[int]) -> list[int]:
-    """Return the choice with each candidate replaced by the earliest one, of a free pole, that loses no weight."""
+    """Return the choice with each candidate replaced by the earliest one on a free pole that covers as much weight."""
     kinds = instance.sensors
     chosen = list(chosen)
     for candidate in sorted(chosen):
         others = [other for other in chosen if other != candidate]
         left = np.where(reach(instance.covers, others), 0.0, instance.weight)
-        gain, taken = instance.covers @ left, {other // kinds for other in others}
+        gain = instance.covers @ left
+        taken = {other // kinds for other in others}
 
-        def gain_of(each: int, left: Array = left) -> int:
-            own = instance.covered_by(each)
+        def gain_of(index: int, left: Array = left) -> int:
+            groups = instance.covered_by(index)
             return (
-                sum(in_units(left[own]).tolist())
+                sum(in_units(left[groups]).tolist())
                 if instance.summed is None
-                else sum(instance.summed[own[left[own] > 0]])
+                else sum(instance.summed[groups[left[groups] > 0]])
             )
 
         needed = gain_of(candidate)

@@ -1,9 +1,9 @@
-"""Largest area of the accuracy polygon: the tasks' accuracies on equally spaced axes of a radar chart.
+"""Maximisation of the area of the accuracy polygon: the tasks' accuracies on equally spaced axes of a radar chart.
 
 With N >= 3 corners r_i the area is sin(2 pi / N) / 2 * sum_i r_i r_(i+1) (Wang et al., IEEE Network 37(3), 2023,
-Fig. 6b). Its derivative by a task's accuracy is proportional to the sum of its neighbours' accuracies. It is climbed by
-successive linearisation: the next plan is the one of least weighted error with the gradient as weights. As the area is
-not concave, the climb has several starts.
+Fig. 6b). Its derivative with respect to a task's accuracy is proportional to the sum of its neighbours' accuracies.
+Successive linearisation climbs it: the next plan is the one of least weighted error with the gradient as weights. As
+the area is not concave, the climb has several starts.
 """
 
 from collections.abc import Sequence
@@ -19,13 +19,13 @@ from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 STEPS = 12  # most steps from each start
 EMPHASIS = 3.0  # weight of one corner in the start that emphasises it
-MOST_EMPHASISED = 6  # corners, up to which each has a start of its own
+MOST_EMPHASISED = 6  # corners up to which there is one more start for each
 LEAST_WEIGHT = 1e-6  # of a corner
 
 
 @dataclass(frozen=True)
 class Polygon:
-    """A whole plan with the area of its predicted accuracies."""
+    """An integer plan with the area of its predicted accuracies."""
 
     x: Array  # (n,)
     area: float
@@ -33,13 +33,13 @@ class Polygon:
 
 
 def area(accuracy: Array) -> float:
-    """Return the area of the polygon whose corners are the accuracies (N,), in order; one below 0 counts as 0."""
+    """Return the area of the polygon whose corners are the accuracies (N,), in order; negative ones count as 0."""
     corners = np.maximum(accuracy, 0)
     return 0.5 * float(np.sin(2 * np.pi / len(corners)) * (corners @ np.roll(corners, -1)))
 
 
 def maximise_area(problem: Problem, gap: float, clocks: Sequence[Clock] = ()) -> Polygon:
-    """Return the plan of largest area among the local optima from several starts; there is no certificate.
+    """Return the plan of largest area among the local optima from several starts; nothing is proven.
 
     `gap` is the relative gap of each weighted problem, and the least relative gain of a step; `clocks` are as in
     `build_instance`. Raises `Infeasible` where no plan is within the budgets.
@@ -60,7 +60,8 @@ def _climb(problem: Problem, weights: Array, gap: float, clocks: Sequence[Clock]
         reached = Polygon(found.x, area(accuracy), found.rates)
         if reached.area <= best.area * (1 + gap):
             return max(best, reached, key=lambda polygon: polygon.area)
-        best, corners = reached, np.maximum(accuracy, 0)
+        best = reached
+        corners = np.maximum(accuracy, 0)
         weights = 0.5 * np.sin(2 * np.pi / len(corners)) * (np.roll(corners, 1) + np.roll(corners, -1))
     return best
 
@@ -77,14 +78,14 @@ def _accuracy(problem: Problem, x: Array) -> Array:
 
 
 def _weighed(problem: Problem, weights: Array) -> Problem:
-    """Return `problem` with other weights, one per learner in order."""
+    """Return `problem` with other `weights`, one per learner, in order."""
     left = iter(weights.tolist())
     tasks = []
     for task in problem.tasks:
-        own = [next(left) for _ in task.learners]
-        update: dict[str, object] = {"weight": sum(own)}
+        task_weights = [next(left) for _ in task.learners]
+        update: dict[str, object] = {"weight": sum(task_weights)}
         if isinstance(task.curve, SharedCurve):
-            members = (member.model_copy(update={"weight": w}) for member, w in zip(task.curve.members, own))
+            members = (member.model_copy(update={"weight": w}) for member, w in zip(task.curve.members, task_weights))
             update["curve"] = task.curve.model_copy(update={"members": tuple(members)})
         tasks.append(task.model_copy(update=update))
     return problem.model_copy(update={"tasks": tuple(tasks)})

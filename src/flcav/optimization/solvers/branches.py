@@ -1,10 +1,10 @@
-"""Problems whose first cloud rounds cost accuracy, or whose plan calls vehicles, as problems without either.
+"""Branching on the first cloud round and on the number of vehicles called.
 
-An additive curve with a `merge` is not convex in the cloud rounds. It is convex without any, and from the first on,
-where the cost is part of its floor. Labels that are sent once before the first cloud round (`labels_mb`) cost megabytes
-in the same way. So each such task has two branches. How many vehicles are called to the rounds of stage II multiplies
-what a round costs and what it brings: a task has as many branches as there are numbers to choose from. The best plan of
-all branches is the best plan of the problem, and the least of their lower bounds is one.
+An additive curve with a `merge` is not convex in the cloud rounds. It is convex without any, and from the first one on,
+where the cost is part of its floor. Labels that are sent once, before the first cloud round (`labels_mb`), cost
+megabytes in the same way: each such task has two branches. The number of vehicles called to the rounds of stage II
+multiplies what a round costs and what it brings: a task has a branch for each number. The best plan of all branches is
+the best plan of the problem, and the least of their lower bounds is a lower bound of it.
 """
 
 from collections.abc import Callable, Iterator
@@ -25,8 +25,8 @@ MOST_CALLS = 2**MOST_BRANCHING  # combinations of numbers of vehicles
 def solve_branches(problem: Problem, solve: Callable[[Problem], T]) -> list[T]:
     """Return the result of `solve` for each branch that has a plan; the first has the fewest cloud rounds.
 
-    Raises `Infeasible`, that of the first branch, where none has a plan, and `InputError` for more than
-    `MOST_BRANCHING` tasks with two branches, or more than `MOST_CALLS` choices of vehicles.
+    Raises `Infeasible`, that of the first branch, where none has a plan, and `InputError` where more than
+    `MOST_BRANCHING` tasks have two branches, or vehicles can be called in more than `MOST_CALLS` ways.
     """
     found: list[T] = []
     refused: list[Infeasible] = []
@@ -41,11 +41,11 @@ def solve_branches(problem: Problem, solve: Callable[[Problem], T]) -> list[T]:
 
 
 def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> AllocationTask:
-    """Return the task with `least` to `most` vehicles called to stage II, and curves by what `most` bring to it.
+    """Return the task with `least` to `most` vehicles called to stage II, and curves for the data that `most` bring.
 
-    Of what the vehicles of an edge server hold they bring the share of their `worth`. Stage III has all vehicles, so
-    that the rest is learned in cloud rounds: z of them bring the share 1 - 1 / (z + 1) of it, which for `k` > 1 edge
-    rounds in each is less than it would be; for k = 0 nobody trains in them.
+    The called vehicles of an edge server bring their share of its data, by `worth`. Stage III has all vehicles, so that
+    the rest is learned in cloud rounds: z of them bring the share 1 - 1 / (z + 1) of it, which understates it for
+    `k` > 1 edge rounds in each; for k = 0 no vehicle trains in them.
     """
     before = task.weigh_groups(max(task.edge_groups) if task.called is None else task.called[1])
     after = task.weigh_groups(most)
@@ -60,7 +60,7 @@ def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> Alloca
             return Federated(model="federated", **values, group_samples=(held, held), gamma=others)
         if isinstance(curve, Federated):
             parts = shares if len(shares) == len(curve.group_samples) else [whole] * len(curve.group_samples)
-            brought = tuple(part * own for part, own in zip(parts, curve.group_samples, strict=True))
+            brought = tuple(part * held for part, held in zip(parts, curve.group_samples, strict=True))
             (own, others), (new_own, new_others) = split_regions(curve.group_samples), split_regions(brought)
             rest = curve.gamma * others + (own - new_own) * (k > 0)
             return curve.model_copy(
@@ -73,7 +73,7 @@ def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> Alloca
 
 
 def list_calls(task: AllocationTask, k: int) -> Iterator[AllocationTask]:
-    """Yield the task with each number of vehicles that a plan may call, the fewest first; or itself."""
+    """Yield the task once per number of vehicles that a plan may call, the fewest first; else the task itself."""
     if task.called is None:
         yield task
         return
@@ -99,13 +99,13 @@ def _list_branches(problem: Problem) -> list[Problem]:
 
 
 def _branch(task: AllocationTask) -> list[AllocationTask]:
-    """Return the task without cloud rounds, and with one or more, as far as its limits and curves allow either."""
-    own = _list_own(task.curve)
-    if not (task.labels_mb or any(curve.merge for curve in own)):
+    """Return the branches of a task without cloud rounds, and with one or more, where limits and curves allow them."""
+    curves = _list_own(task.curve)
+    if not (task.labels_mb or any(curve.merge for curve in curves)):
         return [task]
     least, most = task.limits.cloud_rounds
     branches = []
-    if least == 0 and not any(curve.cloud.infinite_at_0 for curve in own):
+    if least == 0 and not any(curve.cloud.infinite_at_0 for curve in curves):
         branches.append(_limit(task, (0, 0), merged=False))
     if most > 0:
         branches.append(_limit(task, (max(least, 1), most), merged=True))
@@ -114,11 +114,11 @@ def _branch(task: AllocationTask) -> list[AllocationTask]:
 
 def _list_own(curve: Curve) -> list[Additive]:
     members = [member.curve for member in curve.members] if isinstance(curve, SharedCurve) else [curve]
-    return [each for each in members if isinstance(each, Additive)]
+    return [member for member in members if isinstance(member, Additive)]
 
 
 def _limit(task: AllocationTask, cloud_rounds: tuple[int, int], *, merged: bool) -> AllocationTask:
-    """Return the task with other limits, and with the cost of the first cloud round paid (`merged`) or left out."""
+    """Return the task with other limits, and the cost of the first cloud round in its floor (`merged`) or left out."""
     limits = task.limits.model_copy(update={"cloud_rounds": cloud_rounds})
     return task.model_copy(update={"limits": limits, "curve": _settle(task.curve, merged)})
 

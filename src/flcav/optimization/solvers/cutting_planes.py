@@ -4,9 +4,9 @@ The method is that of Duran and Grossmann (1986). Each convex term is bounded fr
 secants through neighbouring whole numbers. With the cuts in place of the terms, the problem is a (mixed-integer) linear
 program. Its optimum is a proven lower bound, and the next cuts are added at its solution.
 
-Concave terms are functions of one quantity each. Every whole number j in its range has a variable w_j in [0, 1]: the
-w_j sum to 1, j w_j sums to the quantity, and the term is the sum of its values at j times w_j. For whole w that is
-exact; in the continuous relaxation it is the term's convex envelope, and so a lower bound.
+Concave terms are functions of one quantity. Every whole number j in its range has a variable w_j in [0, 1]: the w_j sum
+to 1, j w_j sums to the quantity, and the term is the sum of its values at j times w_j. For integral w that is exact; in
+the continuous relaxation it is the term's convex envelope, and so a lower bound.
 """
 
 from collections.abc import Sequence
@@ -32,7 +32,7 @@ class Line(NamedTuple):
 
 
 class Term(Protocol):
-    """A convex function of some of the quantities, with its cuts."""
+    """A convex function of some quantities, with its cuts."""
 
     def value(self, x: Array) -> float:
         """Return the value of the term at x (n,)."""
@@ -58,7 +58,7 @@ class Concave(Protocol):
 
 @dataclass(frozen=True)
 class Program:
-    """Integer program: minimise the sum of all terms over whole x in [low, high] with x @ cost <= budget."""
+    """An integer program: minimise the sum of all terms over integers x in [low, high] with x @ cost <= budget."""
 
     terms: Sequence[Term]
     low: Array  # (n,) least of each quantity
@@ -73,7 +73,7 @@ class Program:
 
 
 class Cuts:
-    """The cuts added so far to a `Program`: a linear program that bounds it from below."""
+    """The linear program of the cuts added so far to a `Program`, which bounds it from below."""
 
     def __init__(self, program: Program) -> None:
         self.program = program
@@ -101,7 +101,7 @@ class Cuts:
         return require_optimum(result)[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
-        """Return the optimum whole x (n,) to a relative `gap`, and the proven lower bound.
+        """Return the optimal integers x (n,) to a relative `gap`, and the proven lower bound.
 
         Raises `InputError` where HiGHS fails.
         """
@@ -142,8 +142,8 @@ class Cuts:
         column = len(self.program.low) + len(self.program.terms)
         rows = np.zeros((2 * len(self._steps), column + self._tabulated))
         for i, (term, steps) in enumerate(zip(self.program.concave, self._steps)):
-            own = slice(column, column + len(steps))
-            rows[2 * i, own], rows[2 * i + 1, own] = 1.0, steps
+            columns = slice(column, column + len(steps))
+            rows[2 * i, columns], rows[2 * i + 1, columns] = 1.0, steps
             rows[2 * i + 1, term.index] = -1.0
             column += len(steps)
         return csr_array(rows), np.tile((1.0, 0.0), len(self._steps))
@@ -154,7 +154,8 @@ class Cuts:
         Its rows are the budgets, scaled to 1, then slope . x - term <= -value for every cut.
         """
         program, n, budgets = self.program, len(self.program.low), len(self.program.budget)
-        budget, quantity = np.repeat(np.arange(budgets), n), np.tile(np.arange(n), budgets)
+        budget = np.repeat(np.arange(budgets), n)
+        quantity = np.tile(np.arange(n), budgets)
         rows, columns, values = [*budget], [*quantity], [*(program.cost / program.budget).T.ravel()]
         for row, (number, line) in enumerate(self._lines, start=budgets):
             rows += [row] * (len(line.of) + 1)
@@ -186,11 +187,11 @@ def continuous_optimum(
 def outer_approximation(
     program: Program, starts: Sequence[Array], gap: float, floor: float = 0.0
 ) -> tuple[list[Array], float]:
-    """Return the whole points (n,) that outer approximation visited, and a proven lower bound.
+    """Return the integer points (n,) that outer approximation visited, and a proven lower bound.
 
     It ends when the best point is within `gap` of the bound, relative to the bound plus `floor`; when a point adds no
-    cut, as it is then optimal; or after 40 points. A point may exceed a budget by the solver's tolerance (1e-7 of it):
-    the caller trims it. Raises `InputError` where HiGHS fails.
+    cut, which proves it optimal; or after 40 points. A point may exceed a budget by the solver's tolerance (1e-7 of
+    it), so that the caller has to trim it. Raises `InputError` where HiGHS fails.
     """
     _, bound, cuts = continuous_optimum(program, starts, gap, floor)
     visited: list[Array] = []
@@ -198,7 +199,8 @@ def outer_approximation(
     for _ in range(40):
         x, below = cuts.solve(gap / 2)
         visited.append(x)
-        bound, best = max(bound, below), min(best, program.value(x))
+        bound = max(bound, below)
+        best = min(best, program.value(x))
         if best - bound <= gap * (bound + floor) or not cuts.add(x):
             break
     return visited, bound

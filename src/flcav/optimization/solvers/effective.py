@@ -1,13 +1,13 @@
-"""Least Lagrangian of curves over effective samples, over whole samples and rounds, vectorised over tasks.
+"""Minimisation of the Lagrangian of curves over effective samples, in integers, vectorised over tasks.
 
 A task's error above its floor is
 
     weight (a n^(-b) + drift part of z),   n = alpha x + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)),
 
-with x samples, t = y + k z rounds and z cloud rounds. Where cloud rounds bring more than edge rounds do, or cost less
-(labels go up before each edge round), every pair (y, z) is tried; for other `Effective` curves, and `Federated` ones
-whose cloud rounds bring nothing, only those with the fewest cloud rounds for each t. For each pair the best x has a
-closed form. No step needs the error to be convex in the rounds, or to fall with them.
+with x samples, t = y + k z rounds and z cloud rounds. Where cloud rounds bring more than edge rounds, or cost less
+(labels are sent before each edge round), every pair (y, z) is tried; for other `Effective` curves, and for `Federated`
+ones whose cloud rounds bring nothing, only the pair with the fewest cloud rounds for each t. For a given pair the best
+x has a closed form. No step needs the error to be convex in the rounds, or to decrease with them.
 """
 
 from collections.abc import Sequence
@@ -25,13 +25,13 @@ from flcav.optimization.solvers.separable import BUDGET_SLACK
 
 @dataclass(frozen=True)
 class EffectiveTasks:
-    """The E tasks with such curves, and T choices of rounds each; a missing choice has infinite cost."""
+    """E tasks with curves over effective samples, and T choices of rounds for each; a missing choice costs infinity."""
 
     quantity: NDArray[np.intp]  # (E, 3) indices of samples, edge rounds, cloud rounds in the whole problem
     gain: Array  # (E, 1) weight * a
     b: Array  # (E, 1)
     alpha: Array  # (E, 1)
-    own: Array  # (E, 1) worth of the samples held in a task's own region
+    own: Array  # (E, 1) worth of the samples held in a task's region
     others: Array  # (E, 1) worth of the samples held in the other regions
     drift: Array  # (E, 1) weight * drift
     k: int  # edge rounds per cloud round
@@ -43,11 +43,11 @@ class EffectiveTasks:
 
     def error(self, x: Array) -> Array:
         """Return the weighted errors (E,) above their floors at x (n,) of the whole problem."""
-        own = x[self.quantity][:, None]
-        return self._error(own[..., 0], own[..., 1:])[:, 0]
+        counts = x[self.quantity][:, None]
+        return self._error(counts[..., 0], counts[..., 1:])[:, 0]
 
     def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, Array]:
-        """Return the whole quantities (E, 3) of least error plus price at `multipliers` (L,), and the minima (E,)."""
+        """Return the integers (E, 3) of least error plus price at `multipliers` (L,), and the minima (E,)."""
         samples, value = self._best_samples(multipliers)
         best = np.argmin(value, axis=1)
         task = np.arange(len(best))
@@ -74,8 +74,9 @@ class EffectiveTasks:
         return np.column_stack((low, least)), np.column_stack((high, most))
 
     def _best_samples(self, multipliers: Array) -> tuple[Array, Array]:
-        """Return the best whole number of samples for each choice of rounds (E, T), and error plus price (E, T)."""
+        """Return the best integer number of samples for each choice of rounds (E, T), and error plus price (E, T)."""
         price = (self.sample_cost @ multipliers)[:, None]
+        # At the stationary point the marginal gain of a sample equals its price.
         with np.errstate(divide="ignore"):
             level = (self.gain * self.b * self.alpha / price) ** (1 / (self.b + 1))
         ideal = (level - self._effective(0.0, self.rounds)) / self.alpha
@@ -137,7 +138,7 @@ def build_effective_tasks(
 
 
 def _held(task: EffectiveTask) -> tuple[float, float, float]:
-    """Return the worth of the samples held in the own region and in the others, and the weighted drift."""
+    """Return the worth of the samples held in the task's region and in the others, and the weighted drift."""
     curve = task.curve
     if isinstance(curve, Federated):
         return curve.own, curve.others, task.weight * curve.drift

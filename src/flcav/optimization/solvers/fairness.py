@@ -1,9 +1,9 @@
-"""Max-min fairness: the plan of least largest error, with a proven lower bound over whole plans.
+"""Max-min fairness: the plan of least largest error, with a proven lower bound over integer plans.
 
-For an error level e, every pair of edge and cloud rounds of a task needs a least whole number of samples to keep the
-task's error at or below e, and so has a least cost. At prices at which all budgets together cost 1, the sum of the
-tasks' least costs is a lower bound of the price of any plan that keeps to e. Where it is above 1, level e is infeasible
-(Lagrangian duality; Everett 1963). Bisection finds the lowest level not excluded; from there on upwards, plans are
+For an error level e, every pair of edge and cloud rounds of a task needs a least integer number of samples to keep the
+task's error at or below e, and so has a least cost. At prices for which all budgets together cost 1, the sum of the
+tasks' least costs is a lower bound on the price of any plan that keeps to e. Where it exceeds 1, level e is infeasible
+(Lagrangian duality; Everett 1963). Bisection finds the lowest level that is not excluded; from there upwards, plans are
 combined task by task until one fits the budgets. The budgets are those of both links, and limits of time.
 """
 
@@ -32,7 +32,7 @@ SMALL = 1e-3  # relative change of the level in the finite difference of its pri
 
 @dataclass(frozen=True)
 class Fair:
-    """A whole plan with its largest error and a proven lower bound."""
+    """An integer plan with its largest error and a proven lower bound."""
 
     x: Array  # (n,)
     level: float  # the largest predicted error
@@ -44,7 +44,7 @@ class Fair:
 
 @dataclass(frozen=True)
 class Choices:
-    """The pairs of edge and cloud rounds of one task, and the learning curves of its members."""
+    """The pairs of edge and cloud rounds of a task, and the learning curves of its members."""
 
     rounds: Array  # (C, 2) edge rounds, cloud rounds
     least: float  # samples
@@ -68,8 +68,8 @@ class Choices:
 def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair:
     """Return a plan whose largest error is within a relative `gap` of the least possible, where one is found.
 
-    `made` is `problem` in arrays. The bound is proven in any case. Raises `InputError` where the limits of a task leave
-    more than `MOST_CHOICES` pairs of rounds.
+    `made` holds `problem` in arrays. The bound is proven in any case. Raises `InputError` where the limits of a task
+    leave more than `MOST_CHOICES` pairs of rounds.
     """
     tasks = _choices(problem, made)
     level = max(map(_largest, tasks, made.low.reshape(-1, 3)))
@@ -79,11 +79,13 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
         middle = 0.5 * (unreached + bound)
         choices = choose_at_level(tasks, middle, made.budget)
         if choices.out_of_reach:
-            bound, prices = middle, choices.prices
+            bound = middle
+            prices = choices.prices
         else:
             unreached = middle
     root = bound
-    tried, stride = bound, 0.1 * gap * bound
+    tried = bound
+    stride = 0.1 * gap * bound
     while level - tried > 0.1 * gap * tried:
         trial = min(0.5 * (level + tried), tried + stride)
         plan, excluded = combine_choices(choose_at_level(tasks, trial, made.budget))
@@ -91,7 +93,8 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
             best, level = plan.ravel(), max(map(_largest, tasks, plan))
             continue
         bound = trial if excluded and bound == tried else bound
-        tried, stride = trial, 2 * stride
+        tried = trial
+        stride = 2 * stride
     held, below = (choose_at_level(tasks, level * share, made.budget) for share in (1, 1 - SMALL))
     dearer = below.total(held.prices) - held.total(held.prices)
     rates = SMALL * level / dearer * held.prices if 0 < dearer < np.inf else np.zeros(len(made.budget))
@@ -102,7 +105,7 @@ def minimise_largest_error(problem: Problem, made: Instance, gap: float) -> Fair
 
 @dataclass(frozen=True)
 class LevelChoices:
-    """The Pareto-optimal choices of all tasks at one error level, and the link prices of the best lower bound."""
+    """The Pareto-optimal choices of all tasks at an error level, and the link prices of the best lower bound."""
 
     counts: tuple[Array, ...]  # per task (P, 3)
     costs: tuple[Array, ...]  # per task (P, L)
@@ -118,8 +121,8 @@ class LevelChoices:
 def choose_at_level(tasks: Sequence[Choices], level: float, budget: Array) -> LevelChoices:
     """Return the tasks' choices at an error `level`, with the prices that maximise the least total cost.
 
-    The total cost is concave in the prices. For two budgets bisection on its supergradient by the wireless link's share
-    of the price maximises it, for more of them Kelley's cutting planes do.
+    The total cost is concave in the prices. With two budgets, bisection on its supergradient by the wireless link's
+    share of the price maximises it; with more, Kelley's cutting planes do.
     """
     counts, costs = zip(*(task.frontier(level) for task in tasks))
     if not all(map(len, counts)):
@@ -144,9 +147,9 @@ def choose_at_level(tasks: Sequence[Choices], level: float, budget: Array) -> Le
 
 
 def _dearest_prices(joined: Array, starts: NDArray[np.intp]) -> tuple[Array, float]:
-    """Return prices (L,), summing to 1, of nearly largest least total cost, and that cost.
+    """Return the prices (L,), summing to 1, that nearly maximise the least total cost, and that cost.
 
-    `joined` (C, L) are the costs of all tasks' choices, of which each task's begin at `starts` (N,).
+    `joined` (C, L) are the costs of all tasks' choices; those of a task begin at its entry of `starts` (N,).
     """
     budgets = joined.shape[1]
     prices, best, most, planes = np.full(budgets, 1 / budgets), np.full(budgets, 1 / budgets), -np.inf, []
@@ -156,7 +159,8 @@ def _dearest_prices(joined: Array, starts: NDArray[np.intp]) -> tuple[Array, flo
         chosen = [start + int(np.argmin(priced[start:end])) for start, end in zip(starts, ends)]
         planes.append(np.r_[1.0, -joined[chosen].sum(axis=0)])
         if (total := float(priced[chosen].sum())) > most:
-            most, best = total, prices
+            most = total
+            best = prices
         model = linprog(
             np.r_[-1.0, np.zeros(budgets)],
             A_ub=np.array(planes),
@@ -172,7 +176,7 @@ def _dearest_prices(joined: Array, starts: NDArray[np.intp]) -> tuple[Array, flo
 
 
 def combine_choices(held: LevelChoices) -> tuple[NDArray[np.float64] | None, bool]:
-    """Return a plan of whole counts (N, 3) within the budgets, or None; and whether it is proven that there is none.
+    """Return an integer plan (N, 3) within the budgets, or None; and whether it is proven that there is none.
 
     Dynamic programming over the tasks: of the partial plans only those on the Pareto front of both links' costs are
     kept. A choice that costs more above its task's least than the budgets have left is pruned.
@@ -198,7 +202,8 @@ def combine_choices(held: LevelChoices) -> tuple[NDArray[np.float64] | None, boo
             kept = kept[np.argsort(more[kept])[:MOST_MERGED]]
         sums, extra = total[kept], more[kept]
         trail.append((kept // len(usable), usable[kept % len(usable)]))
-    at, plan = int(np.argmin(extra)), []
+    at = int(np.argmin(extra))
+    plan = []
     for (earlier, choice), counts in zip(reversed(trail), reversed(held.counts)):
         plan.append(counts[choice[at]])
         at = int(earlier[at])
@@ -206,13 +211,13 @@ def combine_choices(held: LevelChoices) -> tuple[NDArray[np.float64] | None, boo
 
 
 def find_undominated(cost: Array) -> NDArray[np.intp]:
-    """Return the indices of the Pareto-optimal rows of `cost` (n, L), sorted by the first column; one of equals."""
+    """Return the indices of the Pareto-optimal rows of `cost` (n, L), by the first column; the first of equal rows."""
     if cost.shape[1] > 2:
-        left, found = np.lexsort(cost.T[::-1]), []
+        left, front = np.lexsort(cost.T[::-1]), []
         while len(left):
-            found.append(left[0])
+            front.append(left[0])
             left = left[np.any(cost[left] < cost[left[0]], axis=1)]
-        return np.array(found, dtype=np.intp)
+        return np.array(front, dtype=np.intp)
     order = np.lexsort((cost[:, 1], cost[:, 0]))
     second = cost[order, 1]
     before = np.minimum.accumulate(np.r_[np.inf, second[:-1]]) if len(order) else second
@@ -221,12 +226,12 @@ def find_undominated(cost: Array) -> NDArray[np.intp]:
 
 def _choices(problem: Problem, made: Instance) -> list[Choices]:
     low, high, cost = made.low.reshape(-1, 3), made.high.reshape(-1, 3), made.cost.reshape(-1, 3, len(made.budget))
-    found = []
+    choices = []
     for task, least, most, unit in zip(problem.tasks, low, high, cost):
         rounds = pair_rounds(least, most, "objective 'max-min'", task.name)
         curves = tuple(learner.curve for learner in task.learners)
-        found.append(Choices(rounds, least[0], most[0], curves, problem.edge_rounds_per_cloud_round, unit))
-    return found
+        choices.append(Choices(rounds, least[0], most[0], curves, problem.edge_rounds_per_cloud_round, unit))
+    return choices
 
 
 def _largest(task: Choices, counts: Array) -> float:
@@ -234,9 +239,9 @@ def _largest(task: Choices, counts: Array) -> float:
 
 
 def _least(task: Choices, counts: Array) -> float:
-    """Return an error below which no plan brings the task, at the most of its quantities, `counts` (3,).
+    """Return a lower bound on the task's error in any plan; `counts` (3,) are the most of its quantities.
 
-    That is its error there, but where rounds may cost accuracy: then the least over all choices of rounds.
+    It is the error there, except where rounds may cost accuracy: then the least over all choices of rounds.
     """
     if not any(isinstance(curve, Federated) and curve.drift > 0 for curve in task.curves):
         return _largest(task, counts)
@@ -245,7 +250,7 @@ def _least(task: Choices, counts: Array) -> float:
 
 
 def _samples_for(curve: OwnCurve, rounds: Array, k: int, level: float) -> Array:
-    """Return the fractional samples (C,) at which the error after `rounds` (C, 2) is `level`; infinite if none do."""
+    """Return the real number of samples (C,) that brings the error after `rounds` (C, 2) to `level`; else infinite."""
     with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
         if not isinstance(curve, Additive):
             left = level - curve.floor

@@ -1,4 +1,4 @@
-"""An allocation problem in arrays: three quantities per task, their bounds and costs, and the error they leave."""
+"""An allocation problem in arrays: three quantities per task, their bounds and costs, and the resulting error."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -19,30 +19,30 @@ from flcav.optimization.solvers.separable import BUDGET_SLACK, Separable, room
 
 
 def require_optimum(result: OptimizeResult) -> Array:
-    """Return the optimal variables in the result of SciPy's solver; raises `InputError` where it found none."""
+    """Return the optimal variables in the result of a SciPy solver; raises `InputError` where it found none."""
     if result.x is None:
         raise InputError(f"the solver fails on numbers of such different sizes: {shorten(result.message)}")
     return result.x
 
 
 class Infeasible(InputError):
-    """No plan within the limits fits: even the least one exceeds a budget, the samples held or the vehicles' time."""
+    """No plan fits: even the least one exceeds a budget, the samples held, or the time of the vehicles."""
 
 
 @dataclass(frozen=True)
 class Clock:
-    """A limit of time, which samples and rounds of N tasks spend as they spend megabytes."""
+    """A limit of time, which samples and rounds of N tasks consume as they consume megabytes."""
 
     per_sample: tuple[float, ...]  # (N,) [s]
     per_round: tuple[float, ...]  # (N,) [s] of an edge round; a cloud round is k of them
-    seconds: float  # there are
+    seconds: float  # available time [s]
 
 
 def shared_clock(problem: Problem) -> Clock | None:
-    """Return the limit of training time on a vehicle that takes part in every round of every task without names.
+    """Return the limit of training time on a vehicle that joins every round of all tasks without named vehicles.
 
-    Vehicles without names cannot be told apart, so each of them may be that one. None where no such task has a
-    `train_s`, or the problem no `horizon_s`.
+    Vehicles without names are indistinguishable, so that any of them may be that one. None where no such task has a
+    `train_s`, or the problem has no `horizon_s`.
     """
     per_round = tuple(0.0 if task.vehicles else task.train_s for task in problem.tasks)
     if problem.horizon_s is None or not any(per_round):
@@ -83,11 +83,11 @@ class Instance:
 
     def error(self, x: Array) -> float:
         """Return the weighted error above the floors at x (n,)."""
-        own = 0.0 if self.effective is None else float(self.effective.error(x).sum())
-        return float(self.separable.error(x).sum()) + own
+        effective_error = 0.0 if self.effective is None else float(self.effective.error(x).sum())
+        return float(self.separable.error(x).sum()) + effective_error
 
     def change(self, x: Array, step: int) -> Array:
-        """Return the change of the weighted error (n,) when each quantity alone changes by `step`."""
+        """Return the change of the weighted error (n,) when one quantity at a time changes by `step`."""
         with np.errstate(divide="ignore", invalid="ignore"):
             change = self.separable.error(x + step) - self.separable.error(x)
             if self.effective is not None:
@@ -99,27 +99,30 @@ class Instance:
         return change
 
     def minimise_lagrangian(self, multipliers: Array) -> tuple[Array, float]:
-        """Return the whole x (n,) of least Lagrangian at `multipliers` (L,), and the lower bound that it proves."""
-        problem, prices = self.separable, self.separable.prices(multipliers)
+        """Return the integers x (n,) of least Lagrangian at `multipliers` (L,), and the lower bound that they prove."""
+        problem = self.separable
+        prices = self.separable.prices(multipliers)
         below = np.floor(problem.minimise_lagrangian(multipliers))
         above = np.minimum(below + 1, problem.high)
         values = [problem.error(x) + prices * x for x in (below, above)]
-        x, value = np.where(values[0] <= values[1], below, above), np.minimum(*values)
+        x = np.where(values[0] <= values[1], below, above)
+        value = np.minimum(*values)
         total = float(value.sum())
         if self.effective is not None:
-            own, least = self.effective.minimise_lagrangian(multipliers)
+            counts, least = self.effective.minimise_lagrangian(multipliers)
             quantity = self.effective.quantity
             total += float(least.sum() - value[quantity].sum())
-            x[quantity] = own
+            x[quantity] = counts
         return x, total - float(multipliers @ problem.budget)
 
     def tighten_bounds(self, multipliers: Array, slack: float) -> tuple[Array, Array]:
-        """Return least and most of each quantity, (n,) each, whose error plus price is within `slack` of its minimum.
+        """Return the bounds, (n,) each, of the quantities whose error plus price is within `slack` of its minimum.
 
-        Prices are those at `multipliers` (L,). If `slack` is the distance from the dual bound to a known plan's error,
-        no better plan has a quantity outside these bounds.
+        Prices are those at `multipliers` (L,). If `slack` is the distance from the dual bound to the error of a known
+        plan, no better plan has a quantity outside these bounds (Lagrangian bound tightening).
         """
-        problem, prices = self.separable, self.separable.prices(multipliers)
+        problem = self.separable
+        prices = self.separable.prices(multipliers)
         best, _ = self.minimise_lagrangian(multipliers)
         limit = problem.error(best) + prices * best + slack
 
@@ -134,10 +137,10 @@ class Instance:
 
 
 def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
-    """Return `problem` in arrays, its upper bounds lowered to what the budgets have room for.
+    """Return `problem` in arrays, its upper bounds lowered to what the budgets allow.
 
     The budgets are those of both links, of the problem's `shared_clock`, and of `clocks`. Raises `Infeasible`, naming
-    the budget, the cost of the least plan and the excess, where that exceeds a budget.
+    the budget, the cost of the least plan and the excess, where the least plan exceeds a budget.
     """
     low, high = (np.concatenate(edge) for edge in zip(*(_range(problem, task) for task in problem.tasks)))
     rows: list[tuple[float, float, float, int]] = []
@@ -160,8 +163,8 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
     budget = np.array((*links, *(clock.seconds for clock in clocks)))
     k = problem.edge_rounds_per_cloud_round
     cost = np.column_stack((unit_costs(problem), *(_spent(clock, k) for clock in clocks)))
-    own = None if len(of) == len(low) else of.astype(np.intp)
-    powers = Separable(a, b, x0, low, high, cost, budget, own)
+    powers_of = None if len(of) == len(low) else of.astype(np.intp)
+    powers = Separable(a, b, x0, low, high, cost, budget, powers_of)
     _refuse(powers, once_mb)
     powers = replace(powers, high=np.minimum(high, low + room(powers)))
     effective = build_effective_tasks(alone, k, low, powers.high, powers.cost) if alone else None
@@ -170,14 +173,15 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
 
 
 def stage_plan(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> StagePlan:
-    """Return the plan of `task` with `counts` = samples, edge rounds, cloud rounds, and the most vehicles called."""
+    """Return the plan of `task` with `counts` (samples, edge rounds, cloud rounds) and the most vehicles called."""
     samples, edge_rounds, cloud_rounds = counts
-    k, most = problem.edge_rounds_per_cloud_round, None if task.called is None else task.called[1]
+    k = problem.edge_rounds_per_cloud_round
+    most = None if task.called is None else task.called[1]
     return StagePlan(samples, edge_rounds, cloud_rounds, task.edge_groups, k, most)
 
 
 def price_counts(problem: Problem, task: AllocationTask, counts: Sequence[int]) -> LinkMegabytes:
-    """Return the cost on each uplink [MB] of `counts` = samples, edge rounds, cloud rounds of `task`."""
+    """Return the cost on each uplink [MB] of `counts` (samples, edge rounds, cloud rounds) of `task`."""
     return price(stage_plan(problem, task, counts), task.sizes)
 
 
@@ -191,19 +195,19 @@ def price_once(problem: Problem) -> float:
 def unit_costs(problem: Problem) -> Array:
     """Return the cost (3N, 2) [MB] of one sample, edge round and cloud round of each task.
 
-    Beside `price_once`, `price` is linear.
+    `price` is linear in the counts except for the constant `price_once`.
     """
     costs = []
     for task in problem.tasks:
         for unit in ((1, 0, 0), (0, 1, 0), (0, 0, 1)):
             sizes = task.sizes if unit[1] else replace(task.sizes, labels_mb=None)
-            each = price(stage_plan(problem, task, unit), sizes)
-            costs.append((each.wireless_mb, each.wireline_mb))
+            cost = price(stage_plan(problem, task, unit), sizes)
+            costs.append((cost.wireless_mb, cost.wireline_mb))
     return np.array(costs)
 
 
 def _range(problem: Problem, task: AllocationTask) -> tuple[Array, Array]:
-    """Return least and most of a task's quantities, (3,) each, without those at which the error is infinite."""
+    """Return the least and most of a task's quantities, (3,) each, without those of infinite error."""
     limits = task.limits
     ranges = np.array((limits.samples, limits.edge_rounds, limits.cloud_rounds), dtype=np.float64)
     for learner in task.learners:
@@ -216,7 +220,7 @@ def _range(problem: Problem, task: AllocationTask) -> tuple[Array, Array]:
 
 
 def _spent(clock: Clock, k: int) -> Array:
-    """Return the seconds (3N,) that one sample, edge round and cloud round of each task spend."""
+    """Return the time (3N,) [s] that one sample, edge round and cloud round of each task take."""
     per_round = np.array(clock.per_round)
     return np.column_stack((clock.per_sample, per_round, k * per_round)).ravel()
 

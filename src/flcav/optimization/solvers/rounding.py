@@ -1,4 +1,4 @@
-"""Greedy rounding under linear budgets: units are removed at the least loss per price, or added at the most gain."""
+"""Greedy rounding under linear budgets: remove units at the least loss per price, add them at the most gain."""
 
 from collections.abc import Callable
 from typing import Protocol
@@ -11,7 +11,7 @@ from flcav.optimization.solvers.separable import BUDGET_SLACK
 
 
 class Budgeted(Protocol):
-    """A problem of n whole quantities under L budgets, whose error falls as any quantity grows."""
+    """A problem of n integer quantities under L budgets, whose error falls as any quantity grows."""
 
     @property
     def low(self) -> Array:
@@ -34,14 +34,14 @@ class Budgeted(Protocol):
         ...
 
     def change(self, x: Array, step: int) -> Array:
-        """Return the change of the total error (n,) when each quantity alone changes by `step`."""
+        """Return the change of the total error (n,) when one quantity at a time changes by `step`."""
         ...
 
 
 def trim(problem: Budgeted, x: Array, prices: Array) -> Array:
-    """Return whole x (n,) with units removed until it is within the budgets, the least loss per price first.
+    """Return integers x (n,) with units removed until they fit the budgets, those of least loss per price first.
 
-    `prices` (n,) are those of one unit of each quantity.
+    `prices` (n,) are the prices of one unit of each quantity.
     """
     x = x.copy()
     allowed = problem.budget * (1 + BUDGET_SLACK)
@@ -58,9 +58,9 @@ def trim(problem: Budgeted, x: Array, prices: Array) -> Array:
 
 
 def fill(problem: Budgeted, x: Array, prices: Array) -> Array:
-    """Return whole x (n,) with units added as long as one fits the budgets and gains, the most gain per price first.
+    """Return integers x (n,) with units added while one fits the budgets and gains, those of most gain per price first.
 
-    `prices` (n,) are those of one unit of each quantity.
+    `prices` (n,) are the prices of one unit of each quantity.
     """
     x = x.copy()
     while True:
@@ -79,7 +79,7 @@ def fill(problem: Budgeted, x: Array, prices: Array) -> Array:
 
 
 def outermost(good: Callable[[Array], NDArray[np.bool_]], inside: Array, edge: Array) -> Array:
-    """Return, by bisection, the whole numbers nearest to `edge` for which `good` holds, elementwise.
+    """Return, by bisection, the integers nearest to `edge` for which `good` holds, elementwise.
 
     `good` must hold at `inside`, and from there towards `edge` up to a single change.
     """

@@ -1,4 +1,4 @@
-"""The choices of edge and cloud rounds of one task, for solvers that try each of them."""
+"""The choices of edge and cloud rounds of a task, for solvers that enumerate them."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ MOST_CHOICES = 1_000_000  # pairs of rounds of one task
 def pair_rounds(low: Array, high: Array, reason: str, task: str) -> Array:
     """Return all pairs of edge and cloud rounds (C, 2) of `task` with quantities from `low` (3,) to `high` (3,).
 
-    Raises `InputError` with the `reason` for which pairs are tried, where there are more than `MOST_CHOICES`.
+    Raises `InputError`, with the `reason` for enumerating them, where there are more than `MOST_CHOICES`.
     """
     pairs = int(np.prod(high[1:] - low[1:] + 1))
     if pairs > MOST_CHOICES:
@@ -24,7 +24,7 @@ def pair_rounds(low: Array, high: Array, reason: str, task: str) -> Array:
 
 
 def fewest_cloud_rounds(low: Array, high: Array, k: int) -> Array:
-    """Return the choices of edge and cloud rounds (T, 2): for each t = y + k z the one with the fewest cloud rounds.
+    """Return the choices of edge and cloud rounds (T, 2) that have the fewest cloud rounds for each t = y + k z.
 
     For a curve that depends on t alone no other choice is better, as long as a cloud round costs no less than k edge
     rounds under any budget. `low` and `high` (3,) are the least and most of the quantities.

@@ -4,9 +4,8 @@
 
 At multipliers lambda >= 0, x_j is the point at which its marginal gain equals its price p_j = sum_l cost_jl lambda_l,
 or a bound (water-filling). For a single power it is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method finds
-it, starting from the largest of the single powers' points. The dual function is concave in the two multipliers, and its
-gradient is the overspend. All steps are vectorised over the quantities. Only `solve_two_budgets` is limited to two
-budgets.
+it, starting from the largest of the single powers' points. The dual function is concave in the multipliers, and its
+gradient is the overspend. All steps are vectorised over the quantities. `solve_two_budgets` is for two budgets, the rest for any.
 """
 
 from dataclasses import dataclass
@@ -59,8 +58,8 @@ class Separable:
     def prices(self, multipliers: Array) -> Array:
         """Return the price (n,) of one unit of each quantity at `multipliers` (L,)."""
         prices = multipliers[0] * self._columns[0]
-        for each, column in zip(multipliers[1:], self._columns[1:]):
-            prices = prices + each * column
+        for multiplier, column in zip(multipliers[1:], self._columns[1:]):
+            prices = prices + multiplier * column
         return prices
 
     def minimise_lagrangian(self, multipliers: Array) -> Array:
@@ -125,14 +124,14 @@ class ContinuousOptimum:
 
 
 def room(problem: Separable) -> Array:
-    """Return how many whole units of each quantity fit the budgets above `low`, the others staying at `low` (n,)."""
+    """Return how many units of each quantity (n,) fit the budgets above `low`, while the others stay at `low`."""
     left = problem.budget * (1 + BUDGET_SLACK) - problem.spent(problem.low)
     with np.errstate(divide="ignore", invalid="ignore"):
         return np.floor(np.min(np.where(problem.cost > 0, left / problem.cost, np.inf), axis=1))
 
 
 def solve_two_budgets(problem: Separable) -> ContinuousOptimum:
-    """Return the continuous optimum under two budgets, by an active-set search over those that bind.
+    """Return the continuous optimum under two budgets, by an active-set search over the binding ones.
 
     The sets are tried in this order: none, the scarcer budget, both, the other one.
     """
@@ -159,7 +158,7 @@ def _value(problem: Separable, multipliers: Array) -> ContinuousOptimum:
 
 
 def _start(problem: Separable, binding: list[int]) -> Array:
-    """Return initial multipliers (2,): the mean gain per unit of each binding budget half-way between the bounds."""
+    """Return initial multipliers (2,): the mean gain per unit of each binding budget, midway between the bounds."""
     middle = (problem.low + problem.high) / 2
     gain = problem.error(middle) / (middle + 1)
     multipliers = np.zeros(2)
@@ -187,14 +186,15 @@ def _ascend(problem: Separable, binding: list[int], start: Array) -> ContinuousO
                 break
         else:
             break
-        now, overspend = following, left
+        now = following
+        overspend = left
     return now
 
 
 def newton_step(
     problem: Separable, x: Array, multipliers: Array, binding: list[int], overspend: Array
 ) -> NDArray[np.float64]:
-    """Return the Newton step of the logarithms of the binding multipliers, regularised and capped.
+    """Return the Newton step of the logarithms of the binding multipliers, regularised and limited in size.
 
     `x` (n,) minimises the Lagrangian at `multipliers` (2,); `overspend` is the dual's gradient, per binding budget.
     """
@@ -203,7 +203,8 @@ def newton_step(
     bend = problem.bend(x, prices)
     with np.errstate(divide="ignore", invalid="ignore"):
         scaled = np.where(inside, bend / prices, 0.0)
-    cost, scale = problem.cost[:, binding], multipliers[binding]
+    cost = problem.cost[:, binding]
+    scale = multipliers[binding]
     curvature = (cost * scaled[:, None]).T @ cost * np.outer(scale, scale)
     gradient = overspend * scale
     ridge = 1e-12 * max(float(np.trace(curvature)), float(np.abs(gradient).max()))

@@ -1,8 +1,8 @@
-"""Least weighted error over whole plans, with a proven lower bound.
+"""Least weighted error over integer plans, with a proven lower bound.
 
-Minimising the Lagrangian over whole quantities gives the bound. The quantities at the best multipliers, trimmed and
+Minimising the Lagrangian over integer quantities gives the bound. The quantities at the best multipliers, trimmed and
 filled to the budgets, are nearly optimal where tasks are many. Where they are few, quantities that no plan better than
-the best known can have are excluded (Lagrangian bound tightening), and outer approximation over the rest
+the incumbent can have are excluded (Lagrangian bound tightening), and outer approximation over the rest
 (`cutting_planes`) closes the gap. The convex terms of the error and their cuts are `PowerTerm` and `EffectiveTerm`; a
 drift that costs accuracy is concave, and tabulated as `DriftTerm`.
 """
@@ -22,13 +22,13 @@ from flcav.optimization.solvers.instance import Instance, require_optimum
 from flcav.optimization.solvers.rounding import fill, trim
 from flcav.optimization.solvers.separable import newton_step, solve_two_budgets
 
-CORRECTIONS = 6  # Newton steps of the multipliers over whole quantities; dual points tried
+CORRECTIONS = 6  # Newton steps of the multipliers over integer quantities; dual points tried
 PLANES = 60  # most cutting planes of the dual
 
 
 @dataclass(frozen=True)
 class PowerTerm:
-    """The inverse power a * (x[index] + x0)^(-b); its cuts are secants between neighbouring whole numbers."""
+    """The inverse power a * (x[index] + x0)^(-b); its cuts are secants between neighbouring integers."""
 
     index: int
     a: float  # weight included
@@ -40,7 +40,7 @@ class PowerTerm:
         return self._at(x[self.index])
 
     def lines(self, x: Array) -> list[Line]:
-        """Return the secants through the whole neighbours of x (n,)."""
+        """Return the secants through the integers next to x (n,)."""
         below = np.floor(x[self.index] + 1e-9)
         starts = {below} if x[self.index] - below > 1e-6 else {below, below - 1}
         lines = []
@@ -58,7 +58,7 @@ class PowerTerm:
 class EffectiveTerm:
     """The inverse power gain * n^(-b) of effective samples n; its cuts are tangents.
 
-    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), of s = x[first] samples, z = x[first + 2] cloud
+    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), for s = x[first] samples, z = x[first + 2] cloud
     rounds and t = x[first + 1] + k z rounds.
     """
 
@@ -66,7 +66,7 @@ class EffectiveTerm:
     gain: float  # weight * a
     b: float
     alpha: float
-    own: float  # worth of the samples held in the own region
+    own: float  # worth of the samples held in the task's region
     others: float  # worth of the samples held in the other regions
     k: int  # edge rounds per cloud round
 
@@ -104,8 +104,9 @@ class DriftTerm:
 
 
 def list_terms(instance: Instance) -> list[Term]:
-    """Return the convex terms of the weighted error above the floors; with `list_drifts` they sum to it."""
-    powers, effective = instance.separable, instance.effective
+    """Return the convex terms of the weighted error above the floors; together with `list_drifts` they add up to it."""
+    powers = instance.separable
+    effective = instance.effective
     of = np.arange(len(powers.a)) if powers.of is None else powers.of
     rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
     terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]
@@ -129,12 +130,12 @@ def _drifts(effective: EffectiveTasks) -> list[tuple[int, float]]:
 
 @dataclass(frozen=True)
 class Solution:
-    """A whole plan with its weighted error and a proven lower bound."""
+    """An integer plan with its weighted error and a proven lower bound."""
 
     x: Array  # (n,)
     error: float  # above the floors
     bound: float  # above the floors: no whole plan within the budgets has less
-    multipliers: Array  # (L,) at which the bound is proven
+    multipliers: Array  # (L,) for which the bound is proven
     rates: Array  # (L,) decrease of the error per unit more of each budget, of the continuous or dual problem
 
     def gap(self, floor: float) -> float:
@@ -146,7 +147,7 @@ class Solution:
 
 
 def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
-    """Return a whole plan whose weighted error is within a relative `gap` of the least, or the best found.
+    """Return an integer plan whose weighted error is within a relative `gap` of the least, or the best found.
 
     Raises `InputError` where HiGHS fails.
     """
@@ -172,9 +173,9 @@ def minimise_weighted_error(instance: Instance, gap: float) -> Solution:
 
 
 def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield multipliers (L,) near the dual optimum, each with a lower bound known there (-inf: none).
+    """Yield multipliers (L,) near the dual optimum, with the lower bound known there (-inf where there is none).
 
-    The first are those of the continuous optimum, except where a curve is over effective samples or time is limited.
+    The first are those of the continuous optimum, unless a curve is over effective samples or time is limited.
     """
     if instance.effective is not None or len(instance.budget) > 2:
         yield from _planes(instance, gap)
@@ -194,7 +195,7 @@ def _multipliers(instance: Instance, gap: float) -> Iterator[tuple[Array, float]
 
 
 def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
-    """Yield the best multipliers, with their bounds, of Kelley's cutting-plane method on the dual over whole plans."""
+    """Yield the best multipliers of Kelley's cutting-plane method on the dual over integer plans, with their bounds."""
     left = instance.budget - instance.low @ instance.cost
     largest = instance.error(instance.low) / np.maximum(left, 1e-9 * instance.budget)
     aim = np.r_[-1.0, np.zeros(len(largest))]

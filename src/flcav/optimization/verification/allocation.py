@@ -1,7 +1,7 @@
-"""Verification of a plan of MLGRA: costs, objective and dual bound recomputed from problem, plan and certificate.
+"""Verification of an MLGRA plan: costs, objective and dual bound recomputed from problem, plan and certificate.
 
-Nothing of it is the solvers'. Costs are exact, of the decimals that the problem's floats are written with. Where labels
-or accuracy are paid once with the first cloud round, plans without and with one are branches, each with its own dual.
+It shares no code with the solvers. Costs are exact, of the decimals by which the problem's floats are written. Where
+labels or accuracy are paid once with the first cloud round, plans without and with one are branches, each with a dual.
 """
 
 import json
@@ -32,44 +32,48 @@ SEARCH = "the search above the dual (its leaves, HiGHS' word): that no plan is b
 
 
 def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) -> Verification:
-    """Return the verification of a plan (`Allocation`) for a `Problem`, both as JSON text.
+    """Return the verification of a plan (`Allocation`) for a `Problem`, both as JSON text; costs in MB and s.
 
-    `optimal`: largest gap of a plan whose status is optimal.
+    `optimal` is the largest relative gap of a plan whose status is optimal.
     """
     problem, plan = json.loads(problem_json), json.loads(plan_json)
-    k, kind = problem["edge_rounds_per_cloud_round"], problem["objective"]
-    lower, duals = plan["lower_bound"], plan.get("certificate", ())
-    asked, budgets = read_tasks(problem, k)
-    tasks = [own.calls.get(each.get("called"), own) for own, each in zip(asked, plan["tasks"], strict=True)]
-    counts = [[each[name] for name in QUANTITIES] for each in plan["tasks"]]
-    costs = [task.cost(own) for task, own in zip(tasks, counts, strict=True)]
-    told = [plan["used_mb"].values(), *((each["wireless_mb"], each["wireline_mb"]) for each in plan["tasks"])]
-    errors = [[float(error(curve, own, k)) for _, curve in task.curves] for task, own in zip(tasks, counts)]
+    k = problem["edge_rounds_per_cloud_round"]
+    kind = problem["objective"]
+    lower = plan["lower_bound"]
+    duals = plan.get("certificate", ())
+    read, budgets = read_tasks(problem, k)
+    tasks = [task.calls.get(row.get("called"), task) for task, row in zip(read, plan["tasks"], strict=True)]
+    counts = [[row[name] for name in QUANTITIES] for row in plan["tasks"]]
+    costs = [task.cost(row) for task, row in zip(tasks, counts, strict=True)]
+    stated = [plan["used_mb"].values(), *((row["wireless_mb"], row["wireline_mb"]) for row in plan["tasks"])]
+    errors = [[float(error(curve, row, k)) for _, curve in task.curves] for task, row in zip(tasks, counts)]
     value = max(map(max, errors))
     if kind == "weighted":
-        value = fsum(w * each for task, own in zip(tasks, errors) for (w, _), each in zip(task.curves, own))
+        value = fsum(w * loss for task, row in zip(tasks, errors) for (w, _), loss in zip(task.curves, row))
     if kind == "area":
         corners = np.maximum(1 - np.concatenate(errors), 0)
         value = float(np.sin(2 * np.pi / len(corners)) / 2 * (corners @ np.roll(corners, 1)))
     spent = sum(costs, np.zeros(1, dtype=object))
     claims = {
         "the vehicles called": all(
-            not own.calls or each["called"] in own.calls for own, each in zip(asked, plan["tasks"])
+            not task.calls or row["called"] in task.calls for task, row in zip(read, plan["tasks"])
         ),
-        "the limits": all(a <= n <= b for task, own in zip(tasks, counts) for n, (a, b) in zip(own, task.limits)),
+        "the limits": all(a <= n <= b for task, row in zip(tasks, counts) for n, (a, b) in zip(row, task.limits)),
         "the budgets": bool(np.all(spent <= budgets)),
-        "the megabytes": all(near(float(a), b) for own, said in zip([spent, *costs], told) for a, b in zip(own, said)),
+        "the megabytes": all(
+            near(float(a), b) for recomputed, said in zip([spent, *costs], stated) for a, b in zip(recomputed, said)
+        ),
         "the objective": near(value, plan["objective"]),
     }
-    trusted = [CURVES] + [FLEET] * any(each["uplink_mbps"] or each["vehicle_train_s"] for each in problem["tasks"])
+    trusted = [CURVES] + [FLEET] * any(task["uplink_mbps"] or task["vehicle_train_s"] for task in problem["tasks"])
     if kind == "area":
         claims["that there is no bound"] = lower is None and plan["gap"] is None and plan["status"] == "feasible"
         return judge_claims(value, spent, None, claims, trusted)
-    branches = [own for own in list_branches(asked) if np.all(least_cost(own) <= budgets)]
-    proven = [_prove(kind, own, each, budgets, k) for own, each in zip(branches, duals)]
+    branches = [branch for branch in list_branches(read) if np.all(least_cost(branch) <= budgets)]
+    proven = [_prove(kind, branch, dual, budgets, k) for branch, dual in zip(branches, duals)]
     bound = min([*proven, value]) if len(branches) == len(duals) else 0.0
     claims["the duals"] = len(branches) == len(duals) and all(
-        found >= each["bound"] * (1 - 2 * NEAR) for found, each in zip(proven, duals)
+        reached >= dual["bound"] * (1 - 2 * NEAR) for reached, dual in zip(proven, duals)
     )
     claims["the lower bound"] = bound * (1 - 2 * NEAR) <= lower <= value * (1 + NEAR)
     claims["the gap"] = abs(plan["gap"] - ((value - lower) / lower if lower > 0 else value > 0)) <= NEAR
@@ -94,16 +98,20 @@ BELOW = 1 - 1e-9  # of a level: choices whose error just reaches it, or rounds t
 
 
 def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: Array, k: int) -> float:
-    """Return the least Lagrangian at the `multipliers` (L,): no plan within the `budgets` (L,) has less error."""
-    least, left = [], budgets - least_cost(tasks)
+    """Return the least Lagrangian at the `multipliers` (L,), by weak duality a lower bound on any plan's error."""
+    least = []
+    left = budgets - least_cost(tasks)
     for task in tasks:
         ranges, prices = _afford(task, left), (task.unit @ multipliers).astype(float)
-        merged, (weight, curve) = ranges[2][1] > 0, task.curves[0]
+        merged = ranges[2][1] > 0
+        weight, curve = task.curves[0]
         paid = float(task.once @ multipliers) * merged
-        paid += fsum(w * (own["floor"] + own.get("merge", 0.0) * merged) for w, own in task.curves)
+        paid += fsum(w * (curve_["floor"] + curve_.get("merge", 0.0) * merged) for w, curve_ in task.curves)
         if curve["model"] == "additive":
             for stage, price, (low, high) in zip(STAGES, prices, ranges):
-                decays = [(w * own[stage]["a"], own[stage]["b"], 1.0, own[stage]["x0"]) for w, own in task.curves]
+                decays = [
+                    (w * curve_[stage]["a"], curve_[stage]["b"], 1.0, curve_[stage]["x0"]) for w, curve_ in task.curves
+                ]
                 paid += float(_bound_convex([each for each in decays if each[0] > 0], price, low, high))
         else:
             y, z = _pair(ranges)
@@ -115,16 +123,18 @@ def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: A
 
 
 def bound_largest(tasks: Sequence[VerifiedTask], prices: Array, level: float, budgets: Array, k: int) -> float:
-    """Return `level` times `BELOW` if keeping to that costs more than the `budgets` (L,) at `prices` (L,), else 0."""
-    least, left = [], budgets - least_cost(tasks)
+    """Return `level` times `BELOW` if all plans that keep to it cost more than `budgets` (L,) at `prices`, else 0."""
+    least = []
+    left = budgets - least_cost(tasks)
     for task in tasks:
-        ranges, of_unit = _afford(task, left), (task.unit @ prices).astype(float)
+        ranges = _afford(task, left)
+        of_unit = (task.unit @ prices).astype(float)
         y, z = _pair(ranges)
         low, high = (np.full(len(y), float(edge)) for edge in (ranges[0][0], ranges[0][1] + 1))
         most = high[0]
         while np.any(low < high):  # the fewest samples that may suffice
             x = np.floor((low + high) / 2)
-            worst = np.max([error(own, (x, y, z), k) * (1 - _margin(own)) for _, own in task.curves], axis=0)
+            worst = np.max([error(curve, (x, y, z), k) * (1 - _margin(curve)) for _, curve in task.curves], axis=0)
             low, high = np.where(worst <= level * BELOW, low, x + 1), np.where(worst <= level * BELOW, x, high)
         cost = low * of_unit[0] + y * of_unit[1] + z * of_unit[2] + (z > 0) * float(task.once @ prices)
         least.append(float(np.min(np.where(low < most, cost, inf))) * SUMS)
@@ -132,7 +142,7 @@ def bound_largest(tasks: Sequence[VerifiedTask], prices: Array, level: float, bu
 
 
 def _afford(task: VerifiedTask, left: Array) -> list[tuple[int, int]]:
-    """Return the limits, with the most at what is `left` (L,) when all else is at its least."""
+    """Return the limits with the most lowered to what is `left` (L,) while all else is at its least."""
     rooms = [min((floor(a / c) for a, c in zip(left, unit) if c > 0), default=inf) for unit in task.unit]
     return [(low, int(min(high, low + room))) for (low, high), room in zip(task.limits, rooms)]
 
@@ -140,7 +150,7 @@ def _afford(task: VerifiedTask, left: Array) -> list[tuple[int, int]]:
 def _bound_convex(powers: Powers, price: float, low: int, high: int) -> Array:
     """Return a lower bound of sum_p gain (alpha x + shift)^(-b) + price x over whole x, elementwise.
 
-    It is that of the tangents at the first x from which on the sum does not fall, and at the x before.
+    It is the least value of the tangents at the first x from which on the sum does not fall, and at the x before it.
     """
     rounding = max((_rounding(b) for _, b, _, _ in powers), default=2.0**-45)
 

@@ -1,14 +1,14 @@
 """Verification of a placement of sensors: coverage, cost and dual bound recomputed from positions and certificate.
 
-Nothing of it is the solvers'. By weak duality, for any 0 <= u <= w of the errors and any price l >= 0, each choice
-within a budget B, at most one sensor a pole, has
+It shares no code with the solvers. By weak duality, for any 0 <= u <= w of the errors and any price l >= 0, every
+choice within a budget B, with at most one sensor per pole, has
 
     covered weight <= sum_e (w_e - u_e) + l B + sum_poles max(0, max_sensors (sum_covered u_e - l cost)),
 
-so that covering a weight W costs at least (W - all but l B) / l; and at least W / (most weight per cost of a sensor).
-Sums of the dual are correctly rounded, then outward. Costs and covered weights are exact, of the decimals that floats
-are written with, and so are distances where they decide; sums of weights, or of costs, differ by a multiple of their
-greatest common divisor, so that a bound less than that above the choice proves it optimal, too.
+so that covering a weight W costs at least (W - all terms but l B) / l; and at least W / (most weight per cost of a
+sensor). Sums of the dual are correctly rounded, then outward. Costs and covered weights are exact, of the decimals by
+which floats are written, and so are distances where they decide; sums of weights, or of costs, differ by a multiple of
+their greatest common divisor, so that a bound closer than that to the choice proves it optimal, too.
 """
 
 import json
@@ -32,12 +32,12 @@ UPPER = "the linear program's word that this cost covers at most {:.9g}"
 
 @dataclass(frozen=True)
 class PlacementProblem:
-    """A placement problem: one of `count`, `budget` and `cover` is given."""
+    """A placement problem, with one of the limits `count`, `budget` and `cover`; positions in the world frame."""
 
     errors: Array  # (E, 3) [m]
     weight: Array  # (E,)
     poles: Array  # (P, 3) [m]
-    ranges_m: Array  # (S,)
+    ranges_m: Array  # (S,) [m]
     cost: Array | NDArray[np.object_]  # (P, S) of a sensor and its pole: floats, or `Fraction`
     count: int | None = None  # sensors
     budget: float | None = None
@@ -46,22 +46,23 @@ class PlacementProblem:
 
 
 def find_reached(asked: PlacementProblem) -> list[list[NDArray[np.intp]]]:
-    """Return the numbers of the errors that each sensor on each pole covers, by pole and sensor."""
-    found: list[list[NDArray[np.intp]]] = []
+    """Return the indices of the errors that each sensor covers, by pole and sensor."""
+    covered: list[list[NDArray[np.intp]]] = []
     for number, pole in enumerate(asked.poles):
         squared = ((asked.errors - pole) ** 2).sum(axis=1)
-        found.append([])
+        covered.append([])
         for range_m in asked.ranges_m.tolist():
-            inside, doubt = squared <= range_m**2, 1e-12 * range_m * (range_m + float(np.abs(pole).max()))
+            inside = squared <= range_m**2
+            doubt = 1e-12 * range_m * (range_m + float(np.abs(pole).max()))
             for error in np.flatnonzero(np.abs(squared - range_m**2) <= doubt).tolist():
                 apart = (exact(asked.errors[error, axis]) - exact(asked.poles[number, axis]) for axis in range(3))
                 inside[error] = sum(each**2 for each in apart) <= exact(range_m) ** 2
-            found[-1].append(np.flatnonzero(inside if asked.visible is None else inside & asked.visible[number]))
-    return found
+            covered[-1].append(np.flatnonzero(inside if asked.visible is None else inside & asked.visible[number]))
+    return covered
 
 
 def verify_placement(asked: PlacementProblem, placed_json: str, least: float | None = None) -> Verification:
-    """Return the verification of a `Placement` as JSON text, with `cover` also of the bound `least` on its cost."""
+    """Return the verification of a `Placement` as JSON text; `least` is the stated bound on the cost, with `cover`."""
     placed = json.loads(placed_json)
     reached, proof, weight, upper = find_reached(asked), placed["certificate"], asked.weight, placed["upper_bound"]
     u, price, on = (
@@ -76,10 +77,10 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
     value = sum((decimals[each] for each in covered), Fraction(0))
     limit = exact(asked.budget) if asked.budget is not None else Fraction(asked.count or 0) or cost
     spare, densest = _sum_up((*weight, *-u)) + _sum_up(weight) / 2**52, Fraction(0)
-    for own, row in zip(reached, prices):
+    for covers, row in zip(reached, prices):
         paid = [Fraction(1) if asked.count else exact(each) for each in row]
-        spare += max(Fraction(0), *(_sum_up(u[each]) - price * c for each, c in zip(own, paid)))
-        densest = max(densest, *(_sum_up(weight[each]) / max(c, NOTHING) for each, c in zip(own, paid)))
+        spare += max(Fraction(0), *(_sum_up(u[each]) - price * c for each, c in zip(covers, paid)))
+        densest = max(densest, *(_sum_up(weight[each]) / max(c, NOTHING) for each, c in zip(covers, paid)))
     most, trusted, search = nextafter(float(spare + price * limit), inf), [PLACES], proof["search"]
     claims = {
         "one sensor a pole": len(set(placed["chosen"])) == len(on) and asked.count in (None, len(on)),
@@ -101,16 +102,19 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
         claims["whether it is optimal"] = placed["optimal"] == (upper <= float(value))
         trusted += [SEARCH.format(upper)] * (not proven)
         return judge_claims(float(value), [cost], most, claims, trusted)
-    target, told = exact(asked.cover) * sum(decimals, Fraction(0)), inf if least is None else least
+    target = exact(asked.cover) * sum(decimals, Fraction(0))
+    stated_least = inf if least is None else least
     by_dual = max(float((target - spare) / max(price, NOTHING)) if target > spare else 0.0, 0.0)
     fewest = max(by_dual, float(target / max(densest, NOTHING)))
-    proven = _at_most(told, fewest) or fewest > cost - _unit(exact(each) for row in prices for each in row)
+    proven = _at_most(stated_least, fewest) or fewest > cost - _unit(exact(each) for row in prices for each in row)
     claims["the share"] = value >= target
     claims["the dual's bound"] = _at_most(proof["bound"], by_dual)
-    claims["the bound on the cost"] = _at_most(told, float(cost)) and (proven or _at_most(told, search or 0.0))
-    claims["whether it is optimal"] = placed["optimal"] == (told >= placed["cost"])
+    claims["the bound on the cost"] = _at_most(stated_least, float(cost)) and (
+        proven or _at_most(stated_least, search or 0.0)
+    )
+    claims["whether it is optimal"] = placed["optimal"] == (stated_least >= placed["cost"])
     claims["the upper bound"] = upper >= float(value)
-    trusted += [SEARCH.format(told)] * (not proven) + [UPPER.format(upper)] * (not _at_most(most, upper))
+    trusted += [SEARCH.format(stated_least)] * (not proven) + [UPPER.format(upper)] * (not _at_most(most, upper))
     return judge_claims(float(cost), [cost], min(fewest, float(cost)), claims, trusted)
 
 
@@ -120,9 +124,9 @@ def _sum_up(values: Iterable[float]) -> Fraction:
 
 def _unit(decimals: Iterable[Fraction]) -> Fraction:
     """Return the greatest common divisor: sums of the decimals differ by a multiple of it, or not at all."""
-    found = [*decimals]
-    whole = lcm(*(each.denominator for each in found))
-    return Fraction(gcd(*(int(each * whole) for each in found)), whole)
+    fractions = [*decimals]
+    whole = lcm(*(each.denominator for each in fractions))
+    return Fraction(gcd(*(int(each * whole) for each in fractions)), whole)
 
 
 def _at_most(one: float, other: float) -> bool:

@@ -16,7 +16,7 @@ class Verification:
     bound: float | None  # that the dual alone proves; None: the objective has none
     gap: float | None  # between the two, relative to the smaller one
     faults: tuple[str, ...]  # what is stated and does not hold; none: the certificate holds
-    trusted: tuple[str, ...]  # on what the certificate rests beside the dual
+    trusted: tuple[str, ...]  # what the certificate relies on in addition to the dual
 
     def lines(self, *, counted: bool = False) -> list[str]:
         """Return the verification in words; `counted`: the cost is a number of sensors."""
@@ -35,20 +35,21 @@ class Verification:
 def judge_claims(
     objective: float, cost: Iterable[Fraction], bound: float | None, claims: Mapping[str, bool], trusted: Sequence[str]
 ) -> Verification:
-    """Return the verification in which the `claims` that are not true are the faults."""
+    """Return the verification whose faults are the `claims` that do not hold."""
     gap = None
     if bound is not None:
-        apart, least = abs(objective - bound), min(abs(objective), abs(bound))
+        apart = abs(objective - bound)
+        least = min(abs(objective), abs(bound))
         gap = apart / least if least > 0 else float(apart > 0)
     faults = tuple(claim for claim, holds in claims.items() if not holds)
     return Verification(objective, tuple(map(float, cost)), bound, gap, faults, tuple(trusted))
 
 
 def exact(number: float | Fraction) -> Fraction:
-    """Return the decimal that a float is written with; a fraction is exact already."""
+    """Return the decimal by which a float is written, exactly; a fraction is returned as it is."""
     return number if isinstance(number, Fraction) else Fraction(repr(float(number)))
 
 
 def near(one: float, other: float) -> bool:
-    """Return whether two numbers are equal to a relative `NEAR`."""
+    """Return whether two numbers are equal to the relative tolerance `NEAR`."""
     return abs(one - other) <= NEAR * max(abs(one), abs(other))

@@ -44,7 +44,7 @@ def match(
     overlap: float,
     kind: Kind = "3d",
 ) -> Matches:
-    """Return the true and false positives of one class over frames; the three sequences run over the same frames.
+    """Return the true and false positives of a class over frames; the three sequences run over the same frames.
 
     In each frame, in order of score, a detection is matched to the unmatched target of highest IoU (of `kind`), if that
     is at least `overlap`. An unmatched detection is left out where it lies on a neutral object, see `on_neutral`;
@@ -61,10 +61,9 @@ def match(
 
 
 def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> Ints:
-    """Return (D,) the index of the target matched to each detection, -1 for none: `match_greedily` by score.
+    """Return the index (D,) of the target matched to each detection, -1 for none: `match_greedily` by score.
 
-    overlap: IoU of `kind` from which a detection is of a target. Raises ValueError where there are detections without
-    scores.
+    `overlap` is the least IoU of `kind` for a match. Raises ValueError where there are detections without scores.
     """
     if not len(detections) or not len(targets):
         return np.full(len(detections), -1)
@@ -73,25 +72,26 @@ def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind
 
 
 def match_greedily(overlap: Array, least: float, order: Iterable[int] | None = None) -> Ints:
-    """Return (D,) the target matched to each of D detections, -1 for none.
+    """Return the target (D,) matched to each of D detections, -1 for none.
 
-    One detection after the other takes the target left that it overlaps most, from an overlap of `least` (> 0) on.
+    One detection after another takes the remaining target that it overlaps most, if by `least` (> 0) or more.
 
     Args:
         overlap: (D, T) of each detection with each target.
         least: smallest overlap of a match.
-        order: of the detections, by falling score; None: as they stand.
+        order: order of the detections, by falling score; None: as they stand.
     """
-    found, left = np.full(len(overlap), -1), overlap.copy()
+    matched = np.full(len(overlap), -1)
+    left = overlap.copy()
     for number in range(len(left)) if order is None else order:
         if left.size and left[number, best := int(left[number].argmax())] >= least:
-            found[number] = best
+            matched[number] = best
             left[:, best] = -1
-    return found
+    return matched
 
 
 def on_neutral(detections: Boxes, neutral: Boxes) -> Mask:
-    """Return (D,) whether at least half of a detection's footprint lies on one neutral object.
+    """Return the mask (D,) of detections with at least half of their footprint on one neutral object.
 
     The intersection is divided by the area of the detection. IoU would not do: a car detected on a bus covers a small
     part of the bus.
@@ -100,7 +100,7 @@ def on_neutral(detections: Boxes, neutral: Boxes) -> Mask:
 
 
 def lies_on(detections: Boxes, objects: Boxes) -> Mask:
-    """Return (D, N) whether at least half of a detection's footprint lies on each of N objects."""
+    """Return whether (D, N) at least half of a detection's footprint lies on each of N objects."""
     out = np.zeros((len(detections), len(objects)), dtype=bool)
     if not len(objects):
         return out
@@ -116,11 +116,11 @@ def lies_on(detections: Boxes, objects: Boxes) -> Mask:
 
 
 def _match_frame(detections: Boxes, targets: Boxes, neutral: Boxes, overlap: float, kind: Kind) -> tuple[Array, Array]:
-    """Return the scores (D,) of one frame's detections that count, and their heading errors (D,), see `Matches`."""
-    found = assign_targets(detections, targets, overlap, kind)
-    hit = found >= 0
-    turned = np.full(len(found), np.nan)
-    turned[hit] = np.abs(wrap_angle(detections.yaw[hit] - targets.yaw[found[hit]]))
+    """Return the scores (D,) of a frame's detections that count, and their heading errors (D,), see `Matches`."""
+    target = assign_targets(detections, targets, overlap, kind)
+    hit = target >= 0
+    turned = np.full(len(target), np.nan)
+    turned[hit] = np.abs(wrap_angle(detections.yaw[hit] - targets.yaw[target[hit]]))
     counts = hit | ~on_neutral(detections, neutral)
     return _scores(detections)[counts], turned[counts]
 
@@ -138,9 +138,9 @@ AT_ONCE = 2**15  # bootstrap resamples times detections: arrays of 0.25 MB stay 
 
 
 def average_precision(matches: Matches, frames: ArrayLike | None = None) -> float:
-    """Return the average precision AP|R40 in [0, 1] over `frames`; NaN where those frames hold no targets.
+    """Return the average precision AP|R40 in [0, 1] over `frames`; NaN where they hold no targets.
 
-    frames: indices, in which a frame may repeat (None: each frame once).
+    `frames` are indices, in which a frame may repeat (None: every frame once).
     """
     return float(weighted_precision(matches, _times(matches, frames))[0])
 
@@ -182,7 +182,7 @@ def round_or_none(value: float) -> float | None:
 
 
 def _times(matches: Matches, frames: ArrayLike | None) -> Ints:
-    """Return (1, F) the multiplicity of each frame in `frames`."""
+    """Return the multiplicity (1, F) of each frame in `frames`."""
     if frames is None:
         return np.ones((1, len(matches.targets)), dtype=np.int64)
     return np.bincount(np.asarray(frames, dtype=np.int64), minlength=len(matches.targets))[None]
@@ -195,7 +195,8 @@ def weighted_precision(matches: Matches, times: Ints, worth: Array | float = 1.0
     the precision, 1 for AP, (1 + cos t) / 2 for AOS.
     """
     ends = np.flatnonzero(np.diff(matches.score, append=-np.inf) != 0)  # detections of equal score enter together
-    worths, block = np.where(matches.hit, worth, 0.0), max(AT_ONCE // max(len(matches.score), 1), 1)
+    worths = np.where(matches.hit, worth, 0.0)
+    block = max(AT_ONCE // max(len(matches.score), 1), 1)
     blocks = (times[start : start + block] for start in range(0, len(times), block))
     return np.concatenate([_average(matches, worths, ends, part) for part in blocks])
 
@@ -203,6 +204,7 @@ def weighted_precision(matches: Matches, times: Ints, worth: Array | float = 1.0
 def _average(matches: Matches, worths: Array, ends: NDArray[np.intp], times: Ints) -> Array:
     """Return weighted AP (n,) of `times` (n, F); `ends` (E,): index of the last detection of each distinct score."""
     wanted = times @ matches.targets
+    # Counts of all thresholds and resamples at once: cumulative sums over detections in order of falling score.
     weight = np.take(times, matches.frame, axis=1)
     hits, detections = np.cumsum(weight * matches.hit, axis=1)[:, ends], np.cumsum(weight, axis=1)[:, ends]
     precision = np.cumsum(weight * worths, axis=1)[:, ends] / np.maximum(detections, 1)
@@ -210,12 +212,12 @@ def _average(matches: Matches, worths: Array, ends: NDArray[np.intp], times: Int
     best_onwards = np.column_stack((best_onwards, np.zeros(len(times))))
     needed = RECALLS * wanted[:, None] - 1e-9
     place = np.stack([np.searchsorted(*one) for one in zip(hits, needed)])  # first threshold that reaches the recall
-    found = np.take_along_axis(best_onwards, place, axis=1).mean(axis=1)
-    return np.where(wanted > 0, found, np.nan)
+    mean = np.take_along_axis(best_onwards, place, axis=1).mean(axis=1)
+    return np.where(wanted > 0, mean, np.nan)
 
 
 BINS = 10
-PULL = 0.01  # weight of the quadratic penalty on the summand and on the logarithm of the factor
+PULL = 0.01  # weight of the quadratic penalty on the summand and the logarithm of the factor
 
 
 def calibration_error(score: ArrayLike, hit: ArrayLike, bins: int = BINS) -> float:
@@ -225,7 +227,8 @@ def calibration_error(score: ArrayLike, hit: ArrayLike, bins: int = BINS) -> flo
     - share of hits| in the detection's bin, `bins` of equal width (Naeini et al., "Obtaining well calibrated
     probabilities using Bayesian binning", AAAI 2015).
     """
-    scores, hits = np.asarray(score, dtype=np.float64), np.asarray(hit, dtype=np.float64)
+    scores = np.asarray(score, dtype=np.float64)
+    hits = np.asarray(hit, dtype=np.float64)
     if not len(scores):
         return float("nan")
     number = np.minimum((scores * bins).astype(np.int64), bins - 1)

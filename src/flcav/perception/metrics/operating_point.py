@@ -1,7 +1,7 @@
-"""Objects that a detector finds and invents at one score: the count of an operating point, near by and by distance.
+"""Counts of found objects and false detections at one score, the operating point: for near cars, and by distance.
 
-Intervals are bootstrap ones over scenes or, where all frames are of one scene, over frames; these are too narrow where
-frames follow one another.
+Intervals are bootstrap intervals over scenes or, where all frames are of one scene, over frames; the latter are too
+narrow where frames follow one another.
 """
 
 from collections.abc import Iterator, Sequence
@@ -17,19 +17,19 @@ from flcav.perception.ops.boxes import Kind
 from flcav.statistics.bootstrap import bootstrap_over_scenes
 from flcav.storage.records import Class
 
-DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: in the plane from the LiDAR to the centre of the box
+DISTANCES_M = ((0, 20), (20, 40), (40, 80))  # from, to: horizontal distance from the LiDAR to the centre of the box
 OVERLAP = 0.5  # IoU in 3D from which a detection finds an object
 
 
 @dataclass(frozen=True)
 class FoundAtDistance:
-    """The targets of one class in a range of distance, those found of them, and false detections there."""
+    """The targets of a class in a range of distances, the number found, and the false detections there."""
 
     label: Class
     distance_m: tuple[int, int]  # from, to
     targets: int
-    found: int  # of these
-    recall: tuple[float, float] | None  # 95 % interval of their share; None where resamples have no targets
+    found: int  # of these targets
+    recall: tuple[float, float] | None  # 95 % interval of the share found; None where resamples have no targets
     false_a_frame: float
     false: tuple[float, float]  # its 95 % interval
 
@@ -50,26 +50,26 @@ def count_by_distance(
     label: str,
     rng: np.random.Generator,
 ) -> Iterator[FoundAtDistance]:
-    """Yield how many objects of a class were found and invented over F frames, by distance and in all.
+    """Yield the numbers of found objects and false detections of a class over F frames, by distance and in total.
 
     All boxes are of that class, in the LiDAR's frame. In each frame a detection of `SCORE` or more, in order of score,
     finds the target that it overlaps most, as in `match`; one on a neutral object is neither true nor false. A target
-    and a false detection count at their own distances. Raises ValueError where detections have no scores.
+    and a false detection count at their distances. Raises ValueError where detections have no scores.
     """
     unit = np.arange(len(targets)) if len(set(scene_of_frame)) < 2 else np.asarray(scene_of_frame)
     frames = [_count_frame(*frame) for frame in zip(detections, targets, neutral, strict=True)]
     for span in (*DISTANCES_M, (DISTANCES_M[0][0], DISTANCES_M[-1][1])):
         counts = np.array([[_within(part, span) for part in frame] for frame in frames]).reshape(-1, 3)
-        asked, found, false = counts.sum(axis=0).tolist()
-        if asked or false:
-            recall = _interval(counts[:, 1], counts[:, 0], unit, rng) if asked else None
+        wanted, found, false = counts.sum(axis=0).tolist()
+        if wanted or false:
+            recall = _interval(counts[:, 1], counts[:, 0], unit, rng) if wanted else None
             wrong = _interval(counts[:, 2], np.ones(len(counts)), unit, rng)
             assert wrong is not None  # every resample has frames
-            yield FoundAtDistance(label, span, asked, found, recall, round(false / len(counts), 6), wrong)
+            yield FoundAtDistance(label, span, wanted, found, recall, round(false / len(counts), 6), wrong)
 
 
 def describe_counts(counts: Sequence[FoundAtDistance]) -> list[str]:
-    """Return objects found and invented in words: a line per class and range of distance."""
+    """Return the counts of found objects and false detections in words: a line per class and range of distances."""
     return [f"at a score of {SCORE:g} and 3D IoU {OVERLAP:g}, by distance:", *(row.describe() for row in counts)]
 
 
@@ -88,7 +88,7 @@ def _within(distance: NDArray, span: tuple[int, int]) -> int:
 
 
 def _interval(part: NDArray, whole: NDArray, unit: ArrayLike, rng: np.random.Generator) -> tuple[float, float] | None:
-    """Return the 95 % interval of the ratio of two sums over frames; None where no resample has any of the `whole`."""
+    """Return the 95 % interval of the ratio of two sums over frames; None where a resample has none of `whole`."""
 
     def ratio(times: Ints) -> Array:
         below = times @ whole
@@ -98,16 +98,16 @@ def _interval(part: NDArray, whole: NDArray, unit: ArrayLike, rng: np.random.Gen
     return None if np.isnan(low) else (round(low, 6), round(high, 6))
 
 
-WITHIN_M = 40.0  # in the plane from the LiDAR to the centre of a box
-SCORE = 0.3  # lowest of a detection that counts
+WITHIN_M = 40.0  # largest horizontal distance from the LiDAR to the centre of a box
+SCORE = 0.3  # lowest score of a detection that counts
 
 
 @dataclass(frozen=True)
 class FoundCars:
-    """The targets of class Car near the LiDAR, summed over frames, those found of them, and false detections."""
+    """The targets of class Car near the LiDAR, summed over frames, the number found, and the false detections."""
 
-    cars: int  # within `within_m`, each once a frame
-    found: int  # of these
+    cars: int  # within `within_m`, counted once per frame
+    found: int  # of these cars
     false_per_quarter_turn: float  # false cars within `within_m`, by frame and look; around there are four looks
     within_m: float = WITHIN_M
     score: float = SCORE
@@ -123,11 +123,12 @@ class FoundCars:
 def count_found_cars(
     detections: Sequence[Boxes], targets: Sequence[Boxes], neutral: Sequence[Boxes], *, looks: int = 1
 ) -> FoundCars:
-    """Return how many cars were found and invented over F frames, of which the three sequences are; all boxes are cars.
+    """Return the numbers of cars found and of false detections over F frames, over which the three sequences run.
 
-    In each frame a detection, in order of score, finds the target that it overlaps most, as in `match`; one on a
-    neutral object is neither true nor false. looks: quarter turns that the network looked at in each frame, 1 or 4.
-    Boxes are in the LiDAR's frame. Raises ValueError where there are no frames, or detections without scores.
+    All boxes are cars, in the LiDAR's frame. In each frame a detection, in order of score, finds the target that it
+    overlaps most, as in `match`; one on a neutral object is neither true nor false. `looks` is the number of quarter
+    turns that the network looked at in each frame, 1 or 4. Raises ValueError where there are no frames, or detections
+    without scores.
     """
     if not detections:
         raise ValueError("cars of 0 frames cannot be counted")
@@ -137,5 +138,5 @@ def count_found_cars(
 
 
 def is_near(boxes: Boxes) -> Mask:
-    """Return (N,) whether the centre of each box is within `WITHIN_M` of the LiDAR, in whose frame the boxes are."""
+    """Return the mask (N,) of boxes, in the LiDAR's frame, with their centre within `WITHIN_M` of the LiDAR."""
     return np.hypot(boxes.center[:, 0], boxes.center[:, 1]) < WITHIN_M

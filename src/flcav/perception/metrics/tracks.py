@@ -23,13 +23,13 @@ APART_M = 2.0  # largest distance in the plane between the centres of an object 
 
 @dataclass(frozen=True)
 class TrackingFrame:
-    """Ground truth and tracks of one class in one frame of a sequence; positions in one coordinate frame [m]."""
+    """Ground truth and tracks of a class in one frame of a sequence; positions in one coordinate frame [m]."""
 
     objects: Words  # (M,) identity of each object to be tracked
     places: Array  # (M, 2) position x, y of each object
     tracks: Ints  # (N,) identity of each track
     found: Array  # (N, 2) position x, y of each track
-    score: Array  # (N,) of the whole track
+    score: Array  # (N,) score of the whole track
     neutral: Mask  # (N,) whether the track lies on a neutral object: no false positive
 
 
@@ -37,11 +37,11 @@ class TrackingFrame:
 class ClearMot:
     """CLEAR MOT counts, summed over all frames."""
 
-    objects: int  # to be tracked
+    objects: int  # objects to be tracked
     misses: int
     false_positives: int
-    switches: int  # of identity
-    distance_m: float  # sum over pairs of an object and its track
+    switches: int  # identity switches
+    distance_m: float  # sum of the distances of objects from their tracks
 
     @property
     def hits(self) -> int:
@@ -101,8 +101,8 @@ def count_clear_mot(
 ) -> ClearMot:
     """Return the CLEAR MOT counts of the tracks that score at least `threshold`.
 
-    sequences: the frames of each, in time order. A pair of the frame before is kept while it is within `apart_m`; other
-    objects and tracks are paired by the Hungarian method with least total distance.
+    `sequences` holds the frames of each sequence, in time order. A pair of the preceding frame is kept while it is
+    within `apart_m` [m]; other objects and tracks are paired by the Hungarian method with least total distance.
     """
     counts = np.zeros(4, dtype=np.int64)
     distance = 0.0

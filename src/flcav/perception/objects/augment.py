@@ -1,13 +1,12 @@
 """Data augmentation of LiDAR sweeps: global transforms, object scaling, dropped returns, ground-truth sampling.
 
-Global mirroring, turning and scaling, and ground-truth sampling are those of SECOND (Yan et al. 2018, sec. 3.2.1). The
+Global mirroring, rotation and scaling, and ground-truth sampling are those of SECOND (Yan et al. 2018, sec. 3.2.1). The
 others vary what differs between LiDARs, cars and countries: sizes of objects (random object scaling of Yang et al.,
-"ST3D", CVPR 2021), pose of the sensor, lost returns, field of view. Boxes that annotators draw have a margin: they
-begin before the first return, and leave out mirrors.
+"ST3D", CVPR 2021), pose of the sensor, lost returns, field of view. Boxes drawn by annotators have a margin: they begin
+before the first return, and leave out mirrors.
 
-Ground-truth sampling pastes an object with its returns at the place where it was recorded, so that their density is
-that of its distance. It is left out where its footprint overlaps another; returns of the scene inside its box are
-removed.
+Ground-truth sampling pastes an object with its returns at the position where it was recorded, so that their density
+fits its distance. It is skipped where its footprint overlaps another; returns of the scene inside its box are removed.
 """
 
 from collections.abc import Iterable, Sequence
@@ -29,8 +28,8 @@ VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, do
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
     """Return the sample augmented by random amounts drawn from `rng`, within the limits of `how`.
 
-    The order is: cars resized, boxes given their margin; the whole mirrored, turned and scaled; shifted; tilted and
-    lifted; returns dropped; cut to a camera's field of view.
+    The order is: cars are resized, and boxes get their margin; the whole sweep is mirrored, rotated and scaled;
+    shifted; tilted and lifted; returns are dropped; the sweep is cut to a camera's field of view.
     """
     mirror = -1.0 if how.flip and rng.random() < 0.5 else 1.0
     turn = rng.uniform(-how.turn_rad, how.turn_rad)
@@ -57,7 +56,7 @@ def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Samp
 
 
 def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: float) -> Sample:
-    """Return the sample with y times `mirror` (1 or -1), then turned counter-clockwise by `turn_rad`, then scaled."""
+    """Return the sample with y times `mirror` (1 or -1), then rotated counter-clockwise by `turn_rad`, then scaled."""
     cos, sin = heading_vectors(turn_rad) * scale
     plane = np.array([[cos, sin], [-mirror * sin, mirror * cos]])  # right factor of rows (x, y)
     points = sample.points.copy()
@@ -78,11 +77,12 @@ def transform_sample(sample: Sample, mirror: float, turn_rad: float, scale: floa
 
 
 def resize_objects(sample: Sample, factor: Array) -> Sample:
-    """Return the sample with length, width and height of box n and the returns inside it scaled by factor[n] (N, 3).
+    """Return the sample with box n and the returns inside it scaled by factor[n] (N, 3): length, width and height.
 
     The centre of an object's bottom face stays in place.
     """
-    boxes, points = sample.boxes, sample.points.copy()
+    boxes = sample.boxes
+    points = sample.points.copy()
     foot = boxes.center - boxes.size * (0, 0, 0.5)
     changed = np.flatnonzero((factor != 1).any(1))
     for row, inside in zip(changed, points_in_boxes(sample.points, boxes[changed]), strict=True):
@@ -95,7 +95,7 @@ def resize_objects(sample: Sample, factor: Array) -> Sample:
 
 
 def add_margin(boxes: Boxes, name: str, margin_m: Sequence[float]) -> Boxes:
-    """Return the boxes with those of a class longer, wider and higher by a margin [m]; undersides stay in place."""
+    """Return the boxes, those of a class longer, wider and higher by a margin [m]; their bottoms stay in place."""
     more = np.where((boxes.label == name)[:, None], margin_m, 0.0)
     return replace(boxes, center=boxes.center + more * (0, 0, 0.5), size=boxes.size + more)
 
@@ -109,7 +109,7 @@ def shift_sample(sample: Sample, by_m: Array) -> Sample:
 
 
 def tilt_sample(sample: Sample, slope: Array, lift_m: float) -> Sample:
-    """Return the sample with z raised by lift_m + slope . (x, y), slope (2,): a small tilt, with boxes kept upright."""
+    """Return the sample with z raised by lift_m + slope . (x, y), slope (2,): a small tilt that keeps boxes upright."""
     points = sample.points.copy()
     points[:, 2] += (points[:, :2] @ slope + lift_m).astype(np.float32)
 
@@ -121,14 +121,14 @@ def tilt_sample(sample: Sample, slope: Array, lift_m: float) -> Sample:
 
 
 def in_view(points: Array32) -> Mask:
-    """Return (N,) whether points (N, >= 3), LiDAR frame, lie in the field of view of a forward camera at the sensor."""
+    """Return the mask (N,) of points (N, >= 3), LiDAR frame, in the field of view of a forward camera at the sensor."""
     side, down, up = VIEW
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
 
 
 def keep_returns(sample: Sample, kept: Mask) -> Sample:
-    """Return the sample with the returns of the mask `kept` (N,) alone.
+    """Return the sample with only the returns in the mask `kept` (N,).
 
     Objects left with fewer than `MIN_RETURNS` returns are ignored; those left with none are removed.
     """
@@ -151,7 +151,7 @@ class Cutouts:
     """Ground-truth database: objects with the returns inside their boxes, LiDAR frame."""
 
     boxes: Boxes  # label = detection class
-    points: tuple[Array32, ...]  # of each box (N, 4) x, y, z [m], intensity [0, 1]
+    points: tuple[Array32, ...]  # per box (N, 4) x, y, z [m], intensity [0, 1]
 
 
 def cut_out_objects(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
@@ -159,16 +159,16 @@ def cut_out_objects(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
     boxes, points = [Boxes.empty()], []
     for sample in samples:
         known = np.ones(len(sample.boxes), dtype=bool) if sample.exact is None else sample.exact
-        own = sample.boxes[known & in_range(sample.boxes, config)]
-        inside = points_in_boxes(sample.points, own)
+        known_boxes = sample.boxes[known & in_range(sample.boxes, config)]
+        inside = points_in_boxes(sample.points, known_boxes)
         enough = inside.sum(1) >= MIN_RETURNS
-        boxes.append(own[enough])
+        boxes.append(known_boxes[enough])
         points += [sample.points[row] for row in inside[enough]]
     return Cutouts(concatenate(boxes), tuple(points))
 
 
 def paste_objects(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator) -> Sample:
-    """Return the sample with objects of the ground-truth database pasted in, up to `most` of each class in all.
+    """Return the sample with objects of the ground-truth database pasted in, up to `most` of each class in total.
 
     Candidates are drawn by `rng` without replacement; those whose footprints overlap another object's are left out.
     """
@@ -189,7 +189,7 @@ def paste_objects(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Ge
 def select_free(candidates: Boxes, there: Boxes) -> Ints:
     """Return the indices of candidates, chosen greedily in order, that overlap no other box in bird's-eye view.
 
-    Neither those `there` nor one another.
+    They overlap neither the boxes `there` nor one another.
     """
     everything = torch.from_numpy(np.concatenate((there.array(), candidates.array())))
     meets = (iou(torch.from_numpy(candidates.array()), everything, "bev") > 0).numpy()

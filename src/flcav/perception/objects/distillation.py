@@ -1,4 +1,4 @@
-"""Two more losses of a detector: federated distillation from the road average, and imitation of an earlier network.
+"""Two further losses of a detector: federated distillation from the road average, and imitation of an earlier network.
 
 Wang et al. (IEEE Network 37(3), 2023), "federated distillation": each vehicle updates itself by a contrastive loss
 between its boxes and those of the road average. The loss of a batch is the sum of
@@ -7,13 +7,13 @@ between its boxes and those of the road average. The loss of a batch is the sum 
 - regression: smooth L1 of the residuals and cross-entropy of directions, weighted over the batch by the inverse
   variance of the labels, component by component;
 - InfoNCE (van den Oord et al., "Representation Learning with Contrastive Predictive Coding", 2018, eq. 4) of
-  bird's-eye features pooled in boxes: the query is one of the vehicle's own boxes, its positive the box of the road
-  average that it is matched with, its negatives are the other boxes of the sweep, of the road average or its own.
+  bird's-eye features pooled in boxes: the query is a box that the vehicle detected, its positive the matching box of
+  the road average, its negatives are the other boxes of the sweep, from the road average or the vehicle.
 
-Imitation is knowledge distillation against forgetting (Li and Hoiem, "Learning without Forgetting", ECCV 2016; of
+Imitation is knowledge distillation against forgetting (Li and Hoiem, "Learning without Forgetting", ECCV 2016; for
 detectors Shmelkov, Schmid, Alahari, "Incremental Learning of Object Detectors without Catastrophic Forgetting", ICCV
-2017). To the loss on labels it adds the distance of box residuals and headings from those of the earlier network, the
-teacher, where that sees an object. It needs no samples of what was learned before.
+2017). It adds to the loss on labels the distance of box residuals and headings from those of the earlier network, the
+teacher, where that detects an object. It needs no samples of what was learned before.
 """
 
 from collections.abc import Sequence
@@ -51,7 +51,7 @@ YAW = 6  # column of a residual
 
 @dataclass(frozen=True)
 class DistillationTerms:
-    """Terms of the loss beside classification."""
+    """Terms of the distillation loss in addition to classification."""
 
     regression: bool = True
     contrastive: bool = True
@@ -72,7 +72,7 @@ class DistilledObjects(ObjectsTask):
 
 
 def distillation_loss(network: Second, samples: Sequence[Sample], terms: DistillationTerms) -> Tensor:
-    """Return the scalar distillation loss of a batch, see the module."""
+    """Return the scalar distillation loss of a batch, see the module's description."""
     targets = [assign_anchors(sample, network.config) for sample in samples]
     features = network.map_features(voxels_of(network, [sample.points for sample in samples]))
     output = network.answer(features)
@@ -89,11 +89,11 @@ def distillation_loss(network: Second, samples: Sequence[Sample], terms: Distill
 def regression_loss(output: HeadOutput, targets: Sequence[Targets]) -> Tensor:
     """Return the scalar loss of box residuals, directions and variances of a batch, weighted by inverse variance.
 
-    For each component it is the mean over the positive anchors with the weights 1 / variance; a direction has that of
-    its yaw. Without a positive anchor it is 0. Without variances all anchors weigh the same.
+    For each component it is the mean over the positive anchors with weights 1 / variance; a direction has the weight of
+    its yaw. It is 0 without a positive anchor. Without variances all anchors have the same weight.
     """
     box, direction, nll = box_losses(output, targets)
-    known = [torch.ones_like(each.residual) if each.variance is None else each.variance for each in targets]
+    known = [torch.ones_like(target.residual) if target.variance is None else target.variance for target in targets]
     weight = 1 / torch.cat(known).to(box.device)
     weight = weight / weight.sum(0).clamp(min=torch.finfo(weight.dtype).tiny)
     total = BOX_WEIGHT * (box * weight).sum() + DIRECTION_WEIGHT * (direction * weight[:, YAW]).sum()
@@ -101,25 +101,25 @@ def regression_loss(output: HeadOutput, targets: Sequence[Targets]) -> Tensor:
 
 
 def contrastive_loss(features: Tensor, samples: Sequence[Sample], config: SecondConfig, temperature: float) -> Tensor:
-    """Return the mean InfoNCE over the matched boxes of the vehicles' own in a batch; 0 without any.
+    """Return the mean InfoNCE over the matched boxes of the vehicles in a batch; 0 without any.
 
-    features: (B, C, H, W) of the head's grid.
+    `features` (B, C, H, W) are those of the head's grid.
     """
     losses = []
-    for own_features, sample in zip(features, samples, strict=True):
-        own = Boxes.empty() if sample.own is None else sample.own
-        mine, road = match_boxes(own, sample.boxes)
+    for map_features, sample in zip(features, samples, strict=True):
+        detected = Boxes.empty() if sample.own is None else sample.own
+        mine, road = match_boxes(detected, sample.boxes)
         if not len(mine):
             continue
-        others = own[np.setdiff1d(np.arange(len(own)), mine)]
-        queries = pool_boxes(own_features, own[mine], config)
-        keys = pool_boxes(own_features, concatenate([sample.boxes, others]), config)
+        others = detected[np.setdiff1d(np.arange(len(detected)), mine)]
+        queries = pool_boxes(map_features, detected[mine], config)
+        keys = pool_boxes(map_features, concatenate([sample.boxes, others]), config)
         losses.append(info_nce(queries, keys, torch.from_numpy(road).to(keys.device), temperature))
     return torch.cat(losses).mean() if losses else features.sum() * 0
 
 
 def info_nce(queries: Tensor, keys: Tensor, positive: Tensor, temperature: float) -> Tensor:
-    """Return InfoNCE (Q,) of queries (Q, C) against keys (K, C), of which `positive` (Q,) is each query's own.
+    """Return the InfoNCE (Q,) of queries (Q, C) against keys (K, C); `positive` (Q,) is the index of each query's key.
 
     - log( exp(s_p / t) / sum_k exp(s_k / t) ), with s the cosine of two features and t the temperature.
     """
@@ -130,8 +130,8 @@ def info_nce(queries: Tensor, keys: Tensor, positive: Tensor, temperature: float
 def pool_boxes(features: Tensor, boxes: Boxes, config: SecondConfig) -> Tensor:
     """Return the features (N, C) of N boxes, LiDAR frame: means of a map (C, H, W) over a grid in each footprint.
 
-    The map is that of the head's grid, rows along y, columns along x. It is interpolated bilinearly at the centres of
-    `POOL` parts of the box along and across; it is 0 outside the range.
+    The map has the head's grid, rows along y, columns along x. It is interpolated bilinearly at the centres of `POOL`
+    parts of the box, along and across; it is 0 outside the range.
     """
     low, high = np.array(config.range_m[:2]), np.array(config.range_m[3:5])
     place = torch.from_numpy(2 * (spread_over_footprints(boxes, *POOL) - low) / (high - low) - 1).to(features)
@@ -140,9 +140,9 @@ def pool_boxes(features: Tensor, boxes: Boxes, config: SecondConfig) -> Tensor:
 
 
 def match_boxes(own: Boxes, road: Boxes) -> tuple[Ints, Ints]:
-    """Return rows of `own` and of `road` that are of one object: one to one, nearest in bird's-eye view together.
+    """Return the rows of `own` and of `road` that show the same object: one to one, of least total distance.
 
-    They are of one class and at most `MATCH_M` apart.
+    Matched boxes are of the same class and at most `MATCH_M` apart in bird's-eye view.
     """
     apart = np.linalg.norm(own.center[:, None, :2] - road.center[None, :, :2], axis=2)
     fits = (apart <= MATCH_M) & (own.label[:, None] == road.label[None])
@@ -151,18 +151,18 @@ def match_boxes(own: Boxes, road: Boxes) -> tuple[Ints, Ints]:
     return mine[paired], theirs[paired]
 
 
-SEEN = 0.1  # score from which on the teacher sees an object
+SEEN = 0.1  # score from which the teacher counts as detecting an object
 
 
 class ImitatingObjects(ObjectsTask):
-    """3D object detection that learns from labels, and from the boxes of a `teacher` with a `weight`."""
+    """3D object detection that learns from labels and, with a `weight`, from the boxes of a `teacher`."""
 
     def __init__(self, teacher: Second, weight: float) -> None:
         super().__init__()
         self.teacher, self.weight = teacher.eval().requires_grad_(False), weight
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
-        """Return the loss of SECOND on a batch and that of imitation, differentiable in the network's parameters."""
+        """Return SECOND's loss on a batch plus that of imitation, differentiable in the network's parameters."""
         voxels = voxels_of(network, [sample.points for sample in samples])
         output, seen = network(voxels), self.teacher(voxels)
         targets = [assign_anchors(sample, network.config) for sample in samples]
@@ -170,10 +170,10 @@ class ImitatingObjects(ObjectsTask):
 
 
 def imitation_loss(output: HeadOutput, teacher: HeadOutput) -> Tensor:
-    """Return the scalar distance of a batch's boxes from the teacher's, over the anchors where it sees an object.
+    """Return the scalar distance of a batch's boxes from the teacher's, over the anchors where it detects an object.
 
-    That is smooth L1 of the residuals and cross-entropy of the headings, means by the teacher's scores, with the
-    weights of the loss on labels; 0 where it sees nothing.
+    It is smooth L1 of the residuals and cross-entropy of the headings, averaged by the teacher's scores, with the
+    weights of the loss on labels; 0 where the teacher detects nothing.
     """
     score = teacher.score.sigmoid().amax(2)  # (B, A)
     where = score >= SEEN

@@ -1,6 +1,6 @@
 """Evaluation of an object detector: AP and AOS per class, broken down by distance, occlusion and weather; calibration.
 
-AP is that in 3D and in bird's-eye view, at IoU 0.5 and 0.7. Beside it stands a count at one score, of cars near by.
+AP is computed in 3D and in bird's-eye view, at IoU 0.5 and 0.7, together with a count of near cars at one score.
 Matches are kept per frame, to recompute average precision on resampled scenes.
 """
 
@@ -46,12 +46,12 @@ from flcav.world.weather import WEATHER_CLASSES
 
 OVERLAPS: tuple[tuple[Kind, float], ...] = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
 OCCLUSIONS = ((0.0, 0.2), (0.2, 0.6), (0.6, 1.01))  # from, to: occluded share
-BORDER_M = 2.0  # detections up to this far outside a range of distances are kept: they may be of objects in it
+BORDER_M = 2.0  # detections up to this far outside a range of distances are kept, as they may match objects in it
 
 
 @dataclass(frozen=True)
 class BreakdownRow:
-    """Average precision of one class in one part of a breakdown, for one kind of overlap and IoU threshold."""
+    """Average precision of a class in a part of a breakdown, for one kind of overlap and IoU threshold."""
 
     by: str  # distance | occlusion | weather
     slice: str  # name of the part
@@ -64,7 +64,7 @@ class BreakdownRow:
 
 @dataclass(frozen=True)
 class Score:
-    """AP and AOS of one class for one kind of overlap and IoU threshold; None where there are no targets."""
+    """AP and AOS of a class for one kind of overlap and IoU threshold; None where there are no targets."""
 
     label: Class
     kind: Kind
@@ -80,17 +80,17 @@ class Score:
 
 @dataclass(frozen=True, kw_only=True)
 class ObjectsEvaluation(Evaluated):
-    """Evaluation of one network on one set of frames: AP and AOS, cars near by, breakdown, calibration, tracking."""
+    """Evaluation of a network on a set of frames: AP and AOS, near cars, breakdown, calibration, tracking."""
 
     frames: int
     scenes: int
     scores: tuple[Score, ...]  # class by class
     rules: Annotated[TargetCriteria | None, LEFT_OUT] = None  # target criteria; None in results of earlier versions
-    near: Annotated[FoundCars | None, LEFT_OUT] = None  # None of a network that knows no cars, and in earlier results
+    near: Annotated[FoundCars | None, LEFT_OUT] = None  # None without class Car, and in earlier results
     counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # None in earlier results
     slices: tuple[BreakdownRow, ...]  # breakdown of AP
     trust: tuple[Reliability, ...]  # calibration of scores and variances, one per class
-    tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless asked for
+    tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless requested
 
     @property
     def score(self) -> float:
@@ -99,7 +99,7 @@ class ObjectsEvaluation(Evaluated):
         return float(np.mean(known)) if known else 0.0
 
     def numbers(self) -> Mapping[str, float]:
-        """Return the metrics that are known, by name, for each class.
+        """Return the known metrics, by name, of all classes.
 
         AP for every kind of overlap and IoU; AOS and the share of right headings in 3D at IoU 0.5; expected calibration
         error; MOTA and AMOTA where tracks were evaluated.
@@ -122,8 +122,8 @@ class ObjectsEvaluation(Evaluated):
     def lines(self) -> list[str]:
         """Return the evaluation in words.
 
-        Frames and target criteria; a line per class, kind of overlap and IoU; cars near by; a line per class and part
-        of the breakdown; calibration errors; tracking.
+        These are frames and target criteria; a line per class, kind of overlap and IoU; near cars; a line per class and
+        part of the breakdown; calibration errors; tracking.
         """
         lines = [
             f"{plural(self.frames, 'frame')} of {plural(self.scenes, 'scene')}",
@@ -151,8 +151,8 @@ def score_detections(
 ) -> tuple[Score, ...]:
     """Return AP and AOS with intervals, by class, kind of overlap and IoU threshold (`OVERLAPS`).
 
-    detections (LiDAR frame) and truths run over the same frames; seed: of the bootstrap over scenes. Raises
-    `InputError` where there are no frames.
+    `detections` (LiDAR frame) and `truths` run over the same frames; `seed` is that of the bootstrap over scenes.
+    Raises `InputError` where there are no frames.
     """
     if not truths:
         raise InputError("evaluation on 0 frames: at least one is wanted")
@@ -173,9 +173,10 @@ def score_detections(
 def count_cars(
     detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str], *, around: bool
 ) -> FoundCars | None:
-    """Return the cars near the LiDAR that were found and invented, see `count_found_cars`; None without class Car.
+    """Return the counts of near cars, found and false, see `count_found_cars`; None without class Car.
 
-    detections (LiDAR frame) and truths run over the same frames; around: whether the network looked to all four sides.
+    `detections` (LiDAR frame) and `truths` run over the same frames; `around` is whether the network looked to all four
+    sides.
     """
     if "Car" not in classes:
         return None
@@ -185,16 +186,17 @@ def count_cars(
 def count_objects(
     detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str], *, seed: int = 0
 ) -> tuple[FoundAtDistance, ...]:
-    """Return the objects of each class that were found and invented, by distance, see `count_by_distance`."""
+    """Return the counts of found objects and false detections of all classes by distance, see `count_by_distance`."""
     rows: list[FoundAtDistance] = []
     for label in classes:
-        scenes, rng = [truth.scene for truth in truths], stream(seed, "counts", label)
+        scenes = [truth.scene for truth in truths]
+        rng = stream(seed, "counts", label)
         rows += count_by_distance(*select_sides(detections, truths, label), scenes, label, rng)
     return tuple(rows)
 
 
 class BreakdownPart(NamedTuple):
-    """One part of a breakdown: the objects of a range of distance or occlusion, or the frames of a weather."""
+    """A part of a breakdown: the objects in a range of distance or occlusion, or the frames of a weather."""
 
     by: str  # distance | occlusion | weather
     name: str  # of the part: "0-20 m", "20%-60%", "fog"
@@ -206,33 +208,33 @@ class BreakdownPart(NamedTuple):
 def break_down(
     detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: Sequence[str]
 ) -> tuple[BreakdownRow, ...]:
-    """Return the breakdown of AP: a row for each part, class with targets in it, kind of overlap and IoU threshold.
+    """Return the breakdown of AP: a row per part, class with targets in it, kind of overlap and IoU threshold.
 
-    detections (LiDAR frame) and truths run over the same frames.
+    `detections` (LiDAR frame) and `truths` run over the same frames.
     """
     rows = []
     for part in split_parts(detections, truths):
         for label in classes:
-            found = [select_class(boxes, label) for boxes in part.detections]
-            own = [truth.targets.label == label for truth in truths]
-            targets = [t.targets[o & w] for t, o, w in zip(truths, own, part.wanted, strict=True)]
+            of_class = [select_class(boxes, label) for boxes in part.detections]
+            is_class = [truth.targets.label == label for truth in truths]
+            targets = [t.targets[o & w] for t, o, w in zip(truths, is_class, part.wanted, strict=True)]
             count = sum(len(targets[frame]) for frame in part.frames)
             if not count:
                 continue
-            others = [t.targets[o & ~w] for t, o, w in zip(truths, own, part.wanted, strict=True)]
+            others = [t.targets[o & ~w] for t, o, w in zip(truths, is_class, part.wanted, strict=True)]
             neutral = [concatenate([select_class(t.neutral, label), o]) for t, o in zip(truths, others, strict=True)]
             for kind, overlap in OVERLAPS:
-                ap = average_precision(match(found, targets, neutral, overlap, kind), part.frames)
+                ap = average_precision(match(of_class, targets, neutral, overlap, kind), part.frames)
                 rows.append(BreakdownRow(part.by, part.name, label, kind, overlap, round_or_none(ap), count))
     return tuple(rows)
 
 
 def format_breakdown(rows: Sequence[BreakdownRow], overlap: float) -> list[str]:
     """Return a breakdown at IoU `overlap` in words: a line per class and part, class by class."""
-    own = [row for row in rows if row.iou == overlap]
-    ap = {(row.label, row.by, row.slice, row.kind): row.ap for row in own}
-    known = {(row.label, row.by, row.slice): row.targets for row in own}
-    labels = list(dict.fromkeys(row.label for row in own))
+    chosen = [row for row in rows if row.iou == overlap]
+    ap = {(row.label, row.by, row.slice, row.kind): row.ap for row in chosen}
+    known = {(row.label, row.by, row.slice): row.targets for row in chosen}
+    labels = list(dict.fromkeys(row.label for row in chosen))
     return [
         f"{label:<12}{by:<11}{name.replace('_', ' '):<12}AP 3d {ap[label, by, name, '3d']:.3f}"
         f"  bev {ap[label, by, name, 'bev']:.3f}  (objects: {targets})"
@@ -306,7 +308,7 @@ class ObjectsOutcomes:
         return Outcomes(np.array([truth.scene for truth in truths]), arrays)
 
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
-        """Return (n,) the mean AP over the classes with targets, for each of n resamples of the frames `times` (n, F).
+        """Return the mean AP (n,) over the classes with targets, for n resamples of the frames `times` (n, F).
 
         NaN where no class has targets.
         """
@@ -324,32 +326,32 @@ class ObjectsOutcomes:
         and hidden objects.
         """
         once = np.ones((1, len(outcomes.scene)), dtype=np.int64)
-        each = [read_matches(outcomes, name) for name in outcomes.arrays[CLASSES]]
-        known = [matches for matches in each if matches.targets.any()]
+        per_class = [read_matches(outcomes, name) for name in outcomes.arrays[CLASSES]]
+        known = [matches for matches in per_class if matches.targets.any()]
         right = [share for matches in known if not np.isnan(share := right_headings(matches))]
         return {
             "AP70": _number(self._mean_precision(outcomes, "3d70", once)[0]),
             "BEV AP50": _number(self._mean_precision(outcomes, "bev50", once)[0]),
             "AOS50": float(np.mean([orientation_similarity(matches) for matches in known])) if known else None,
             "right headings": float(np.mean(right)) if right else None,
-            "targets": float(sum(int(matches.targets.sum()) for matches in each)),
+            "targets": float(sum(int(matches.targets.sum()) for matches in per_class)),
             "hidden": float(outcomes.arrays[HIDDEN].sum()),
         }
 
     def _mean_precision(self, outcomes: Outcomes, key: str, times: Times) -> Values:
-        each = [weighted_precision(read_matches(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]
-        known = ~np.isnan(each)
+        per_class = [weighted_precision(read_matches(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]
+        known = ~np.isnan(per_class)
         with np.errstate(invalid="ignore"):
-            return np.where(known, each, 0.0).sum(axis=0) / known.sum(axis=0)
+            return np.where(known, per_class, 0.0).sum(axis=0) / known.sum(axis=0)
 
 
 def read_matches(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:
-    """Return the matches of class `name` for the kind of overlap and IoU `key`, one of `KEPT`."""
+    """Return the matches of class `name` for `key`, a kind of overlap and IoU in `KEPT`."""
     return Matches(**{field.name: outcomes.arrays[f"{name}/{key}/{field.name}"] for field in fields(Matches)})
 
 
 def join_outcomes(parts: Sequence[Outcomes]) -> Outcomes:
-    """Return the outcomes of one network on the frames of several tests, one after the other, as of one test.
+    """Return the outcomes of a network on the frames of several tests, one after another, as those of one test.
 
     Scenes of different parts are different scenes: their names begin with the number of the part.
     """
@@ -361,10 +363,10 @@ def join_outcomes(parts: Sequence[Outcomes]) -> Outcomes:
     before = np.cumsum([0, *(len(each.scene) for each in parts)])
     for label in parts[0].arrays[CLASSES]:
         for key in KEPT:
-            own = [read_matches(part, str(label), key) for part in parts]
-            columns = [vars(each) for each in own]
+            matches = [read_matches(part, str(label), key) for part in parts]
+            columns = [vars(each) for each in matches]
             joined = {name: np.concatenate([each[name] for each in columns]) for name in columns[0]}
-            joined["frame"] = np.concatenate([each.frame + first for each, first in zip(own, before)])
+            joined["frame"] = np.concatenate([each.frame + first for each, first in zip(matches, before)])
             order = np.argsort(-joined["score"], kind="stable")
             joined |= {name: joined[name][order] for name in ("score", "hit", "turned", "frame")}
             arrays |= {f"{label}/{key}/{name}": value for name, value in joined.items()}

@@ -34,7 +34,7 @@ IGNORE_MARGIN_M = 0.5  # and where its centre lies in an ignored box enlarged by
 
 
 def cell_size(config: SecondConfig) -> tuple[float, float]:
-    """Return the size along x and along y [m] of a cell of the head's grid."""
+    """Return the size of a cell of the head's grid along x and y [m]."""
     rows, columns = head_shape(config)
     x0, y0, _, x1, y1, _ = config.range_m
     return (x1 - x0) / columns, (y1 - y0) / rows
@@ -62,7 +62,7 @@ def anchor_boxes(config: SecondConfig) -> Array:
 
 @lru_cache(maxsize=4)
 def anchor_classes(config: SecondConfig) -> Ints:
-    """Return (A,) the class index of every anchor, in the order of `anchor_boxes`; read-only."""
+    """Return the class indices (A,) of the anchors, in the order of `anchor_boxes`; read-only."""
     rows, columns = head_shape(config)
     classes = np.tile(np.repeat(np.arange(len(config.anchors)), HEADINGS), rows * columns)
     classes.flags.writeable = False
@@ -71,7 +71,7 @@ def anchor_classes(config: SecondConfig) -> Ints:
 
 @dataclass(frozen=True)
 class Targets:
-    """Training targets of one sample with A anchors, P of them positive."""
+    """Training targets of a sample with A anchors, P of them positive."""
 
     positive: Tensor  # (P,) int64 indices of the positive anchors
     weight: Tensor  # (A,) float32: 1 for positive and negative anchors, 0 for ignored ones
@@ -123,20 +123,20 @@ def encode_variance(variance: Array, boxes: Array, anchors: Array) -> Array:
 
 
 def _slopes(boxes: Array, anchors: Array) -> Array:
-    """Return the derivatives (P, 7) of decoded boxes by their residuals."""
+    """Return the derivatives (P, 7) of decoded boxes with respect to their residuals."""
     diagonal = np.hypot(anchors[:, 3], anchors[:, 4])
     return np.column_stack((diagonal, diagonal, anchors[:, 5], boxes[:, 3:6], np.ones(len(boxes))))
 
 
 def direction_of(yaw: Array) -> Ints:
-    """Return the direction class (P,) of each yaw: 0 in [pi/4, 5/4 pi), else 1. It distinguishes front from back."""
+    """Return the direction classes (P,) of yaws [rad]: 0 in [pi/4, 5/4 pi), else 1, to distinguish front from back."""
     return (np.mod(yaw - np.pi / 4, 2 * np.pi) >= np.pi).astype(np.int64)
 
 
 def mark_free_cells(free: Array32, config: SecondConfig) -> Mask:
-    """Return a mask (rows, columns) of the head's grid, True for cells with one of the free positions (K, 2) x, y [m].
+    """Return the mask (rows, columns) of cells of the head's grid that contain a free position (K, 2) x, y [m].
 
-    Positions should be at most half a cell apart in a free area; otherwise cells of a turned sample are missed.
+    Positions should be at most half a cell apart in a free area; otherwise cells of a rotated sample are missed.
     """
     rows, columns = head_shape(config)
     dx, dy = cell_size(config)
@@ -152,9 +152,9 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
     """Return the training targets of a sample: positive, negative and ignored anchors, residuals, directions.
 
     An anchor is positive for the object of its class with the highest IoU, if that is at least the class's
-    `matched_iou`, and for an object of which it is the best anchor, if their IoU is above 0.1. Other anchors are
-    ignored from `unmatched_iou` on, on boxes of `sample.ignore` or outside the range, and in cells not known to be free
-    where `sample.free` is given. The rest are negative.
+    `matched_iou`, and for an object whose best anchor it is, if their IoU is above 0.1. Other anchors are ignored from
+    `unmatched_iou` on, on boxes of `sample.ignore` or outside the range, and, where `sample.free` is given, in cells
+    that are not known to be free. The rest are negative.
     """
     anchors, classes = anchor_boxes(config), anchor_classes(config)
     inside = in_range(sample.boxes, config)
@@ -185,8 +185,8 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
     targets = boxes[owner[positive]]
     variance = None
     if sample.boxes.variance is not None:
-        own = sample.boxes.variance[inside][owner[positive]]
-        variance = torch.from_numpy(encode_variance(own, targets, anchors[positive]).astype(np.float32))
+        label_variance = sample.boxes.variance[inside][owner[positive]]
+        variance = torch.from_numpy(encode_variance(label_variance, targets, anchors[positive]).astype(np.float32))
     return Targets(
         positive=torch.from_numpy(positive),
         weight=torch.from_numpy(counts.astype(np.float32)),
@@ -198,7 +198,7 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
 
 
 def _near(boxes: Array, config: SecondConfig) -> Ints:
-    """Return the indices of the anchors in cells near any of the boxes (B, 7): all that could overlap one."""
+    """Return the indices of the anchors in cells near any box (B, 7): all those that may overlap one."""
     rows, columns = head_shape(config)
     dx, dy = cell_size(config)
     close = np.zeros((rows, columns), dtype=bool)
@@ -225,7 +225,7 @@ def _find_ignored(boxes: Array, config: SecondConfig) -> Ints:
 
 
 def _axis_aligned_iou(a: Array, b: Array) -> Array:
-    """Return the IoU (A, B) in bird's-eye view of boxes a (A, 7) with b (B, 7), each turned to the nearest axis."""
+    """Return the IoU (A, B) in bird's-eye view of boxes a (A, 7) with b (B, 7), both turned to the nearest axis."""
     a_low, a_high = _axis_aligned(a)
     b_low, b_high = _axis_aligned(b)
     shared = np.minimum(a_high[:, None], b_high) - np.maximum(a_low[:, None], b_low)
@@ -248,7 +248,7 @@ def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondCo
     """Return the scalar loss of a batch, the mean over its samples.
 
     The classification term of a sample is divided by its number of positive anchors; the box, direction and variance
-    terms by its number of positive anchors with an exact box, the only ones that enter them.
+    terms by its number of positive anchors with an exact box, the only ones that contribute to them.
     """
     share = torch.cat([target.exact / target.exact.sum().clamp(min=1) for target in targets]).to(output.score.device)
     box, direction, nll = box_losses(output, targets)
@@ -259,9 +259,9 @@ def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondCo
 
 
 def classification_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondConfig) -> Tensor:
-    """Return the sum over the samples of a batch of the focal loss of each, divided by its number of positive anchors.
+    """Return the sum over a batch's samples of their focal loss, divided by their number of positive anchors.
 
-    Ignored anchors do not enter it.
+    Ignored anchors do not contribute.
     """
     device = output.score.device
     samples, anchors, classes = output.score.shape
@@ -277,11 +277,12 @@ def classification_loss(output: HeadOutput, targets: Sequence[Targets], config: 
 
 
 def box_losses(output: HeadOutput, targets: Sequence[Targets]) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return the losses of a batch's P positive anchors: of residuals (P, 7), directions (P,) and variances (P, 7).
+    """Return the losses of a batch's P positive anchors: residuals (P, 7), directions (P,) and variances (P, 7).
 
     They are smooth L1, cross-entropy and Gaussian negative log-likelihood; the last is None where none are predicted.
     """
-    device, positive = output.score.device, _positive(output, targets)
+    device = output.score.device
+    positive = _positive(output, targets)
     residual = torch.cat([target.residual for target in targets]).to(device)
     error = residual_errors(output.box.flatten(0, 1)[positive], residual)
     box = smooth_l1(error)
@@ -294,7 +295,7 @@ def box_losses(output: HeadOutput, targets: Sequence[Targets]) -> tuple[Tensor, 
 
 
 def residual_errors(found: Tensor, wanted: Tensor) -> Tensor:
-    """Return the errors (P, 7) of residuals (P, 7): differences, of the yaw its sine."""
+    """Return the errors (P, 7) of residuals (P, 7): differences, and for the yaw the sine of the difference."""
     error = found - wanted
     return torch.cat((error[:, :6], torch.sin(error[:, 6:])), 1)
 
@@ -305,7 +306,7 @@ def smooth_l1(error: Tensor) -> Tensor:
 
 
 def _positive(output: HeadOutput, targets: Sequence[Targets]) -> Tensor:
-    """Return (P,) the indices of the positive anchors of a batch among the anchors of all samples."""
+    """Return the indices (P,) of the positive anchors of a batch among the anchors of all samples."""
     anchors = output.score.shape[1]
     return torch.cat([target.positive + i * anchors for i, target in enumerate(targets)]).to(output.score.device)
 

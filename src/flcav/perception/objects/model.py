@@ -1,9 +1,9 @@
 """SECOND and its configurations: a sparse 3D backbone, a 2D network in bird's-eye view, one anchor head.
 
 Yan, Mao, Li, "SECOND: Sparsely Embedded Convolutional Detection", Sensors 18(10):3337, 2018. The widths of
-`second_paper` are those of the public configuration for KITTI (8x sparse backbone, 5.3 M parameters). In place of the
-sparse backbone a network may have a dense one, of pillars (Lang et al., "PointPillars", CVPR 2019). Configurations
-include the augmentation of training samples, and are stored beside the weights.
+`second_paper` are those of the public configuration for KITTI (8x sparse backbone, 5.3 M parameters). A dense backbone
+of pillars (Lang et al., "PointPillars", CVPR 2019) may replace the sparse one. Configurations include the augmentation
+of training samples, and are stored together with the weights.
 """
 
 import math
@@ -66,7 +66,7 @@ class Augmentation:
 class SecondConfig:
     """Configuration of a SECOND network, in the LiDAR frame: x forward, y left, z up, metres, origin at the sensor.
 
-    With `pillar_channels` the backbone takes pillars through 2D convolutions, not voxels through sparse 3D ones.
+    With `pillar_channels` the backbone processes pillars by 2D convolutions instead of voxels by sparse 3D ones.
     """
 
     anchors: Annotated[tuple[Anchor, ...], Field(min_length=1)]  # one per class, in the order of the scores
@@ -83,7 +83,7 @@ class SecondConfig:
     foreground: bool = False  # whether roadside sweeps come without their static background
     uncertainty: bool = False  # whether the network predicts a variance of each residual
     bfloat16: bool = False  # autocast in training where the hardware supports it: on a CPU in the 2D part alone
-    around: bool = False  # whether it is asked to look to all four sides, by quarter turns of the sweep
+    around: bool = False  # whether it looks to all four sides, by quarter turns of the sweep
     calibration: tuple[tuple[float, float], ...] | None = None  # Platt scaling, per class: factor and summand of logits
     augmentation: Augmentation = Augmentation()  # of training samples
 
@@ -127,7 +127,7 @@ HEADINGS = 2  # anchors per class and cell: along x, along y
 
 
 class HeadOutput(NamedTuple):
-    """Raw predictions of the anchor head for A = H * W * classes * headings anchors of B samples."""
+    """Raw predictions of the anchor head for the A = H * W * classes * headings anchors of B samples."""
 
     score: Tensor  # (B, A, classes) logits
     box: Tensor  # (B, A, 7) residuals, see `flcav.perception.objects.loss.encode_residuals`
@@ -136,7 +136,7 @@ class HeadOutput(NamedTuple):
 
 
 class SparseBlock(nn.Module):
-    """Sparse convolution, batch normalisation, ReLU."""
+    """Sparse convolution, batch normalisation and ReLU."""
 
     def __init__(self, convolution: SubmanifoldConv3d | StridedConv3d, channels: int) -> None:
         super().__init__()
@@ -173,7 +173,7 @@ def _convolved(size: int, kernel: int, stride: int, padding: int) -> int:
 
 
 def head_shape(config: SecondConfig) -> tuple[int, int]:
-    """Return the rows (y) and columns (x) of the head's grid: the last stride of the backbone's."""
+    """Return the rows (y) and columns (x) of the head's grid, that of the backbone's last stride."""
     _, rows, columns = grid_shape(config.range_m, config.voxel_m)
     for _ in config.pillar_channels or config.sparse_channels[1:]:
         rows, columns = _convolved(rows, 3, 2, 1), _convolved(columns, 3, 2, 1)
@@ -216,7 +216,7 @@ class BirdsEye(nn.Module):
 
 
 class Second(nn.Module):
-    """SECOND network of a configuration: voxels or pillars, their backbone, 2D backbone, anchor head."""
+    """The SECOND network of a configuration: voxels or pillars, their backbone, 2D backbone, anchor head."""
 
     def __init__(self, config: SecondConfig) -> None:
         super().__init__()
@@ -243,7 +243,7 @@ class Second(nn.Module):
     def voxels(self, points: Tensor, sample: Tensor, samples: int) -> SparseTensor | Tensor:
         """Return the input of a batch of `samples` point clouds: voxels, coordinates scaled to [-1, 1]; or pillars.
 
-        points (N, 4) x, y, z [m], intensity, LiDAR frame; sample (N,) number of each point's cloud.
+        `points` is (N, 4): x, y, z [m], intensity, LiDAR frame; `sample` (N,) is the number of each point's cloud.
         """
         if self.config.pillar_channels:
             points = points if self.config.intensity else points * points.new_tensor((1, 1, 1, 0))
@@ -277,12 +277,12 @@ class Second(nn.Module):
 
 
 def second(config: SecondConfig) -> Second:
-    """Return a new SECOND network of `config`, its weights drawn by torch's global generator."""
+    """Return a new SECOND network of `config`, with weights drawn by torch's global generator."""
     return Second(config)
 
 
 def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return the configuration of the smallest SECOND, for a CPU: 0.33 M parameters, 0-48 m ahead, 24 m to either side.
+    """Return the smallest SECOND's configuration, for a CPU: 0.33 M parameters, 0-48 m ahead, 24 m to either side.
 
     Raises `InputError` for unknown classes.
     """
@@ -298,7 +298,7 @@ def tiny_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -
 
 
 def pillars_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return the demo's configuration, of pillars: the range of `tiny_config`, 0.16 M parameters, a third of its time.
+    """Return the demo's configuration, of pillars: the range of `tiny_config`, 0.16 M parameters, a third of the time.
 
     Raises `InputError` for unknown classes.
     """
@@ -321,11 +321,11 @@ def small_config(
 ) -> SecondConfig:
     """Return the configuration of the study, trained on a CPU: 0-51.2 m ahead, 28.8 m to either side, voxels of 0.1 m.
 
-    KITTI's benchmark asks for cars of 25 pixels or more, which are within 43 m. Intensity is no input, since each LiDAR
-    reports it in its own way. The augmentation varies what differs between simulated and real streets: tilt and height
-    of the sensor, distance and size of cars, lost returns, field of view. KITTI's cars are smaller than the simulated
-    ones, so the anchor is the published one, KITTI's mean car, and most cars are resized. Boxes have the margins of
-    KITTI's labels. Raises `InputError` for unknown classes.
+    KITTI's benchmark counts cars of 25 pixels or more, which are within 43 m. Intensity is not an input, since every
+    LiDAR reports it in a different way. The augmentation varies what differs between simulated and real streets: tilt
+    and height of the sensor, distance and size of cars, lost returns, field of view. KITTI's cars are smaller than the
+    simulated ones, so that the anchor is the published one, KITTI's mean car, and most cars are resized. Boxes have the
+    margins of KITTI's labels. Raises `InputError` for unknown classes.
     """
     return SecondConfig(
         anchors=tuple(KITTI_CAR if anchor.name == "Car" else anchor for anchor in _anchors(classes)),
@@ -357,8 +357,8 @@ def small_config(
 def road_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -6.0) -> SecondConfig:
     """Return the configuration of the roadside detector: 38.4 m to every side of a LiDAR 6 m above the road.
 
-    Its layers are those of `small_config`. A pole stands anywhere beside the road, so that samples are turned by up to
-    a quarter to either side. Raises `InputError` for unknown classes.
+    Its layers are those of `small_config`. A pole may stand anywhere at the roadside, so that samples are rotated by up
+    to a quarter turn to either side. Raises `InputError` for unknown classes.
     """
     return replace(
         small_config(classes, ground_z_m),

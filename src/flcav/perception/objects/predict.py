@@ -1,7 +1,7 @@
 """Inference of SECOND: decoding of anchors, non-maximum suppression, score calibration, and findings of point clouds.
 
 Scores are calibrated by Platt scaling, and their reliability is measured per class: expected calibration error (ECE)
-and the ratio of squared errors to predicted variances. Point clouds are those of files, folders and datasets.
+and the ratio of squared errors to predicted variances. Point clouds are read from files, folders and datasets.
 """
 
 import copy
@@ -89,7 +89,7 @@ def detect(network: Second, points: Array32, *, score_threshold: float = 0.1) ->
     """Return the boxes detected in a point cloud (N, 4) x, y, z [m], intensity [0, 1], LiDAR frame.
 
     They have class labels and scores of at least `score_threshold`, class by class, highest score first, and variances
-    where the network predicts them.
+    if the network predicts them.
     """
     return detect_all(network, [points], score_threshold=score_threshold)[0]
 
@@ -114,7 +114,7 @@ def detect_moved(
 ) -> list[Boxes]:
     """Return the boxes detected in each point cloud as `detect` does, in the frame of its points.
 
-    A cloud's move (4, 4) brings it to the frame that the network was trained in; None: it is there.
+    A cloud's move (4, 4) brings it to the frame that the network was trained in; None: it is already in that frame.
     """
     moved = [move_points(cloud, move) for cloud, move in zip(clouds, moves, strict=True)]
     found = detect_all(network, moved, score_threshold=score_threshold)
@@ -126,8 +126,8 @@ def detect_all(
 ) -> list[Boxes]:
     """Return the boxes detected in each point cloud as `detect` does, `batch` clouds at a time.
 
-    With `around` in its configuration the network looks at each cloud four times, turned by quarters, and what two
-    looks found is suppressed as within one. It runs in evaluation mode; its mode is restored.
+    With `around` in its configuration the network looks at each cloud four times, turned by quarters, and detections
+    from two looks suppress one another as those of one look do. It runs in evaluation mode; its mode is restored.
     """
     if not network.config.around:
         return _detect_ahead(network, clouds, score_threshold, batch)
@@ -149,7 +149,7 @@ def look_around(network: Second) -> Second:
 
 
 def _turn(points: Array32, quarters: int) -> Array32:
-    """Return the points turned by so many quarters to the left about the sensor, exactly."""
+    """Return the points rotated exactly by a number of quarter turns to the left about the sensor."""
     x, y = points[:, 0], points[:, 1]
     for _ in range(quarters % QUARTERS):
         x, y = -y, x
@@ -161,9 +161,9 @@ def _suppress(boxes: Boxes, classes: Sequence[str]) -> Boxes:
     assert boxes.score is not None
     kept = []
     for name in classes:
-        own = np.flatnonzero(boxes.label == name)
-        own = own[np.argsort(-boxes.score[own], kind="stable")]
-        kept.append(own[nms(torch.from_numpy(boxes.array()[own]), torch.from_numpy(boxes.score[own])).numpy()])
+        rows = np.flatnonzero(boxes.label == name)
+        rows = rows[np.argsort(-boxes.score[rows], kind="stable")]
+        kept.append(rows[nms(torch.from_numpy(boxes.array()[rows]), torch.from_numpy(boxes.score[rows])).numpy()])
     return boxes[np.concatenate(kept)]
 
 
@@ -193,8 +193,8 @@ def detect_frames(
 ) -> tuple[list[Boxes], list[FrameTruth]]:
     """Return the detections of `network` in each frame, from `LOWEST_SCORE` on, and the ground truth of each frame.
 
-    asked: a configuration of smaller range (None: the network's own); objects beyond it are neutral, and detections
-    beyond it are dropped. total: number of frames where it is known, for `progress`. Raises `InputError` where a frame
+    `asked` is a configuration of smaller range (None: the network's); objects beyond it are neutral, and detections
+    beyond it are dropped. `total` is the number of frames, if known, for `progress`. Raises `InputError` where a frame
     has no LiDAR.
     """
     truths: list[FrameTruth] = []
@@ -230,7 +230,7 @@ def calibrate_logits(logits: Tensor, config: SecondConfig) -> Tensor:
 
 
 def boxes_to_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
-    """Return the boxes as records, one per box; a score that is not known is 1."""
+    """Return the boxes as records, one per box; an unknown score becomes 1."""
     scores = boxes.score if boxes.score is not None else np.ones(len(boxes))
     rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), strict=True)
     return tuple(ObjectFound(label, score, *row) for label, score, row in rows)
@@ -248,17 +248,17 @@ def _decode_boxes(
     config = network.config
     parts = []
     for index, name in enumerate(config.classes):
-        own = np.flatnonzero(anchor_classes(config) == index)
-        scores = score[own, index]
+        anchors_of_class = np.flatnonzero(anchor_classes(config) == index)
+        scores = score[anchors_of_class, index]
         likely = np.argsort(-scores, kind="stable")[:CANDIDATES]
         likely = likely[scores[likely] >= threshold]
-        own, scores = own[likely], scores[likely]
-        anchors = anchor_boxes(config)[own]
-        rows = decode_residuals(box[own], direction[own], anchors)
+        anchors_of_class, scores = anchors_of_class[likely], scores[likely]
+        anchors = anchor_boxes(config)[anchors_of_class]
+        rows = decode_residuals(box[anchors_of_class], direction[anchors_of_class], anchors)
         kept = nms(torch.from_numpy(rows), torch.from_numpy(scores)).numpy()
         found = Boxes.from_array(rows[kept], name, scores[kept])
         if spread is not None:
-            found = replace(found, variance=decode_variance(spread[own][kept], rows[kept], anchors[kept]))
+            found = replace(found, variance=decode_variance(spread[anchors_of_class][kept], rows[kept], anchors[kept]))
         parts.append(found)
     return concatenate(parts)
 
@@ -268,7 +268,7 @@ class InputCloud(NamedTuple):
 
     path: Path  # of the file; of a dataset, folder / key of the frame
     points: Array32  # (N, 4) x, y, z [m], intensity [0, 1]
-    move: Array | None  # (4, 4) brings it to the frame that the network was trained in; None: it is there
+    move: Array | None  # (4, 4) to the frame that the network was trained in; None: it is in that frame
     view: Callable[[], CameraView | None]  # reads the view of a camera with the same direction, None without one
 
 
@@ -277,8 +277,8 @@ def detect_objects(
 ) -> Iterator[Finding]:
     """Yield the objects of score `threshold` or more in each point cloud of `path`.
 
-    path: a file of a point cloud, see `read_cloud_file`, a folder of them, or a dataset folder, of which `frames`
-    (None: all). Raises `InputError` as `read_point_clouds` does.
+    `path` is a point cloud file, see `read_cloud_file`, a folder of them, or a dataset folder, with its `frames` (None:
+    all). Raises `InputError` as `read_point_clouds` does.
     """
     for cloud in read_point_clouds(path, frames, network.config):
         (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)
@@ -316,7 +316,7 @@ def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) 
         frame = read(i)
         lidar, origin = choose_lidar(frame), folder / frame.key
         points = frame.lidar[lidar]
-        if not config.foreground:  # a street may be empty before its background
+        if not config.foreground:  # without its background, a street may be empty
             validate_points(points, origin)
         yield InputCloud(origin, points, network_from_lidar(frame, config), partial(recorded_view, dataset, i, lidar))
 
@@ -325,7 +325,7 @@ OVERLAP = 0.5  # 3D IoU from which a detection is a true positive
 
 
 def calibrate(network: Second, frames: Iterable[Frame]) -> None:
-    """Set the Platt scaling in the configuration of `network`, fitted per class on frames it was not trained on.
+    """Set the Platt scaling in the configuration of `network`, fitted per class on frames not used for training.
 
     See `flcav.perception.metrics.detection.fit_logistic`.
     """
@@ -340,7 +340,7 @@ def calibrate(network: Second, frames: Iterable[Frame]) -> None:
 
 @dataclass(frozen=True)
 class Reliability:
-    """Reliability of one class's scores and predicted variances; None without detections or variances."""
+    """Reliability of a class's scores and predicted variances; None without detections or variances."""
 
     label: Class
     detections: int  # true and false positives

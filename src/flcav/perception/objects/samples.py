@@ -1,6 +1,6 @@
 """Training samples of the detector: LiDAR sweeps with labels, from recorded frames or from messages.
 
-In a message the sweep is whole and uncompressed, 16 bytes a point, with the boxes to learn from.
+In a message the sweep is whole and uncompressed, 16 bytes per point, with the boxes to learn from.
 """
 
 import math
@@ -33,7 +33,7 @@ from flcav.perception.task import KnownLidar
 from flcav.perception.weights import find_recorded_lidar
 from flcav.sensors.frame import Frame
 
-RANGE_SLACK = 0.2  # difference of a LiDAR's range from the one of the training that is not worth a word
+RANGE_SLACK = 0.2  # relative difference of a LiDAR's range from that of the training that is not mentioned
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
 
 
@@ -44,21 +44,20 @@ class Sample:
     points: Array32  # (N, 4) x, y, z [m], intensity [0, 1]
     boxes: Boxes  # (B,) objects to detect; label = detection class
     ignore: Boxes = field(default_factory=Boxes.empty)  # objects left out of the loss, neither positive nor negative
-    free: Array32 | None = None  # (K, 2) positions x, y [m] without objects; None: wherever no box is
+    free: Array32 | None = None  # (K, 2) positions x, y [m] without objects; None: everywhere outside boxes
     exact: Mask | None = None  # (B,) whether size and pose of the box are learned too; None: all
-    own: Boxes | None = None  # the vehicle's own detections, for a contrastive loss; None: there is none
+    own: Boxes | None = None  # the vehicle's detections, for a contrastive loss; None: none
 
 
 def sample_from_frame(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Sample:
     """Return the frame's sweep with its ground truth as labels.
 
-    Objects with `MIN_RETURNS` returns or more are to be detected. Those with fewer but some are ignored, and so are
+    Objects with `MIN_RETURNS` returns or more are to be detected. Those with fewer, but some, are ignored, and so are
     lookalikes with any; objects without a return are background. Objects out of range are kept, since augmentation may
-    move them in; points that it cannot move into the range of `config` are left out.
+    move them into it; points that it cannot move into the range of `config` are left out.
 
-    The sweep is moved to the height and direction that the network expects, see `network_from_lidar`.
-
-    lidar: name of the LiDAR; None: the frame's first. Raises `InputError` where the frame has none of that name.
+    The sweep is moved to the height and direction that the network expects, see `network_from_lidar`. `lidar` is the
+    name of the LiDAR; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
     whole = label_sweep(frame, config, lidar)
     return replace(whole, points=crop_to_range(whole.points, config))
@@ -73,7 +72,7 @@ def label_sweep(frame: Frame, config: SecondConfig, lidar: str | None = None) ->
 
 
 def move_sample(sample: Sample, move: Array | None) -> Sample:
-    """Return the sample in the target frame of the rigid (4, 4) transform `move`; None: as it is."""
+    """Return the sample in the target frame of the rigid transform `move` (4, 4) [m]; for None unchanged."""
     if move is None:
         return sample
     free = sample.free
@@ -83,14 +82,14 @@ def move_sample(sample: Sample, move: Array | None) -> Sample:
 
 
 def map_sample(sample: Sample, points: Array32, moved: Callable[[Boxes], Boxes], free: Array32 | None) -> Sample:
-    """Return the sample with other points (N, 4) and free positions (K, 2), and all its boxes `moved`, LiDAR frame."""
-    own = None if sample.own is None else moved(sample.own)
+    """Return the sample with other points (N, 4) and free positions (K, 2), and with `moved` boxes, LiDAR frame."""
+    detected = None if sample.own is None else moved(sample.own)
     boxes, ignore = moved(sample.boxes), moved(sample.ignore)
-    return replace(sample, points=points, boxes=boxes, ignore=ignore, free=free, own=own)
+    return replace(sample, points=points, boxes=boxes, ignore=ignore, free=free, own=detected)
 
 
 def move_points(points: Array32, move: Array | None) -> Array32:
-    """Return the points (N, 4) x, y, z [m], intensity in the target frame of the rigid (4, 4) `move`; None: as is."""
+    """Return points (N, 4) x, y, z [m], intensity in the target frame of the rigid `move` (4, 4); None: unchanged."""
     return (
         points
         if move is None
@@ -99,7 +98,7 @@ def move_points(points: Array32, move: Array | None) -> Array32:
 
 
 class RecordedSweeps(Sequence[Sample]):
-    """Frames of a dataset as a sequence of samples with ground truth as labels, each read on access.
+    """Frames of a dataset as a sequence of samples with ground truth as labels, which are read on access.
 
     Raises `InputError` where one of the frames has no LiDAR, or the dataset no labels of objects.
     """
@@ -120,7 +119,7 @@ class RecordedSweeps(Sequence[Sample]):
 
 
 def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
-    """Return the numbers of the frames whose first LiDAR is mounted within `HEIGHT_SLACK_M` of the height expected.
+    """Return the numbers of the frames whose first LiDAR is mounted at the expected height, within `HEIGHT_SLACK_M`.
 
     The height is that above the ground (`flcav.dataset.ground`), the expected one is -config.ground_z_m. A vehicle's
     origin is on the ground, a pole's at its sensors. All frames are returned where none has a LiDAR; reading them as
@@ -147,7 +146,7 @@ def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
 
 
 def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trained: KnownLidar) -> str:
-    """Return how the LiDAR of the frames' agents differs from the one of the network's training, as `describe_rig`."""
+    """Return how the LiDAR of the frames' agents differs from that of the network's training, see `describe_rig`."""
     agents = {data.keys[i].agent: data.lidars(i)[0] for i in frames if data.lidars(i)}
     mounts = [
         data.calibrations[agent].assumed.agent_from_sensor[lidar]
@@ -159,11 +158,11 @@ def compare_rig(data: Dataset, config: SecondConfig, frames: Sequence[int], trai
 
 
 def describe_rig(mounts: Sequence[Array], here: KnownLidar, config: SecondConfig, trained: KnownLidar) -> str:
-    """Return how a LiDAR `here` differs from the one of the network's training, in words.
+    """Return how a LiDAR `here` differs from that of the network's training, in words.
 
-    That is by its number of beams, its range as far as the network looks, its height above the ground and its
-    direction, of which the last two are corrected (see `flcav.perception.objects.truth.network_from_lidar`). "" where
-    it does not differ, or does by nothing known. mounts: (4, 4) vehicle from LiDAR, as each vehicle assumes it.
+    It may differ in its number of beams, its range as far as the network looks, its height above the ground and its
+    direction; the last two are corrected (see `flcav.perception.objects.truth.network_from_lidar`). "" if it does not,
+    or not in anything known. `mounts` are the transforms (4, 4) vehicle from LiDAR, as assumed by the vehicles.
     """
     moved = [mount for mount in mounts if level_mount(mount, config) is not None]
     heights = dict.fromkeys(f"{mount[2, 3]:.2f}" for mount in moved if abs(mount[2, 3] + config.ground_z_m) > LEVEL_M)
@@ -193,7 +192,7 @@ def _span(beams: tuple[int, int]) -> str:
 def crop_to_range(points: Array32, config: SecondConfig) -> Array32:
     """Return the points (N', 4) of a sweep (N, 4) that global augmentation may move into the range of `config`.
 
-    Global augmentation is mirroring, turning, scaling, shifting, tilting and lifting; the bounds are approximate.
+    Global augmentation is mirroring, rotation, scaling, shifting, tilting and lifting; the bounds are approximate.
     """
     x0, _, z0, _, _, z1 = config.range_m
     most = config.augmentation
@@ -212,7 +211,7 @@ def crop_to_range(points: Array32, config: SecondConfig) -> Array32:
 def validate_points(points: Array32, origin: str | Path) -> Array32:
     """Return the points unchanged; raises `InputError` unless they are (N, 4), N >= 1, with finite numbers in range.
 
-    origin: their file or frame, named in the message.
+    `origin` is their file or frame, named in the message.
     """
     if points.ndim != 2 or points.shape[1] != 4:
         raise InputError(f"{origin}: a point cloud of shape {points.shape}; (N, 4) x, y, z, intensity is wanted")

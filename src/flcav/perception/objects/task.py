@@ -1,7 +1,8 @@
 """3D object detection by SECOND as a `Task`, its error registry, and its study recipes.
 
 A miss is a target or faint object (see `flcav.perception.objects.truth`) without a detection. A false positive is a
-detection on no annotated object with at least one LiDAR return in its box. Both lie within the range of the network.
+detection that lies on no annotated object and has at least one LiDAR return in its box. Both are within the range of
+the network.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -49,8 +50,8 @@ from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, KnownLidar, Practice
 from flcav.sensors.frame import Frame
 
-TOWNS = ("suburb", "ring", "grid")  # of the study
-TRACKS = "tracks"  # test of tracking
+TOWNS = ("suburb", "ring", "grid")  # towns of the study
+TRACKS = "tracks"  # name of the test of tracking
 
 
 OVERLAP = 0.5  # 3D IoU from which an object is detected
@@ -59,10 +60,10 @@ OVERLAP = 0.5  # 3D IoU from which an object is detected
 def find_errors(
     frames: Iterable[Frame], detections: Iterable[Boxes], config: SecondConfig, threshold: float = THRESHOLD
 ) -> Iterator[list[PerceptionError]]:
-    """Yield the misses and false positives of each frame, of detections of score `threshold` or more.
+    """Yield the misses and false positives of each frame, for detections that score at least `threshold`.
 
-    They are at world coordinates; those that repeat over frames are among them, see `flcav.perception.errors`.
-    detections: one `Boxes` per frame, LiDAR frame. Raises ValueError where these and `frames` differ in length.
+    They are in world coordinates; duplicates over frames are included, see `flcav.perception.errors`. `detections` has
+    one `Boxes` per frame, LiDAR frame. Raises ValueError where `detections` and `frames` differ in length.
     """
     for frame, found in zip(frames, detections, strict=True):
         found = found[np.flatnonzero(found.score >= threshold)] if found.score is not None else found
@@ -74,12 +75,13 @@ def find_errors(
 def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfig) -> list[PerceptionError]:
     """Return the missed objects, and set `matched` (N,) for detections that match or lie on an annotated object."""
     truth, annotations = ground_truth(frame, config), frame.annotations
-    label, asked = truth.boxes.label, truth.target | truth.faint
-    missed = asked.copy()
+    label = truth.boxes.label
+    wanted = truth.target | truth.faint
+    missed = wanted.copy()
     for name in config.classes:
-        own, objects = np.flatnonzero(found.label == name), np.flatnonzero(asked & (label == name))
-        target = assign_targets(found[own], truth.boxes[objects], OVERLAP)
-        matched[own[target >= 0]] = True
+        same_class, objects = np.flatnonzero(found.label == name), np.flatnonzero(wanted & (label == name))
+        target = assign_targets(found[same_class], truth.boxes[objects], OVERLAP)
+        matched[same_class[target >= 0]] = True
         missed[objects[target[target >= 0]]] = False
     matched |= on_neutral(found, truth.boxes)
     rows = zip(
@@ -105,12 +107,13 @@ def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[P
 
 
 def streets_study() -> StudyRecipe:
-    """Return the study recipe of drawn streets: five of each town, and a third of the sweeps of `ObjectsTask.study`.
+    """Return the study recipe of generated streets: five per town, and a third of the sweeps of `ObjectsTask.study`.
 
     Cars in those sweeps have flat ends.
     """
     recipe, drawn = read_recipe("objects"), read_recipe("streets")
-    tested, drawn_test = {"split": "test", "scenes": 10, "spins_per_scene": 4}, {"split": "test", "scenes": 10}
+    tested = {"split": "test", "scenes": 10, "spins_per_scene": 4}
+    drawn_test = {"split": "test", "scenes": 10}
     return StudyRecipe(
         network="small",
         train=(
@@ -143,7 +146,7 @@ class ObjectsTask(ObjectsOutcomes):
         self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # the latest ground-truth database and its samples
 
     def study(self) -> StudyRecipe:
-        """Return the study recipe: training in three towns, tests on other scenes of each, in weather, of tracking."""
+        """Return the study recipe: training in three towns; tests on other scenes of them, in weather, of tracking."""
         recipe = read_recipe("objects")
         tested = {**recipe, "split": "test", "scenes": 10, "spins_per_scene": 4}
         weather = {"classes": ["clear", "light_rain", "heavy_rain", "fog"], "turn_s": 4.0}
@@ -162,11 +165,11 @@ class ObjectsTask(ObjectsOutcomes):
         )
 
     def build(self, config: SecondConfig) -> Second:
-        """Return a new SECOND network; torch's global generator draws its weights."""
+        """Return a new SECOND network, with weights drawn by torch's global generator."""
         return second(config)
 
     def samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int] | None = None) -> Sequence[Sample]:
-        """Return the sweeps of frames (None: all) with ground truth as labels, each read on access.
+        """Return the sweeps of frames (None: all) with ground truth as labels, read on access.
 
         Raises `InputError` where one of the frames has no LiDAR.
         """
@@ -187,9 +190,9 @@ class ObjectsTask(ObjectsOutcomes):
         return compare_rig(data, config, frames, trained)
 
     def draw(self, samples: Sequence[Sample], index: int, config: SecondConfig, rng: np.random.Generator) -> Sample:
-        """Return sample `index` augmented as `config.augmentation` says, ground-truth sampling first.
+        """Return sample `index` augmented as `config.augmentation` says, starting with ground-truth sampling.
 
-        The ground-truth database is made of all samples when one of them is drawn first.
+        The ground-truth database is built from all samples when the first of them is drawn.
         """
         how = config.augmentation
         sample = samples[index]
@@ -216,10 +219,11 @@ class ObjectsTask(ObjectsOutcomes):
         asked: SecondConfig | None = None,
         progress: Report = ignore_progress,
     ) -> ObjectsEvaluation:
-        """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; cars near by; breakdown.
+        """Return AP and AOS per class, kind of overlap and IoU, with intervals over scenes; near cars; breakdown.
 
-        frames: their numbers (None: all). asked: the network's configuration with a smaller range, see `narrow_range`
-        in `flcav.perception.objects.truth`. Raises `InputError` where there are no frames, or one has no LiDAR.
+        `frames` are their numbers (None: all). `asked` is the network's configuration with a smaller range, see
+        `narrow_range` in `flcav.perception.objects.truth`. Raises `InputError` where there are no frames, or one has no
+        LiDAR.
         """
         data.check_labelled("objects")
         numbers, classes = data.numbers(frames), network.config.classes
@@ -242,12 +246,12 @@ class ObjectsTask(ObjectsOutcomes):
         )
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
-        """Set the Platt scaling of the network's scores, fitted on frames (None: all) it was not trained on."""
+        """Set the Platt scaling of the network's scores, fitted on frames (None: all) not used for training."""
         data.check_labelled("objects")
         calibrate(network, map(frame_reader(data, network.config.foreground), data.numbers(frames)))
 
     def pack_samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> Iterator[bytes]:
-        """Yield the message of each frame: its whole sweep and its boxes."""
+        """Yield the messages of frames, with their whole sweep and boxes."""
         RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
         read = frame_reader(data, config.foreground)
         return (pack_sample(read(i), config) for i in frames)
@@ -272,7 +276,7 @@ class ObjectsTask(ObjectsOutcomes):
     ) -> Registry:
         """Return the registry of the network's misses and false positives on frames (None: all).
 
-        threshold: lowest score of a detection. See `find_errors`.
+        `threshold` is the lowest score of a detection. See `find_errors`.
         """
         data.check_labelled("objects")
         numbers, read = data.numbers(frames), frame_reader(data, network.config.foreground)
@@ -282,8 +286,8 @@ class ObjectsTask(ObjectsOutcomes):
                 yield from detect_in(network, [read(number)], score_threshold=threshold)
                 progress(done, len(numbers), "")
 
-        each = find_errors(map(read, numbers), found(), network.config, threshold)
-        return Registry.of(dict(zip(numbers, each, strict=True)))
+        mistakes = find_errors(map(read, numbers), found(), network.config, threshold)
+        return Registry.of(dict(zip(numbers, mistakes, strict=True)))
 
 
 OBJECTS = ObjectsTask()

@@ -33,54 +33,54 @@ DETECTION_CLASS = {
 CARS = tuple(kind for kind, name in DETECTION_CLASS.items() if name == "Car")  # categories of actors
 LOOKALIKE = {"truck": "Car", "bus": "Car"}  # neutral: a detection on one is neither true nor false
 MIN_RETURNS = 5  # LiDAR returns that make an object a target
-QUARTERS = 4  # quarter turns of a whole spin
-LEVEL_M = 0.15  # difference of a mount's height from the one of the training that needs no correction
-LEVEL_RAD = 0.05  # the same of its direction
+QUARTERS = 4  # quarter turns in a full turn
+LEVEL_M = 0.15  # difference of a mount's height from that of the training that needs no correction
+LEVEL_RAD = 0.05  # the same for its direction
 
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Ground truth of one frame: its M annotated actors, for a network of some classes and range.
+    """Ground truth of a frame: its M annotated actors, for a network of some classes and range.
 
-    Rows are those of the frame's annotations. Besides targets, faint and hidden objects there are objects out of range,
-    lookalikes, and actors of no class the network knows.
+    Rows are those of the frame's annotations. In addition to targets, faint and hidden objects there are objects out of
+    range, lookalikes, and actors of no class that the network knows.
     """
 
-    boxes: Boxes  # (M,) LiDAR frame; label = detection class, of a lookalike the one it resembles, else ""
-    returns: Ints  # (M,) of all LiDARs
+    boxes: Boxes  # (M,) LiDAR frame; label = detection class, for a lookalike the one that it resembles, else ""
+    returns: Ints  # (M,) by all LiDARs
     inside: Mask  # (M,) centre within the range in bird's-eye view
     lookalike: Mask  # (M,) trucks and buses, for a network that knows cars
 
     @cached_property
     def known(self) -> Mask:
-        """Return (M,) whether the object is of a class of the network, in range or not."""
+        """Return the mask (M,) of objects of a class that the network knows, in range or not."""
         return (self.boxes.label != "") & ~self.lookalike
 
     @cached_property
     def enough(self) -> Mask:
-        """Return (M,) whether the object is of a known class with enough returns for a target, in range or not."""
+        """Return the mask (M,) of objects of a known class with enough returns for a target, in range or not."""
         return self.known & (self.returns >= MIN_RETURNS)
 
     @cached_property
     def target(self) -> Mask:
-        """Return (M,) whether the object is a target: of a known class, in range, with enough returns."""
+        """Return the mask (M,) of targets: objects of a known class, in range, with enough returns."""
         return self.enough & self.inside
 
     @cached_property
     def faint(self) -> Mask:
-        """Return (M,) whether the object is faint: of a known class, in range, with some returns but too few."""
+        """Return the mask (M,) of faint objects: of a known class, in range, with some returns but too few."""
         return self.known & self.inside & (self.returns > 0) & ~self.enough
 
     @cached_property
     def hidden(self) -> Mask:
-        """Return (M,) whether the object is hidden: of a known class, in range, without a return."""
+        """Return the mask (M,) of hidden objects: of a known class, in range, without a return."""
         return self.known & self.inside & (self.returns == 0)
 
 
 def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -> GroundTruth:
     """Return the ground truth of `frame` for a network of `config`, in the frame of the LiDAR.
 
-    lidar: its name; None: the frame's first. Raises `InputError` where the frame has none of that name.
+    `lidar` is its name; None: the frame's first. Raises `InputError` where the frame has none of that name.
     """
     annotations = frame.annotations
     boxes = annotations.boxes.transform(inverse(frame.world_from_sensor(choose_lidar(frame, lidar))))
@@ -91,9 +91,9 @@ def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -
 
 
 def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
-    """Return (N,) whether the centre of each box (LiDAR frame) lies in the range of `config` in bird's-eye view.
+    """Return the mask (N,) of boxes (LiDAR frame) with their centre in the range of `config` in bird's-eye view.
 
-    With `config.around` that is the range ahead, to the left, behind, or to the right.
+    With `config.around` the range extends ahead, to the left, behind, and to the right.
     """
     x, y = boxes.center[:, 0], boxes.center[:, 1]
     x0, y0, _, x1, y1, _ = config.range_m
@@ -105,36 +105,36 @@ def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
 
 
 def network_from_lidar(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Array | None:
-    """Return the (4, 4) transform from a LiDAR's frame to the one that a network of `config` was trained in.
+    """Return the transform (4, 4) [m] from a LiDAR's frame to that in which a network of `config` was trained.
 
-    That one is level, its x axis points ahead of the vehicle, and the ground is at `config.ground_z_m`. The mount is
+    The latter is level, its x axis points ahead of the vehicle, and the ground is at `config.ground_z_m`. The mount is
     the one that the agent assumes. None where the mount is within `LEVEL_M` and `LEVEL_RAD` of that, and for poles,
-    whose height above the ground is not known. lidar: its name; None: the frame's first.
+    whose height above the ground is unknown. `lidar` is its name; None: the frame's first.
     """
     mount = frame.assumed.agent_from_sensor[choose_lidar(frame, lidar)]
     return None if kind_of(frame.agent) == POLE else level_mount(mount, config)
 
 
 def level_mount(mount: Array, config: SecondConfig) -> Array | None:
-    """Return the (4, 4) transform of `network_from_lidar` for a vehicle's LiDAR with this (4, 4) mount, or None."""
+    """Return the transform (4, 4) [m] of `network_from_lidar` for a vehicle's LiDAR of this `mount` (4, 4), or None."""
     levelled = np.eye(4)
     levelled[:3, :3], levelled[2, 3] = mount[:3, :3], mount[2, 3] + config.ground_z_m
     return None if turn_of(mount) <= LEVEL_RAD and abs(levelled[2, 3]) <= LEVEL_M else levelled
 
 
 def turn_of(mount: Array) -> float:
-    """Return the angle of the rotation in a rigid (4, 4) transform [rad], in [0, pi]."""
+    """Return the rotation angle [rad], in [0, pi], of a rigid transform (4, 4)."""
     return math.acos(min(1.0, max(-1.0, (float(np.trace(mount[:3, :3])) - 1) / 2)))
 
 
 def detection_labels(category: Words, classes: tuple[str, ...]) -> Words:
-    """Return the detection class (N,) of each actor category (N,), "" where it is none of `classes`."""
+    """Return the detection classes (N,) of actor categories (N,), "" where a class is not in `classes`."""
     mapped = [DETECTION_CLASS.get(str(name), "") for name in category]
     return np.array([name if name in classes else "" for name in mapped], dtype=np.str_)
 
 
 def is_lookalike(category: Words, classes: tuple[str, ...]) -> Mask:
-    """Return (N,) whether an actor category (N,) resembles one of `classes` so that a detection is no error.
+    """Return the mask (N,) of actor categories (N,) that resemble one of `classes`, so that a detection is no error.
 
     Trucks and buses resemble cars.
     """
@@ -153,15 +153,15 @@ def choose_lidar(frame: Frame, name: str | None = None) -> str:
 
 @dataclass(frozen=True)
 class FrameTruth:
-    """Ground truth of one frame for evaluation: targets, neutral and hidden objects, LiDAR frame, detection classes."""
+    """Ground truth of a frame for evaluation: targets, neutral and hidden objects, LiDAR frame, detection classes."""
 
     scene: str
     targets: Boxes  # (T,) objects to be found
     neutral: Boxes  # a detection on them is neither true nor false; label = the class they are neutral for
     hidden: Boxes  # in range without a return: counted, and neutral too
-    occlusion: Array | None = None  # (targets,) occluded share in [0, 1]; None: not known
-    weather: str | None = None  # weather class of the frame; None between the classes, and where it is not known
-    returns: Ints | None = None  # (targets,) LiDAR returns; None: not known
+    occlusion: Array | None = None  # (T,) occluded share in [0, 1]; None: unknown
+    weather: str | None = None  # weather class of the frame; None between the classes, or if unknown
+    returns: Ints | None = None  # (T,) LiDAR returns; None: unknown
 
 
 def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
@@ -175,9 +175,10 @@ def asked_of(frame: Frame, config: SecondConfig) -> FrameTruth:
     weather = None if frame.weather is None else classify_weather(frame.weather)
     hidden = frame.annotations.occlusion[truth.target].astype(float)
     occlusion = None if np.isnan(hidden).any() else hidden
-    boxes, returns = truth.boxes, truth.returns[truth.target]
-    own = boxes[truth.target], boxes[neutral], boxes[truth.hidden]
-    return FrameTruth(frame.scene, *own, occlusion, weather, returns)
+    boxes = truth.boxes
+    returns = truth.returns[truth.target]
+    sides = boxes[truth.target], boxes[neutral], boxes[truth.hidden]
+    return FrameTruth(frame.scene, *sides, occlusion, weather, returns)
 
 
 def select_class(boxes: Boxes, name: str) -> Boxes:
@@ -197,8 +198,8 @@ def select_sides(
 def narrow_range(config: SecondConfig, text: str) -> SecondConfig:
     """Return `config` with the smaller range `text`: metres ahead, a comma, metres to either side, as in "48,24".
 
-    Networks of different ranges are thus evaluated on the same objects. Raises `InputError` for any other text, and
-    where the range exceeds that of the network.
+    Networks of different ranges are evaluated on the same objects in this way. Raises `InputError` for any other text,
+    and where the range exceeds that of the network.
     """
     try:
         ahead, side = map(float, text.split(","))
@@ -216,10 +217,10 @@ def narrow_range(config: SecondConfig, text: str) -> SecondConfig:
 class TargetCriteria:
     """Criteria that make an object a target, and the confidence level of intervals."""
 
-    range_m: tuple[float, ...]  # of its centre, LiDAR frame: minima x, y, z, then maxima [m]
+    range_m: tuple[float, ...]  # range of its centre, LiDAR frame: minima x, y, z, then maxima [m]
     min_returns: int  # LiDAR returns from it
     confidence: float  # in (0, 1)
-    around: Annotated[bool | None, LEFT_OUT] = None  # whether the range is also that to the sides and behind
+    around: Annotated[bool | None, LEFT_OUT] = None  # whether the range also extends to the sides and behind
 
     def lines(self) -> list[str]:
         """Return the criteria in words: a line on targets, a line on intervals."""

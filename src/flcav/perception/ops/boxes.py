@@ -1,9 +1,9 @@
 """IoU and non-maximum suppression of rotated boxes, in 3D and in bird's-eye view, and of axis-aligned rectangles.
 
-Boxes are rows x, y, z of the centre, length, width, height [m], yaw [rad], in any one frame with z up; computation is
-in float64. The intersection of two footprints is the convex hull of the corners of each that lie in the other and of
-the crossings of their edges. Coordinates are relative to the midpoint of the pair, so that precision does not depend on
-the distance from the origin. Rectangles are rows x1, y1, x2, y2.
+Boxes are rows x, y, z of the centre, length, width, height [m], yaw [rad], in any frame with z up; computation is in
+float64. The intersection of two footprints is the convex hull of the corners of each that lie in the other and of the
+crossings of their edges. Coordinates are relative to the midpoint of the pair, so that precision does not depend on the
+distance from the origin. Rectangles are rows x1, y1, x2, y2 [px].
 """
 
 import math
@@ -18,7 +18,7 @@ PAIRS_AT_ONCE = 100_000  # bounds the memory of `iou`
 
 
 def iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
-    """Return (A, B) float64 IoU of each of the boxes a (A, 7) with each of b (B, 7), of volumes or of footprints."""
+    """Return the IoU (A, B), in float64, of boxes a (A, 7) with boxes b (B, 7), of volumes or of footprints."""
     a, b = a.double(), b.double()
     out = a.new_zeros(len(a), len(b))
     reach_a, reach_b = a[:, 3:5].norm(dim=1) / 2, b[:, 3:5].norm(dim=1) / 2
@@ -30,7 +30,7 @@ def iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
 
 
 def paired_iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
-    """Return (P,) float64 IoU of each box of a (P, 7) with the same row of b (P, 7)."""
+    """Return the IoU (P,), in float64, of boxes a (P, 7) with the same rows of b (P, 7)."""
     a, b = a.double(), b.double()
     shared = intersection_area(a, b)
     if kind == "bev":
@@ -42,7 +42,7 @@ def paired_iou(a: Tensor, b: Tensor, kind: Kind = "3d") -> Tensor:
 
 
 def intersection_area(a: Tensor, b: Tensor) -> Tensor:
-    """Return (P,) intersection area [m^2] of the footprints of each box of a (P, 7) and the same row of b (P, 7)."""
+    """Return the intersection areas (P,) [m^2] of the footprints of boxes a (P, 7) and the same rows of b (P, 7)."""
     middle = (a[:, :2] + b[:, :2]) / 2
     a = torch.cat((a[:, :2] - middle, a[:, 2:]), 1)
     b = torch.cat((b[:, :2] - middle, b[:, 2:]), 1)
@@ -78,7 +78,7 @@ def nms(boxes: Tensor, scores: Tensor, *, overlap: float = 0.01, consider: int =
 
 
 def _corners(boxes: Tensor) -> Tensor:
-    """Return (P, 4, 2) footprint corners, counter-clockwise."""
+    """Return the corners (P, 4, 2) of footprints, counter-clockwise."""
     cos, sin = boxes[:, 6].cos()[:, None], boxes[:, 6].sin()[:, None]
     along = boxes[:, 3:4] / 2 * boxes.new_tensor([1, -1, -1, 1])
     across = boxes[:, 4:5] / 2 * boxes.new_tensor([1, 1, -1, -1])
@@ -95,9 +95,9 @@ def _inside(points: Tensor, boxes: Tensor) -> Tensor:
 
 
 def _crossings(corners_a: Tensor, corners_b: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (P, 16, 2) crossings of each edge of one rectangle with each of the other, and (P, 16) whether they exist.
+    """Return the crossings (P, 16, 2) of the edges of two rectangles, and whether they exist (P, 16).
 
-    corners_a, corners_b: (P, 4, 2).
+    `corners_a` and `corners_b` are (P, 4, 2).
     """
     edge_a = (corners_a.roll(-1, 1) - corners_a)[:, :, None]
     edge_b = (corners_b.roll(-1, 1) - corners_b)[:, None]
@@ -119,12 +119,12 @@ TINY = 1e-7  # added to denominators
 
 
 def rectangle_iou(one: Tensor, other: Tensor) -> Tensor:
-    """Return (N, M) intersection over union of rectangles (N, 4) with (M, 4)."""
+    """Return the intersection over union (N, M) of rectangles (N, 4) with (M, 4)."""
     return _iou(one[:, None], other[None])
 
 
 def complete_iou(one: Tensor, other: Tensor) -> Tensor:
-    """Return (N,) complete IoU (CIoU) of rectangles (N, 4) with the rectangles of the same rows (N, 4), in (-1.5, 1].
+    """Return the complete IoU (CIoU) (N,), in (-1.5, 1], of rectangles (N, 4) with the same rows of others (N, 4).
 
     CIoU = IoU - d^2 / c^2 - a v: d the distance of the centres, c the diagonal of the smallest rectangle around both,
     v the difference of the aspect ratios, a its weight, a constant for derivatives (Zheng et al., "Distance-IoU Loss",

@@ -1,9 +1,8 @@
-"""Point clouds on grids: voxels with the mean of their points, and pillars with statistics of theirs.
+"""Point clouds on grids: voxels with the mean of their points, and pillars with statistics of their points.
 
 Voxels are those of SECOND's published configuration (mean VFE). The grid of pillars is that of Lang et al.,
-"PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019; the statistics take the place of its
-learned encoder: they cost one pass over the points, and the highest point of a pillar is the height of an
-object.
+"PointPillars: Fast Encoders for Object Detection from Point Clouds", CVPR 2019; statistics replace its learned encoder:
+they cost one pass over the points, and the highest point of a pillar is the height of an object.
 """
 
 from collections.abc import Sequence
@@ -23,15 +22,15 @@ def pillar_statistics(
 ) -> Tensor:
     """Return the map (samples, STATISTICS, rows along y, columns along x) of a batch of point clouds.
 
-    Channels: half the logarithm of one plus the number of points; highest, lowest and mean height above the ground
-    [m]; mean intensity; mean place in the pillar along x and along y, in [-1/2, 1/2]; whether there is a point in each
-    bin of heights. All are 0 where there is none.
+    Channels: half the logarithm of one plus the number of points; highest, lowest and mean height above the ground [m];
+    mean intensity; mean position in the pillar along x and y, in [-1/2, 1/2]; whether a bin of heights has a point. All
+    are 0 in a pillar without points.
 
     Args:
         points: (N, 4) x, y, z [m], intensity; those outside the range are left out.
         sample: (N,) number of each point's cloud.
         samples: number of clouds.
-        range_m: minima x, y, z, then maxima [m], of a LiDAR's frame.
+        range_m: minima x, y, z, then maxima [m], in the LiDAR's frame.
         pillar_m: size of a pillar along x and along y [m].
         ground_z_m: height of the ground [m].
     """
@@ -42,7 +41,8 @@ def pillar_statistics(
     inside = ((cell >= 0) & (cell < points.new_tensor((columns, rows)))).all(1)
     inside &= (points[:, 2] >= range_m[2]) & (points[:, 2] < range_m[5])
     kept = inside.nonzero()[:, 0]
-    cell, height = cell[kept], points[kept, 2] - ground_z_m
+    cell = cell[kept]
+    height = points[kept, 2] - ground_z_m
     x, y = cell.long().unbind(1)
     key = (sample[kept] * rows + y) * columns + x
     cells = samples * rows * columns
@@ -60,8 +60,8 @@ def pillar_statistics(
 def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:
     """Return the extents z, y, x of a voxel grid.
 
-    range_m: minima x, y, z, then maxima [m], LiDAR frame; voxel_m: sizes along x, y, z [m]. One empty layer is added on
-    top, as in the published network, so that its strides divide the height.
+    `range_m` holds the minima x, y, z, then the maxima [m], LiDAR frame; `voxel_m` the sizes along x, y, z [m]. One
+    empty layer is added on top, as in the published network, so that its strides divide the height.
     """
     nx, ny, nz = (round((range_m[i + 3] - range_m[i]) / voxel_m[i]) for i in range(3))
     return nz + 1, ny, nx
@@ -72,8 +72,8 @@ def voxelize(
 ) -> tuple[Tensor, Tensor]:
     """Return the mean features (V, C) and the ascending keys (V,) of the occupied voxels of a batch of point clouds.
 
-    points (N, C), x, y, z first [m]; sample (N,) number of each point's cloud; range_m, voxel_m and shape: see
-    `grid_shape`. Points outside the range are left out.
+    `points` is (N, C), with x, y, z [m] first; `sample` (N,) is the number of each point's cloud; for `range_m`,
+    `voxel_m` and `shape` see `grid_shape`. Points outside the range are left out.
     """
     low, size = points.new_tensor(range_m[:3]), points.new_tensor(voxel_m)
     cell = torch.floor((points[:, :3] - low) / size)
@@ -82,6 +82,6 @@ def voxelize(
     x, y, z = cell[kept].long().unbind(1)
     keys, order = encode_cells(torch.stack((sample[kept], z, y, x), 1), shape).sort(stable=True)
     keys, count = torch.unique_consecutive(keys, return_counts=True)
-    own = points[kept[order]]  # may be empty, for which the checks of `unsafe=False` raise
-    means = torch.segment_reduce(own, "mean", lengths=count, axis=0, unsafe=True)
+    rows = points[kept[order]]  # may be empty, for which the checks of `unsafe=False` raise
+    means = torch.segment_reduce(rows, "mean", lengths=count, axis=0, unsafe=True)
     return means, keys

@@ -1,6 +1,6 @@
 """Batch normalisation followed by ReLU, of (B, C, H, W) maps and of (N, C) rows of features.
 
-Rows on a CPU have an implementation of their own, one differentiable step, because PyTorch's kernel is several times
+Rows on a CPU have a separate implementation as one differentiable step, because PyTorch's kernel is several times
 slower there on tall, narrow matrices. Equations: Ioffe and Szegedy, "Batch Normalization", ICML 2015, alg. 1, and their
 gradient; as there, the running variance is the unbiased one.
 """
@@ -70,6 +70,7 @@ class _NormReLU(torch.autograd.Function):
         return y, mean, variance
 
     @staticmethod
+    # Gradient of Ioffe and Szegedy (2015), p. 4: the mean and variance of the batch depend on every row of x.
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         unit, y, weight, inverse = ctx.saved_tensors
         through = torch.ops.aten.threshold_backward(gradients[0], y, 0)

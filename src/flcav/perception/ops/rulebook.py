@@ -27,14 +27,15 @@ Triple = tuple[int, int, int]
 def find_submanifold_pairs(keys: Ints, steps: Ints) -> tuple[Ints32, Ints32, Ints]:
     """Return the pairs of a 3x3x3 submanifold convolution: source (P,), target (P,), number of pairs per offset (27,).
 
-    keys (N,) ascending; steps (13,) key differences of the offsets after the centre, z-major. Pairs are grouped by
-    offset; within one, targets ascend.
+    `keys` (N,) ascend; `steps` (13,) are key differences of the offsets after the centre, z-major. Pairs are grouped by
+    offset; within an offset, targets ascend.
     """
     count, half = len(keys), len(steps)
     later = np.empty((half, count), dtype=np.int32)  # the neighbour at each later offset, -1 for none
     per_offset = np.zeros(2 * half + 1, dtype=np.int64)
     for k in range(half):
-        place, found = 0, 0
+        place = 0
+        found = 0
         for row in range(count):
             wanted = keys[row] + steps[k]
             while place < count and keys[place] < wanted:
@@ -71,8 +72,8 @@ def find_strided_pairs(
 ) -> tuple[Ints32, Ints32, Ints, Ints]:
     """Return the pairs of a strided convolution: source (P,), target (P,), number per offset (K,), output keys (M,).
 
-    keys (N,) and output keys ascend. shape, kernel, stride, padding, out_shape: (3,) along z, y, x. Pairs are grouped
-    by offset, z-major; within one, targets ascend.
+    `keys` (N,) and output keys ascend. `shape`, `kernel`, `stride`, `padding` and `out_shape` are (3,) along z, y, x.
+    Pairs are grouped by offset, z-major; within an offset, targets ascend.
     """
     height, width = shape[1] + 2, shape[2] + 2
     layers = shape[0] + 2
@@ -140,7 +141,7 @@ class Rulebook:
     counts: tuple[int, ...]  # pairs per kernel offset, z-major
     targets: int  # rows of the output
     by_target: Groups | None = None  # None on a CPU, where products are added pair by pair
-    by_source: Groups | None = None  # None too where offset k has the pairs of offset K-1-k with exchanged roles
+    by_source: Groups | None = None  # None, too, where offset k has the pairs of offset K-1-k with exchanged roles
 
 
 def _compiled(keys: Tensor) -> bool:
@@ -158,13 +159,13 @@ def _group_pairs(row: Tensor, offset: Tensor, offsets: int, rows: int) -> Groups
 
 
 def _places(mask: Tensor, count: int) -> Tensor:
-    """Return the (count,) ascending indices where a flat mask is True: `nonzero` without waiting for the GPU."""
+    """Return the ascending indices (count,) where a flat mask is True: `nonzero` without waiting for the GPU."""
     rank = mask.cumsum(0, dtype=torch.int32)
     return torch.searchsorted(rank, torch.arange(1, count + 1, device=mask.device, dtype=torch.int32))
 
 
 def encode_cells(cells: Tensor, shape: Triple) -> Tensor:
-    """Return the (N,) integer keys of cells (N, 4), rows sample, z, y, x, of a grid of extents `shape` (z, y, x)."""
+    """Return the integer keys (N,) of cells (N, 4), rows sample, z, y, x, of a grid of extents `shape` (z, y, x)."""
     depth, height, width = (extent + 2 for extent in shape)
     sample, z, y, x = cells.unbind(1)
     return ((sample * depth + z + 1) * height + y + 1) * width + x + 1
@@ -200,7 +201,8 @@ def _build_submanifold_rulebook(keys: Tensor, height: int, width: int) -> Rulebo
     lines = (width, (height - 1) * width, height * width, (height + 1) * width)
     wanted = torch.stack([keys + (line - 1) for line in lines])  # (4, N): the first of three consecutive keys
     place = torch.searchsorted(keys, wanted)
-    found, where = [later[1 : count + 1] == keys + 1], [torch.arange(1, count + 1, device=keys.device)]
+    found = [later[1 : count + 1] == keys + 1]
+    where = [torch.arange(1, count + 1, device=keys.device)]
     for line in range(4):
         at = place[line]
         for step in range(3):

@@ -1,9 +1,9 @@
 """Submanifold and strided sparse 3D convolution: gather, one matrix product per kernel offset, sum by output voxel.
 
-On a CPU compiled kernels work through the pairs of a rulebook in blocks: the products of a block stay in the
-processor's cache; those of all pairs at once would go through main memory. Each product is smaller than those that BLAS
-spreads over threads. Elsewhere the sum by output voxel is an `embedding_bag`, which reads each product once, in the
-order of the outputs. The backward pass is written by hand and keeps the input features and the weight alone.
+On a CPU compiled kernels process the pairs of a rulebook in blocks, so that the products of a block stay in the
+processor's cache instead of going through main memory. Each product is smaller than those that BLAS spreads over
+threads. Elsewhere the sum by output voxel is an `embedding_bag`, which reads each product once, in the order of the
+outputs. The backward pass is written by hand and keeps only the input features and the weight.
 Convolutions: Graham et al., "3D Semantic Segmentation with Submanifold Sparse Convolutional Networks", CVPR 2018.
 """
 
@@ -71,8 +71,8 @@ class SparseTensor:
 def sparse_convolution(features: Tensor, weight: Tensor, rules: Rulebook) -> Tensor:
     """Return the sparse convolution (M, C'): row t is the sum of features[s] @ weight[k] over the pairs (s, t, k).
 
-    features (N, C), weight (K, C, C'); differentiable in both. Computed in the precision of the features; elsewhere
-    than on a CPU in that of autocast, where autocast is on.
+    `features` is (N, C), `weight` (K, C, C'); differentiable in both. It is computed in the precision of the features,
+    and on other devices than a CPU in that of autocast, where autocast is on.
     """
     kind = features.device.type
     if rules.by_target is not None and torch.is_autocast_enabled(kind):
@@ -81,12 +81,12 @@ def sparse_convolution(features: Tensor, weight: Tensor, rules: Rulebook) -> Ten
         return _SparseConvolution.apply(features, weight.to(features.dtype), rules)
 
 
-_second: ThreadPoolExecutor | None = None  # of one thread
+_second: ThreadPoolExecutor | None = None  # with a single thread
 
 
 @contextlib.contextmanager
 def second_core() -> Iterator[None]:
-    """Compute gradients of weights beside those of features, in a second thread, within the context: the same bits."""
+    """Compute gradients of weights in a second thread within the context, parallel to those of features; same bits."""
     global _second
     with ThreadPoolExecutor(1) as _second:
         try:
@@ -125,15 +125,15 @@ class _SparseConvolution(torch.autograd.Function):
         if _second is None:
             convolution_gradients(*arrays, turned, pairs, grad_features.numpy(), grad_weight.numpy())
         else:
-            beside = _second.submit(weight_gradient, *arrays, pairs, grad_weight.numpy())
+            weights_done = _second.submit(weight_gradient, *arrays, pairs, grad_weight.numpy())
             source, target, begins = pairs
             convolve(arrays[1], turned, (target, source, begins), grad_features.numpy())
-            beside.result()
+            weights_done.result()
         return grad_features, grad_weight, None
 
 
 def _pairs(rules: Rulebook) -> Pairs:
-    """Return source (P,), target (P,), and (K + 1,) where the pairs of each offset begin and the last ones end."""
+    """Return source (P,), target (P,), and (K + 1,) where the pairs of each offset begin, and the last ones end."""
     return rules.source.numpy(), rules.target.numpy(), np.cumsum((0, *rules.counts), dtype=np.int64)
 
 

@@ -23,7 +23,7 @@ from flcav.world.rays.embree import Solid
 from flcav.world.static import SignsAndSignals, build_static_world, list_signs_and_signals
 
 OVERLAP = 0.5  # least IoU of a true positive
-WITHIN = 0.5  # least share of a detection on a neutral (too small or cut off) box for it to be no mistake
+WITHIN = 0.5  # least share of a detection on a neutral (too small or cut off) box that excuses it
 
 
 def register_sign_errors(
@@ -33,11 +33,12 @@ def register_sign_errors(
     threshold: float,
     progress: Report = ignore_progress,
 ) -> Registry:
-    """Return the missed signs and lights of the town, each once, and the false positives of each scene.
+    """Return the missed signs and lights of the town, once each, and the false positives of each scene.
 
-    Detections scoring below `threshold` are ignored. A miss has the position of the sign in the town; a false positive
-    that of the first hit of the ray through its centre with the static mesh of the town, and is dropped, and counted,
-    without a hit. Raises `InputError` if the dataset's town is unknown, or none of the frames has a camera.
+    Detections that score below `threshold` are ignored. A miss has the position of the sign in the town. A false
+    positive has that of the first hit, in the static mesh of the town, of the ray through its centre; without a hit it
+    is dropped, and counted. Raises `InputError` where the dataset's town is unknown, or none of the frames has a
+    camera.
     """
     town = data.town()
     if town is None:
@@ -57,8 +58,8 @@ def register_sign_errors(
         misses, false = _mistakes(frame, camera, found, (width, height), network.config)
         meets = list(_meets(frame, camera, found, false, solid, network.config))
         dropped += sum(error is None for error in meets)
-        own = mistakes.setdefault(number, [])
-        own += [*_misses(frame, camera, misses, things), *(error for error in meets if error is not None)]
+        of_frame = mistakes.setdefault(number, [])
+        of_frame += [*_misses(frame, camera, misses, things), *(error for error in meets if error is not None)]
         progress(done, len(pairs), "")
     return Registry.of(mistakes, dropped=dropped, standing=True)
 
@@ -84,13 +85,14 @@ def _mistakes(
 
 
 def _on(box: Array, others: Array) -> bool:
-    """Return whether at least the share `WITHIN` of a box (4,) lies inside one of the others (K, 4)."""
+    """Return whether at least the share `WITHIN` of a box (4,) lies inside one of the other boxes (K, 4)."""
     low, high = np.maximum(box[:2], others[:, :2]), np.minimum(box[2:], others[:, 2:])
     return bool(((high - low).clip(min=0).prod(1) >= WITHIN * (box[2:] - box[:2]).prod()).any())
 
 
 def _misses(frame: Frame, camera: str, rows: Ints, things: SignsAndSignals) -> Iterator[PerceptionError]:
-    signs, shown = frame.annotations.signs[camera], select_rectangles(frame, camera, "signs", min_pixels=1)
+    signs = frame.annotations.signs[camera]
+    shown = select_rectangles(frame, camera, "signs", min_pixels=1)
     for row in rows.tolist():
         thing = int(signs.thing[row])
         label = CLASSES["signs"][shown.label[int(np.flatnonzero(shown.row == row)[0])]]
@@ -102,7 +104,7 @@ def _misses(frame: Frame, camera: str, rows: Ints, things: SignsAndSignals) -> I
 def _meets(
     frame: Frame, camera: str, found: SignDetections, numbers: Ints, solid: Solid, config: SignsConfig
 ) -> Iterator[PerceptionError | None]:
-    """Yield each false positive at the hit of its ray with the town, None for a ray without a hit."""
+    """Yield each false positive at the point where its ray hits the town, None for a ray without a hit."""
     if not len(numbers):
         return
     calibration = frame.calibration

@@ -1,4 +1,4 @@
-"""COCO's mean average precision of the sign detector, by class and size; outcomes of each image for the bootstrap."""
+"""COCO's mean average precision of the sign detector, by class and size; outcomes per image for the bootstrap."""
 
 import contextlib
 import io
@@ -28,7 +28,7 @@ ALL, FIFTY = 0, 0  # index of the area range of all sizes; index of the IoU thre
 
 @dataclass(frozen=True)
 class SignTruth:
-    """Ground truth of one image."""
+    """Ground truth of an image."""
 
     box: Array  # (N, 4) x1 y1 x2 y2 [px] of the targets
     label: Ints  # (N,) index of the class
@@ -52,7 +52,7 @@ class ClassPrecision:
 
 @dataclass(frozen=True)
 class SizePrecision:
-    """Mean average precision of targets of one size, the root of a box's area; None without targets."""
+    """Mean average precision for one size of targets, the square root of a box's area; None without targets."""
 
     from_px: float
     to_px: float | None  # None: no upper limit
@@ -67,7 +67,7 @@ class SizePrecision:
 
 @dataclass(frozen=True)
 class SignsEvaluation(Evaluated):
-    """COCO's mean average precision, as a whole, by class and by size; None without targets."""
+    """COCO's mean average precision, in total, by class and by size; None without targets."""
 
     map50: float | None  # at IoU 0.5
     map50_95: float | None  # averaged over IoU 0.5 to 0.95
@@ -106,8 +106,8 @@ def mean_average_precision(
 ) -> SignsEvaluation:
     """Return mAP at IoU 0.5 and averaged over IoU 0.5 to 0.95, by class and by size of the true box.
 
-    `found` and `truths` have an entry per image. Detections that are smaller than `smallest_px`, or match only a
-    neutral box (COCO's "crowd": the intersection over the detection's area counts), are neither right nor wrong.
+    `found` and `truths` have one entry per image. Detections that are smaller than `smallest_px` [px], or match only a
+    neutral box (COCO's "crowd": the intersection is divided by the detection's area), are neither right nor wrong.
     """
     edges = (smallest_px, *EDGES_PX, LARGEST_PX)
     ranges = [(smallest_px, LARGEST_PX), *pairwise(edges)]
@@ -204,7 +204,7 @@ class SignsOutcomes:
     def outcomes(
         self, network: SignDetector, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
     ) -> Outcomes:
-        """Return detections and ground truth of each image, flattened, with the counts per image."""
+        """Return detections and ground truth of the images, concatenated, with the counts per image."""
         recorded = _last_asked_for(data, network.config, tuple(frames))
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
@@ -229,7 +229,8 @@ class SignsOutcomes:
     def measure(self, outcomes: Outcomes, times: Times) -> Values:
         """Return mAP at IoU 0.5 of each bootstrap sample; NaN without targets."""
         found, truths = by_picture(outcomes)
-        classes, smallest = outcomes.arrays[CLASSES].tolist(), float(outcomes.arrays[SMALLEST])
+        classes = outcomes.arrays[CLASSES].tolist()
+        smallest = float(outcomes.arrays[SMALLEST])
         values = []
         for counts in times:
             drawn = np.repeat(np.arange(len(counts)), counts)
@@ -240,13 +241,14 @@ class SignsOutcomes:
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
         """Return mAP averaged over IoU 0.5 to 0.95, and the number of targets."""
         found, truths = by_picture(outcomes)
-        classes, smallest = outcomes.arrays[CLASSES].tolist(), float(outcomes.arrays[SMALLEST])
+        classes = outcomes.arrays[CLASSES].tolist()
+        smallest = float(outcomes.arrays[SMALLEST])
         result = mean_average_precision(found, truths, classes, smallest)
         return {"mAP50-95": result.map50_95, "targets": float(len(outcomes.arrays[f"{WANTED}/label"]))}
 
 
 def by_picture(outcomes: Outcomes) -> tuple[list[SignDetections], list[SignTruth]]:
-    """Return the detections and the ground truth of each image."""
+    """Return the detections and the ground truth, by image."""
 
     def parts(name: str, field: str) -> list[np.ndarray]:
         ends = np.cumsum(outcomes.arrays[f"{name}/count"])[:-1]
@@ -263,5 +265,5 @@ def _joined(boxes: Sequence[np.ndarray], width: int) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _last_asked_for(data: Dataset, config: SignsConfig, frames: tuple[int, ...]) -> RecordedPictures:
-    """Return the images with their labels, cached: each validation of a training asks for the same ones."""
+    """Return the images with their labels, cached, since every validation of a training asks for the same ones."""
     return RecordedPictures(data, config, frames)

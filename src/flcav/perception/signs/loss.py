@@ -1,6 +1,6 @@
 """Targets and loss of the sign detector: boxes assigned to anchors; complete IoU, objectness and class entropies.
 
-`class_probabilities` are what a network says of the same boxes, from which others learn (see `number_boxes`).
+`class_probabilities` are a network's predictions for the same boxes, from which others learn (see `number_boxes`).
 """
 
 from collections.abc import Sequence
@@ -23,7 +23,7 @@ MOST_TIMES = 4.0  # largest ratio of a box's width or height to its anchor's, ei
 
 @dataclass(frozen=True)
 class LevelTargets:
-    """Training targets of a batch at one level: P pairs of a box with an anchor of a cell."""
+    """Training targets of a batch at one level: P pairs of a box with an anchor in a cell."""
 
     image: Tensor  # (P,) index in the batch
     anchor: Tensor  # (P,) index of the anchor
@@ -35,10 +35,10 @@ class LevelTargets:
 
 
 def assign_levels(samples: Sequence[Sample], config: SignsConfig) -> list[LevelTargets]:
-    """Return the training targets at each of `STRIDES` for images of one size.
+    """Return the training targets at the levels of `STRIDES` for images of one size.
 
-    A box is assigned to every anchor whose width and height are within a factor of four of its own, in the cell of its
-    centre and in the nearer horizontal and the nearer vertical neighbour. Cells within ignored boxes do not count.
+    A box is assigned to every anchor whose width and height are within a factor of four of the box's, in the cell of
+    its centre and in the nearer horizontal and the nearer vertical neighbour. Cells within ignored boxes do not count.
     """
     height, width = samples[0].picture.shape[:2]
     image = np.repeat(np.arange(len(samples)), [len(sample.boxes) for sample in samples])
@@ -58,14 +58,14 @@ def assign_levels(samples: Sequence[Sample], config: SignsConfig) -> list[LevelT
 
 
 def _places(box: Tensor, anchors: Tensor, stride: int, grid: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return box (P,), anchor (P,), and cell (P, 2) as column, row, of every assignment."""
+    """Return the box (P,), anchor (P,), and cell (P, 2), as column and row, of all assignments."""
     ratio = (box[:, 2:] - box[:, :2])[:, None] / anchors  # (N, A, 2)
     number, anchor = (torch.maximum(ratio, 1 / ratio).amax(2) < MOST_TIMES).nonzero(as_tuple=True)
     center = ((box[:, :2] + box[:, 2:]) / 2 / stride)[number]
-    own = torch.minimum(center.long(), grid - 1)
-    toward = torch.where(center - own < 0.5, -1, 1)  # the nearer neighbour along each axis
+    home = torch.minimum(center.long(), grid - 1)
+    toward = torch.where(center - home < 0.5, -1, 1)  # the nearer neighbour along each axis
     steps = torch.stack((torch.zeros_like(toward), toward * torch.tensor([1, 0]), toward * torch.tensor([0, 1])))
-    cell = own + steps  # (3, P, 2)
+    cell = home + steps  # (3, P, 2)
     inside = ((cell >= 0) & (cell < grid)).all(2)
     return number.expand(3, -1)[inside], anchor.expand(3, -1)[inside], cell[inside]
 
@@ -82,7 +82,7 @@ LEVELS = (4.0, 1.0, 0.4)  # weights of the levels' objectness: on finer levels a
 
 
 def number_boxes(samples: Sequence[Sample]) -> list[Sample]:
-    """Return the samples with the number of each box among all of them for a label."""
+    """Return the samples, with the number of each box among all boxes as its label."""
     ends = np.cumsum([len(sample.boxes) for sample in samples])
     return [
         replace(sample, label=np.arange(end - len(sample.boxes), end))
@@ -93,32 +93,32 @@ def number_boxes(samples: Sequence[Sample]) -> list[Sample]:
 def detection_loss(
     raw: Sequence[Tensor], targets: Sequence[LevelTargets], config: SignsConfig, classes: Tensor | None = None
 ) -> Tensor:
-    """Return the loss of raw predictions, one tensor per level as `SignDetector.forward`: the weighted sum of terms.
+    """Return the loss of raw predictions, one tensor per level as in `SignDetector.forward`: the weighted sum of terms.
 
-    Boxes: mean of 1 - complete IoU over the assigned anchors. Objectness: mean binary cross entropy over counted
-    cells; the target is that complete IoU at assigned anchors (the largest, if several boxes share one) and 0
-    elsewhere. Classes: mean binary cross entropy over assigned anchors and classes; `classes` (labels, classes) are the
-    probabilities that a label stands for, by default 1 of its own class.
+    Boxes: mean of 1 - complete IoU over the assigned anchors. Objectness: mean binary cross entropy over counted cells;
+    the target is that complete IoU at assigned anchors (the largest, where boxes share an anchor) and 0 elsewhere.
+    Classes: mean binary cross entropy over assigned anchors and classes; `classes` (labels, classes) are the
+    probabilities that a label stands for, by default 1 for its class.
     """
     classes = torch.eye(len(config.classes)) if classes is None else classes
     total = raw[0].new_zeros(())
-    for level, (cells, asked) in enumerate(zip(raw, targets, strict=True)):
-        asked = _to_device(asked, cells.device)
+    for level, (cells, of_level) in enumerate(zip(raw, targets, strict=True)):
+        of_level = _to_device(of_level, cells.device)
         wanted = torch.zeros_like(cells[..., 4])
-        counted = asked.counted[:, None].expand_as(wanted).clone()
-        if len(asked.image):
-            place = (asked.image, asked.anchor, asked.row, asked.column)
+        counted = of_level.counted[:, None].expand_as(wanted).clone()
+        if len(of_level.image):
+            place = (of_level.image, of_level.anchor, of_level.row, of_level.column)
             found = cells[place]
-            anchor = cells.new_tensor(config.anchors_px[level])[asked.anchor]
-            cell = torch.stack((asked.column, asked.row), 1)
-            overlap = complete_iou(decode_boxes(found[:, :4], cell, anchor, STRIDES[level]), asked.box)
-            label = classes.to(found)[asked.label]
+            anchor = cells.new_tensor(config.anchors_px[level])[of_level.anchor]
+            cell = torch.stack((of_level.column, of_level.row), 1)
+            overlap = complete_iou(decode_boxes(found[:, :4], cell, anchor, STRIDES[level]), of_level.box)
+            label = classes.to(found)[of_level.label]
             total = total + BOX * (1 - overlap).mean()
             total = total + CLASS * functional.binary_cross_entropy_with_logits(found[:, 5:], label)
             wanted = _largest_at(wanted, place, overlap.detach().clamp(min=0))
             counted[place] = True
-        each = functional.binary_cross_entropy_with_logits(cells[..., 4], wanted, reduction="none")
-        total = total + OBJECT * LEVELS[level] * (each * counted).sum() / counted.sum().clamp(min=1)
+        entropy = functional.binary_cross_entropy_with_logits(cells[..., 4], wanted, reduction="none")
+        total = total + OBJECT * LEVELS[level] * (entropy * counted).sum() / counted.sum().clamp(min=1)
     return total
 
 
@@ -137,8 +137,8 @@ def _to_device(targets: LevelTargets, device: torch.device) -> LevelTargets:
 def class_probabilities(network: SignDetector, samples: Sequence[Sample]) -> list[Array32]:
     """Return the class probabilities (boxes, classes) of the boxes of each sample; sides are multiples of 32.
 
-    A box has the mean of the anchors that it is assigned to in training, and zeros where there are none. The network's
-    training mode is left as it was.
+    A box has the mean over the anchors to which training assigns it, and zeros where there are none. The network's
+    training mode is restored.
     """
     found = []
     with inference(network):

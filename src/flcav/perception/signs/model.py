@@ -1,11 +1,11 @@
-"""A YOLOv5-style one-stage detector and its configurations: width, depth, classes, anchors, size of training windows.
+"""A YOLOv5-style one-stage detector and its configurations: width, depth, classes, anchors, training windows.
 
 A backbone of cross-stage partial stages (Wang et al., "CSPNet", CVPRW 2020), spatial pyramid pooling by repeated
 max pooling (He et al., "Spatial Pyramid Pooling in Deep Convolutional Networks", ECCV 2014), a path-aggregation neck
 (Liu et al., "Path Aggregation Network for Instance Segmentation", CVPR 2018), and anchors on three levels. Terven et
 al., "A Comprehensive Review of YOLO Architectures", 2023, describe how the parts are combined, their widths and depths.
-With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters. The same network also
-finds cars, in the pictures of roadside cameras: configuration `road`.
+With 80 classes the configurations `n` and `s` have the published 1.87 M and 7.23 M parameters. The configuration `road`
+of the same network detects cars, in the pictures of roadside cameras.
 """
 
 import math
@@ -48,9 +48,9 @@ class SignsConfig:
     labels: Literal["signs", "actors"] = "signs"  # what is to be found: a key of `flcav.dataset.rectangles.CLASSES`
     classes: Annotated[tuple[str, ...], Field(min_length=1)] = SIGNS  # of these labels, in the order of the scores
     anchors_px: tuple[Level, Level, Level] = ANCHORS_PX  # width, height of the anchors at each of STRIDES
-    background: bool = False  # whether its input is a picture beside the static background: see `signs.background`
+    background: bool = False  # whether its input is a picture with the static background: see `signs.samples`
     window_px: tuple[Window, Window] = (320, 192)  # width, height of a training sample
-    smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # least size, root of the area, of a target box
+    smallest_px: Annotated[float, Field(ge=0, le=8192)] = 6.0  # least size, square root of the area, of a target box
 
 
 CONFIGURATIONS = {
@@ -181,9 +181,9 @@ class SignDetector(nn.Module):
 
 
 def decode_level(raw: Tensor, level: int, config: SignsConfig) -> Tensor:
-    """Return the boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of one level's raw predictions.
+    """Return the boxes (B, anchors, rows, columns, 4) x1 y1 x2 y2 [px] of a level's raw predictions.
 
-    A centre lies in its cell or up to half a cell outside, a width or height is at most four times the anchor's.
+    A centre lies in its cell or up to half a cell outside; a width or height is at most four times the anchor's.
     """
     stride, (rows, columns) = STRIDES[level], raw.shape[2:4]
     across = torch.arange(columns, device=raw.device)

@@ -1,6 +1,6 @@
 """Inference of the sign detector: decoding, score threshold, class-agnostic non-maximum suppression, and findings.
 
-Inputs are images of files, folders and datasets.
+Inputs are images from files, folders and datasets.
 """
 
 from collections.abc import Iterator, Sequence
@@ -30,7 +30,7 @@ MOST_FOUND = 100  # largest number of detections of an image
 
 @dataclass(frozen=True)
 class SignDetections:
-    """Detections in one image as arrays, by falling score."""
+    """Detections in an image as arrays, by falling score."""
 
     box: Array  # (N, 4) x1 y1 x2 y2 [px] from the upper left corner
     label: Ints  # (N,) index of the class
@@ -42,7 +42,7 @@ class SignDetections:
 
 @dataclass(frozen=True)
 class BoxFound:
-    """A detected sign or traffic light; coordinates are from the upper left corner of the image."""
+    """A detected sign or traffic light; coordinates are from the upper left corner of the image [px]."""
 
     label: Class
     score: float  # [0, 1]
@@ -76,7 +76,7 @@ def boxes_found(found: SignDetections, classes: Sequence[str]) -> BoxesFound:
 def detect_in_picture(network: SignDetector, picture: Picture, *, threshold: float) -> SignDetections:
     """Return the detections in an image of any size with a score of at least `threshold`.
 
-    The network's training mode is left as it was.
+    The network's training mode is restored.
     """
     with inference(network):
         raw = predict_levels(network, [pad_to_stride(picture)])
@@ -89,7 +89,7 @@ def detect_in_picture(network: SignDetector, picture: Picture, *, threshold: flo
 
 
 def pad_to_stride(picture: Picture) -> Picture:
-    """Return the image padded with grey on the right and below, to sides that are multiples of the largest stride."""
+    """Return the image padded with grey at the right and bottom, to sides that are multiples of the largest stride."""
     down, across = (-side % STRIDES[-1] for side in picture.shape[:2])
     return np.pad(picture, ((0, down), (0, across), (0, 0)), constant_values=GREY)
 
@@ -97,8 +97,8 @@ def pad_to_stride(picture: Picture) -> Picture:
 def predict_levels(network: SignDetector, pictures: Sequence[Picture]) -> list[torch.Tensor]:
     """Return the network's raw predictions on images of one size, whose sides are multiples of the largest stride.
 
-    One tensor per level as `SignDetector.forward`, in float32. Channels are last in memory and convolutions are in
-    bfloat16 where the hardware supports it, which halves the time.
+    There is one tensor per level, as in `SignDetector.forward`, in float32. Memory is channels-last, and convolutions
+    are in bfloat16 where the hardware supports it, which halves the time.
     """
     device = next(network.parameters()).device
     stacked = torch.from_numpy(np.stack(pictures)).to(device)
@@ -126,8 +126,8 @@ def detect_signs(
 ) -> Iterator[Finding]:
     """Yield the detections of score `threshold` or more in each image at `path`, by falling score.
 
-    Raises `InputError` as `flcav.perception.images.read_pictures` does. A network of backgrounds finds in pictures of a
-    dataset's poles alone; it raises `InputError` for files, and for frames of vehicles.
+    Raises `InputError` as `flcav.perception.images.read_pictures` does. A network of backgrounds detects only in
+    pictures of a dataset's poles; it raises `InputError` for files, and for frames of vehicles.
     """
     for origin, rgb, seen in _read(network, path, frames):
         found = detect_in_picture(network, seen, threshold=threshold)
@@ -137,7 +137,7 @@ def detect_signs(
 
 
 def _read(network: SignDetector, path: Path, frames: Sequence[int] | None) -> Iterator[tuple[Path, Picture, Picture]]:
-    """Yield path and image, and the image as the network sees it."""
+    """Yield path and image, and the image in the form that the network sees."""
     if not network.config.background:
         yield from ((origin, rgb, rgb) for origin, rgb in read_pictures(path, frames))
         return

@@ -1,13 +1,13 @@
 """Samples of the sign task: images with target and ignored boxes, their messages, backgrounds and augmentation.
 
-A network of three channels sees the pictures of a camera that stands still beside the static background. That is the
-median of the camera's pictures in the same dataset, as that of a roadside LiDAR is learned from its own sweeps.
+A network of backgrounds sees the pictures of a fixed camera together with the static background. That is the median of
+the camera's pictures in the same dataset, as the background of a roadside LiDAR is learned from its sweeps.
 
 Augmentation is by random crops and scales, mosaics, brightness and saturation; there is no mirroring. The mosaic is
-that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, of crops ("windows") instead of whole images made smaller: signs
-are few and small, so most windows are drawn around a sign. Small windows around signs show the network many digits at a
-low cost. Each window but the first looks for a sign of a class drawn at random, so that rare classes (amber lasts
-seconds of a minute) are seen as often as others.
+that of Bochkovskiy et al., "YOLOv4", 2020, sec. 3.3, but of crops ("windows") instead of whole images made smaller:
+signs are few and small, so that most windows are drawn around a sign. Small windows around signs show the network many
+digits at a low cost. Every window but the first looks for a sign of a class drawn at random, so that rare classes
+(amber lasts seconds of a minute) are seen as often as others.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -33,7 +33,7 @@ KEPT_BYTES = 3_000_000_000  # [B] of images cached in memory
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled image; boxes are x1 y1 x2 y2 [px] from its upper left corner."""
+    """A labelled image; boxes are x1 y1 x2 y2 [px] from its upper left corner."""
 
     picture: Picture
     boxes: Array  # (N, 4) targets
@@ -44,8 +44,8 @@ class Sample:
 class RecordedPictures(Sequence[Sample]):
     """The labelled images of all cameras in frames of a dataset (None: all).
 
-    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` if no frame has a camera, and for
-    frames of vehicles if the network sees pictures beside their background.
+    Images are read on access and cached up to `KEPT_BYTES`. Raises `InputError` where no frame has a camera, and for
+    frames of vehicles if the network needs backgrounds.
     """
 
     def __init__(self, data: Dataset, config: SignsConfig, frames: Sequence[int] | None = None) -> None:
@@ -82,8 +82,8 @@ class RecordedPictures(Sequence[Sample]):
 def label_picture(frame: Frame, camera: str, picture: Picture, config: SignsConfig) -> Sample:
     """Return a camera's image with the boxes of its signs and lights, or of its actors, as `config.labels` says.
 
-    Boxes smaller than `config.smallest_px` are ignored, and so are signs cut off by the image's edge: a lamp may lie
-    outside.
+    Boxes smaller than `config.smallest_px` are ignored, and so are signs cut off by the image's edge, whose lit lamp
+    may be outside.
     """
     shown = select_rectangles(frame, camera, config.labels, min_pixels=1)
     names = [CLASSES[config.labels][number] for number in shown.label]
@@ -96,9 +96,9 @@ def label_picture(frame: Frame, camera: str, picture: Picture, config: SignsConf
 
 
 def find_targets(box: Array, size: tuple[int, int], config: SignsConfig) -> Mask:
-    """Return (N,) which boxes (N, 4) are targets in an image of `size` (width, height) [px].
+    """Return the mask (N,) of boxes (N, 4) that are targets in an image of `size` (width, height) [px].
 
-    They are large enough, and those of signs are whole.
+    They are large enough and, if they are signs, not cut off.
     """
     whole = (box[:, :2] > 0).all(1) & (box[:, 2:] < size).all(1)
     return (whole | (config.labels != "signs")) & (size_px(box) >= config.smallest_px)
@@ -109,16 +109,16 @@ def size_px(boxes: Array) -> Array:
     return np.sqrt((boxes[:, 2:] - boxes[:, :2]).clip(min=0).prod(1))
 
 
-LEAST_PICTURES = 3  # of a camera: the median of fewer shows what moves, too
-MOST_PICTURES = 40  # of each camera, evenly spread over the dataset, that its background is learned from
+LEAST_PICTURES = 3  # pictures of a camera: the median of fewer shows moving objects, too
+MOST_PICTURES = 40  # pictures per camera, evenly spread over the dataset, from which its background is learned
 LUMA = np.array((0.299, 0.587, 0.114))  # ITU-R BT.601
 
 
 def picture_reader(data: Dataset, background: bool) -> Callable[[int, str], Picture]:
-    """Return the function that reads the picture of a frame's number and a camera as a network sees it.
+    """Return the function that reads the picture of a frame, by number, and a camera as a network sees it.
 
-    For a network of backgrounds (`background`) that is `compare_with_background`, of poles alone. Raises `InputError`
-    as `check_picture`, `check_stands` and `learn_picture_background` do.
+    For a network of backgrounds (`background`) it is `compare_with_background`, for poles only. Raises `InputError` as
+    `check_picture`, `check_stands` and `learn_picture_background` do.
     """
 
     def read(number: int, camera: str) -> Picture:
@@ -132,7 +132,7 @@ def picture_reader(data: Dataset, background: bool) -> Callable[[int, str], Pict
 
 
 def check_stands(data: Dataset, numbers: Iterable[int]) -> None:
-    """Raise `InputError` unless the agents of all these frames are poles: the camera of a vehicle has no background."""
+    """Raise `InputError` unless the agents of all these frames are poles: a vehicle's camera has no background."""
     for agent in dict.fromkeys(data.keys[number].agent for number in numbers):
         if kind_of(agent) != POLE:
             raise InputError(
@@ -142,14 +142,14 @@ def check_stands(data: Dataset, numbers: Iterable[int]) -> None:
 
 
 def compare_with_background(picture: Picture, background: Picture) -> Picture:
-    """Return (H, W, 3): luma of the picture, luma of the background, and the largest difference of a colour."""
+    """Return (H, W, 3): luma of the picture, luma of the background, and the largest difference of a colour channel."""
     apart = np.abs(picture.astype(np.int16) - background).max(axis=2)
     return np.stack([picture @ LUMA, background @ LUMA, apart], axis=2).round().astype(np.uint8)
 
 
 @lru_cache(maxsize=64)
 def learn_picture_background(data: Dataset, agent: str, camera: str) -> Bytes:
-    """Return the median (H, W, 3) of an agent's pictures by one camera in `data`.
+    """Return the median (H, W, 3) of an agent's pictures by a camera in `data`.
 
     Raises `InputError` where there are fewer than `LEAST_PICTURES`.
     """
@@ -177,7 +177,7 @@ def pack_signs(data: Dataset, number: int, config: SignsConfig) -> bytes:
 
 
 def unpack_signs(message: bytes) -> list[Sample]:
-    """Return the samples in a message: those of `label_picture` for each camera."""
+    """Return the samples in a message: those of `label_picture` for every camera."""
     arrays = unpack_arrays(message)
     return [
         Sample(picture, *(arrays[f"{camera}.{field}"] for field in BOXES))
@@ -219,7 +219,7 @@ def _borders(length: int, parts: int, rng: np.random.Generator) -> list[int]:
 
 
 def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -> Sample:
-    """Return a random sample, with a sign of class `label` if one is among `LOOKS` samples."""
+    """Return a random sample, with a sign of class `label` if one is found among `LOOKS` samples."""
     looked = (samples[int(number)] for number in rng.integers(0, len(samples), LOOKS))
     sample = next(looked)
     while label not in sample.label and (other := next(looked, None)):
@@ -228,7 +228,7 @@ def _one_with(label: int, samples: Sequence[Sample], rng: np.random.Generator) -
 
 
 def join_mosaic(parts: Sequence[tuple[Sample, int, int]], width: int, height: int) -> Sample:
-    """Return the mosaic of parts at (x, y) [px] of their upper left corners; the rest is grey."""
+    """Return the mosaic of parts, given with x, y [px] of their upper left corners; the rest is grey."""
     picture = np.full((height, width, 3), GREY, np.uint8)
     for part, x, y in parts:
         picture[y : y + part.picture.shape[0], x : x + part.picture.shape[1]] = part.picture
@@ -268,7 +268,7 @@ def draw_window(
 def crop_sample(sample: Sample, part: tuple[int, int, int, int], size: tuple[int, int], config: SignsConfig) -> Sample:
     """Return the crop `part` (x, y, width, height) [px] of a sample, resized to `size` (width, height) [px].
 
-    Padding outside the image is grey. Boxes of which less than the share `WHOLE` remains, or that become smaller than
+    Padding outside the image is grey. Boxes that keep less than the share `WHOLE`, or become smaller than
     `config.smallest_px`, become ignored.
     """
     x, y, across, down = part
@@ -282,12 +282,13 @@ def crop_sample(sample: Sample, part: tuple[int, int, int, int], size: tuple[int
         clipped = np.clip(boxes - [x, y, x, y], 0, [across, down, across, down])
         return clipped * factor
 
-    boxes, ignore = moved(sample.boxes), moved(sample.ignore)
+    boxes = moved(sample.boxes)
+    ignore = moved(sample.ignore)
     before = size_px(sample.boxes) ** 2 * factor[:2].prod()
     left = size_px(boxes) ** 2
-    found = (left >= WHOLE * before) & (size_px(boxes) >= config.smallest_px)
-    ignore = np.concatenate((ignore[size_px(ignore) > 0], boxes[~found & (left > 0)]))
-    return Sample(resize_picture(canvas, *size), boxes[found], sample.label[found], ignore)
+    kept = (left >= WHOLE * before) & (size_px(boxes) >= config.smallest_px)
+    ignore = np.concatenate((ignore[size_px(ignore) > 0], boxes[~kept & (left > 0)]))
+    return Sample(resize_picture(canvas, *size), boxes[kept], sample.label[kept], ignore)
 
 
 def _in_other_colours(sample: Sample, rng: np.random.Generator) -> Sample:

@@ -1,4 +1,4 @@
-"""The sign task: detection of traffic signs and traffic lights as a `Task`."""
+"""The sign task: detection of traffic signs and traffic lights, as a `Task`."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -25,7 +25,7 @@ from flcav.perception.task import Finding, Practice
 
 
 class SignsTask(SignsOutcomes):
-    """2D detection of signs and signal heads in camera images, classified by what they show."""
+    """2D detection of signs and signal heads in camera images, classified by their meaning."""
 
     name = "signs"
     family = "yolo"
@@ -95,19 +95,19 @@ class SignsTask(SignsOutcomes):
         *,
         progress: Report = ignore_progress,
     ) -> SignsEvaluation:
-        """Return COCO's mAP, as a whole, by class and by size; see `mean_average_precision`."""
+        """Return COCO's mAP, in total, by class and by size; see `mean_average_precision`."""
         kept = self.outcomes(network, data, data.numbers(frames), progress)
         found, truths = by_picture(kept)
         result = mean_average_precision(found, truths, network.config.classes, network.config.smallest_px)
         return replace(result, scenes=len(set(kept.scene.tolist())))
 
     def check_for_vehicles(self, config: SignsConfig) -> None:
-        """Raise `InputError` for a network of pictures beside their background, which vehicles do not have."""
+        """Raise `InputError` for a network that needs the static background, since vehicles have none."""
         if config.background:
             raise InputError("signs: this network sees pictures of poles beside their background, vehicles have none")
 
     def pack_samples(self, data: Dataset, config: SignsConfig, frames: Sequence[int]) -> Iterator[bytes]:
-        """Yield the message of each frame: its images with their boxes."""
+        """Yield the messages of frames, with their images and boxes."""
         self.check_for_vehicles(config)
         RecordedPictures(data, config, frames)  # raises for frames without cameras
         return (pack_signs(data, i, config) for i in frames)
@@ -119,7 +119,7 @@ class SignsTask(SignsOutcomes):
     def infer(
         self, network: SignDetector, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
     ) -> Iterator[Finding]:
-        """Yield the detections of each image at `path`, by falling score, see `flcav.perception.signs.predict`."""
+        """Yield the detections in each image at `path`, by falling score, see `flcav.perception.signs.predict`."""
         yield from detect_signs(network, path, threshold, frames)
 
     def register_errors(

@@ -1,6 +1,6 @@
 """State of a training: its optimiser AdamW, its checkpoints, and the settings that identify it.
 
-The settings are all that decides the weights, except the kind of processor and the versions of libraries.
+The settings are all that determines the weights, except the kind of processor and the versions of libraries.
 """
 
 import io
@@ -27,12 +27,12 @@ BETAS, EPSILON, WEIGHT_DECAY = (0.9, 0.99), 1e-8, 0.01
 class AdamW:
     """AdamW with the moments of a network's parameters (Loshchilov and Hutter, ICLR 2019).
 
-    Its steps are those of `torch.optim.AdamW` to the bit, by PyTorch's own function. That class imports the compiler of
-    PyTorch, which takes each process that trains 1.7 s and 65 MB.
+    Its steps equal those of `torch.optim.AdamW` to the bit, since they use PyTorch's functional implementation. That
+    class would import PyTorch's compiler, which costs 1.7 s and 65 MB in every process that trains.
     """
 
     def __init__(self, network: nn.Module, learning_rate: float) -> None:
-        """Begin with moments of zero."""
+        """Start with moments of zero."""
         self.learning_rate = learning_rate
         self._parameters = [*network.parameters()]
         self._first = [torch.zeros_like(each) for each in self._parameters]  # moments of the gradient
@@ -43,24 +43,28 @@ class AdamW:
     def step(self) -> None:
         """Change the parameters that have a gradient, in place."""
         held = zip(self._parameters, self._first, self._second, self._steps, strict=True)
-        own = [(each, each.grad, *moments) for each, *moments in held if each.grad is not None]
-        if own:
-            parameters, gradients, first, second, steps = map(list, zip(*own, strict=True))
+        updated = [(each, each.grad, *moments) for each, *moments in held if each.grad is not None]
+        if updated:
+            parameters, gradients, first, second, steps = map(list, zip(*updated, strict=True))
             rate: Any = {"lr": self.learning_rate, "beta1": BETAS[0], "beta2": BETAS[1], "eps": EPSILON}
             decay: Any = {"weight_decay": WEIGHT_DECAY, "amsgrad": False, "maximize": False}
             adamw(parameters, gradients, first, second, [], steps, fused=True, **rate, **decay)
 
     def state(self) -> dict[str, list[Tensor]]:
-        """Return the moments and counts of steps, for a checkpoint; not copied."""
+        """Return the moments and step counts, for a checkpoint; not copied."""
         return {"first": self._first, "second": self._second, "steps": self._steps}
 
     def to_arrays(self, names: Sequence[str]) -> dict[str, NDArray[np.number]]:
-        """Return a copy of the state as arrays; `names` are those of the parameters, in their order."""
+        """Return a copy of the state as arrays; `names` are the names of the parameters, in order."""
         held = self.state().items()
-        return {f"{kind}/{name}": each.numpy(force=True).copy() for kind, own in held for name, each in zip(names, own)}
+        return {
+            f"{kind}/{name}": each.numpy(force=True).copy()
+            for kind, tensors in held
+            for name, each in zip(names, tensors)
+        }
 
     def restore_arrays(self, arrays: Mapping[str, NDArray[np.number]], names: Sequence[str]) -> None:
-        """Take the state that `to_arrays` returned; raises `InputError` for that of another network."""
+        """Restore the state that `to_arrays` returned; raises `InputError` for that of another network."""
         wanted = [f"{kind}/{name}" for kind in self.state() for name in names]
         if lacking := {*wanted} ^ arrays.keys():
             raise InputError(f"state of an optimiser: '{min(lacking)}' is missing or unknown")
@@ -71,12 +75,12 @@ class AdamW:
             raise InputError(f"state of an optimiser: {error}") from None
 
     def restore(self, state: dict[str, list[Tensor]]) -> None:
-        """Take the moments and counts of steps of a checkpoint; raises `ValueError` for those of another network."""
+        """Restore the moments and step counts of a checkpoint; raises ValueError for those of another network."""
         for name, held in self.state().items():
-            for own, saved in zip(held, state[name], strict=True):
-                if own.shape != saved.shape:
-                    raise ValueError(f"{name}: {tuple(saved.shape)} instead of {tuple(own.shape)}")
-                own.copy_(saved)
+            for moment, saved in zip(held, state[name], strict=True):
+                if moment.shape != saved.shape:
+                    raise ValueError(f"{name}: {tuple(saved.shape)} instead of {tuple(moment.shape)}")
+                moment.copy_(saved)
 
 
 TRAINED = ("device", "epochs", "patience", "batch", "learning_rate", "schedule")  # settings in `Card.training`
@@ -85,7 +89,7 @@ NAMED = {"data": "other data or agents", "validation": "other validation data or
 
 
 class TrainingSettings(Config):
-    """Settings of a training, which decide its weights; None where an older card lacks them."""
+    """Settings of a training, which determine its weights; None where an older card lacks them."""
 
     task: str
     network: str  # name of the configuration
@@ -101,15 +105,15 @@ class TrainingSettings(Config):
     schedule: str
 
     def differences(self, other: "TrainingSettings") -> str:
-        """Return the differences of `other` in words; an empty string if there are none."""
+        """Return the differences of `other` in words; empty if there are none."""
         pairs = [(name, getattr(self, name), getattr(other, name)) for name in type(self).model_fields]
         return ", ".join(
-            NAMED.get(name, f"{name} {theirs} instead of {own}") for name, own, theirs in pairs if own != theirs
+            NAMED.get(name, f"{name} {theirs} instead of {ours}") for name, ours, theirs in pairs if ours != theirs
         )
 
 
 def settings_of(card: Card) -> TrainingSettings:
-    """Return the settings of the training that a card describes."""
+    """Return the settings of the training described by a card."""
     return TrainingSettings.model_validate(
         {
             "task": card.task,
@@ -148,8 +152,8 @@ def find_finished_card(path: Path, asked: TrainingSettings) -> Card | None:
 class RunState:
     """State of a training run: losses, validation scores and best weights so far."""
 
-    losses: list[float] = field(default_factory=list)  # of each step
-    scores: list[float] = field(default_factory=list)  # of each validation
+    losses: list[float] = field(default_factory=list)  # one per step
+    scores: list[float] = field(default_factory=list)  # one per validation
     best: dict[str, Tensor] | None = None  # weights of the best validation; None before the first
 
 
@@ -171,19 +175,19 @@ def save_checkpoint(path: Path, identity: str, progress: RunState, network: nn.M
 def load_checkpoint(path: Path, identity: str, network: nn.Module, optimizer: AdamW) -> RunState:
     """Restore network and optimiser in place and return the progress; without a file, an empty progress.
 
-    Raises `DamagedFile` if the file is not a checkpoint, network and optimiser may be any then, and `InputError` if it
-    is one of another run. No code in the file is executed.
+    Raises `DamagedFile` if the file is not a checkpoint, which may leave network and optimiser in any state, and
+    `InputError` if it belongs to another run. No code in the file is executed.
     """
     if not path.exists():
         return RunState()
     broken = DamagedFile(f"{path} {DAMAGED}, training begins anew")
     try:
         state = torch.load(path, map_location="cpu", weights_only=True)
-        found = str(state["identity"])
+        saved = str(state["identity"])
         progress = RunState(state["losses"].tolist(), state["scores"].tolist(), state["best"])
     except (pickle.UnpicklingError, RuntimeError, EOFError, KeyError, TypeError, ValueError, AttributeError):
         raise broken from None
-    if found != identity:
+    if saved != identity:
         raise InputError(f"{path}: the checkpoint of a run with other settings or data; remove it to start afresh")
     try:
         network.load_state_dict(state["network"])

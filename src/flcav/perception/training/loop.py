@@ -58,7 +58,7 @@ class Checkpointing:
 
     path: Path
     every: int = 50  # steps between checkpoints
-    of: str = ""  # part of the run's identity beside the arguments of `train`, such as its data
+    of: str = ""  # part of the run's identity in addition to the arguments of `train`, such as its data
 
 
 @dataclass(frozen=True)
@@ -67,7 +67,7 @@ class Validation:
 
     score: Callable[[nn.Module], float]  # validation score of a network; more is better
     every: int  # steps between validations
-    patience: int | None = None  # validations without a new best after which training stops; None: it goes on
+    patience: int | None = None  # validations without a new best after which training stops; None: never
 
     def is_over(self, scores: Sequence[float]) -> bool:
         """Return whether training stops: none of the last `patience` of `scores` is above all scores before them."""
@@ -80,7 +80,7 @@ class Validation:
 class TrainingHistory:
     """Losses and validation scores of a training."""
 
-    losses: Array  # (steps,) loss of each batch; fewer steps than asked for after early stopping
+    losses: Array  # (steps,) loss of each batch; fewer than the requested steps after early stopping
     scores: Array  # (validations,)
 
 
@@ -106,9 +106,9 @@ def train(
     Each epoch goes through the samples in a new random order. With the `patience` of `validation`, training may stop
     early, and the network gets the weights of the best validation. With `checkpointing`, an interrupted run is resumed
     from its file and ends with the same weights. `watch` receives loss, learning rate and validation score; `correct`
-    changes the gradients before they are clipped. Training goes on with the moments of an `optimizer` of the network,
-    which it changes; None: they begin at zero. A damaged checkpoint is reported, and training begins anew. Raises
-    `InputError` without samples, for an unknown schedule, and if the checkpoint is of another run.
+    changes the gradients before they are clipped. Training continues with the moments of `optimizer`, which it updates;
+    None: they start at zero. A damaged checkpoint is reported, and training starts anew. Raises `InputError` without
+    samples, for an unknown schedule, and if the checkpoint belongs to another run.
     """
     batch = task.practice.batch if batch is None else batch
     learning_rate = task.practice.learning_rate if learning_rate is None else learning_rate
@@ -209,7 +209,7 @@ def step(
 
 
 def batches(samples: int, batch: int, steps: int, seed: int) -> Ints:
-    """Return the sample indices of each batch, (steps, batch): shuffled epochs one after another, cut into batches.
+    """Return the sample indices of the batches (steps, batch): shuffled epochs one after another, cut into batches.
 
     A batch has at most as many samples as there are.
     """

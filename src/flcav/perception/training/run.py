@@ -30,7 +30,7 @@ WEIGHTS, CARD, CHECKPOINT, EVENTS = "weights.safetensors", "card.md", "checkpoin
 def event_files(folder: Path) -> Iterator[Watch]:
     """Yield a `Watch` that writes TensorBoard event files to `folder`, which is created with the first scalar.
 
-    A run that is resumed hides the events that the interrupted run wrote after the checkpoint.
+    A resumed run hides the events that the interrupted run wrote after the checkpoint.
     """
     writer: Any = None
 
@@ -55,13 +55,13 @@ class TrainingRequest:
     """Arguments of a training."""
 
     data: Sequence[Dataset]
-    validation: Dataset | None = None  # of other scenes
+    validation: Dataset | None = None  # with other scenes
     network: str | None = None  # name of the configuration; None: the task's default
     epochs: int = 10
     patience: int = 5  # epochs without a better validation score after which training stops
     seed: int = 0
     device: torch.device = CPU
-    agents: str | None = None  # selection of frames, of validation too: see `flcav.perception.agents.choose_frames`
+    agents: str | None = None  # selection of frames, also for validation: see `flcav.perception.agents.choose_frames`
 
 
 @dataclass(frozen=True)
@@ -136,15 +136,15 @@ def prepare_training(task: Task, request: TrainingRequest, out: Path) -> Prepare
     finished = _find_finished(out, settings)
     samples: Any = ()
     if finished is None:
-        found = [task.samples(part.data, config, part.chosen.frames) for part in parts]
-        samples = ConcatDataset(found)  # pyright: ignore[reportArgumentType]
+        labelled = [task.samples(part.data, config, part.chosen.frames) for part in parts]
+        samples = ConcatDataset(labelled)  # pyright: ignore[reportArgumentType]
         if held is not None:
             task.samples(held.data, config, held.chosen.frames)  # raises for bad validation data before the long work
     return Prepared(task, request, out, config, settings, parts, held, finished, samples)
 
 
 def train_prepared(prepared: Prepared, progress: Report = ignore_progress) -> TrainingResult:
-    """Perform the training that `prepare_training` returned, see `train_network`; return its card and evaluation."""
+    """Perform a training prepared by `prepare_training`, see `train_network`; return its card and evaluation."""
     with only_writer(prepared.out):
         return _train(prepared, progress)
 
@@ -157,7 +157,8 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
     if (weights := prepared.out / WEIGHTS).exists():
         progress(0, 1, f"{weights} {DAMAGED}, made anew")
     task, request, out, held = prepared.task, prepared.request, prepared.out, prepared.held
-    settings, samples = prepared.settings, prepared.samples
+    settings = prepared.settings
+    samples = prepared.samples
     network = build_network(task, prepared.config, request.seed).to(request.device)
     per_epoch = max(1, len(samples) // task.practice.batch)
     with event_files(out / EVENTS) as watch:
@@ -175,7 +176,7 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
     if held is not None and isinstance(task, Calibrates):
         task.calibrate(network, held.data, held.chosen.frames)
     evaluation = None if held is None else task.evaluate(network, held.data, held.chosen.frames)
-    asked = settings.model_dump(include={*vars(task.practice), "epochs", "patience", "device"}, exclude_none=True)
+    requested = settings.model_dump(include={*vars(task.practice), "epochs", "patience", "device"}, exclude_none=True)
     reached = {"loss": float(history.losses[-per_epoch:].mean()), "scores": _rounded(history.scores)}
     card = Card(
         task=task.name,
@@ -183,7 +184,7 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
         parameters=sum(parameter.numel() for parameter in network.parameters()),
         seed=request.seed,
         samples=len(samples),
-        training=asked | {"steps": len(history.losses)} | reached,
+        training=requested | {"steps": len(history.losses)} | reached,
         data=tuple(part.entry for part in prepared.parts),
         validation=None if held is None else held.entry,
         metrics={} if evaluation is None else evaluation.as_json(),
@@ -197,7 +198,7 @@ def _train(prepared: Prepared, progress: Report) -> TrainingResult:
 
 
 def _find_finished(out: Path, settings: TrainingSettings) -> Card | None:
-    """Return `find_finished_card` of the weights in `out`; None for damaged ones of a training, with a checkpoint."""
+    """Return `find_finished_card` of the weights in `out`; None for damaged ones if a checkpoint can replace them."""
     try:
         return find_finished_card(out / WEIGHTS, settings)
     except DamagedFile:
@@ -216,7 +217,8 @@ def _rounded(scores: Array) -> list[float]:
 
 
 def _validation(prepared: Prepared, per_epoch: int) -> Validation | None:
-    held, task = prepared.held, prepared.task
+    held = prepared.held
+    task = prepared.task
     if held is None:
         return None
 

@@ -45,7 +45,7 @@ class CrossView:
 
 @dataclass(frozen=True, config=STRICT)
 class TrajectoryConfig:
-    """Configuration of the LSTM encoder-decoder; its bird's-eye view is of rasters, or of cameras."""
+    """Configuration of the LSTM encoder-decoder, whose bird's-eye view is computed from rasters or from cameras."""
 
     modes: Annotated[int, Field(ge=1, le=256)] = 6  # of a forecast, K
     hidden: Annotated[int, Field(ge=8, le=4096)] = 64  # size of the hidden state of both LSTMs

@@ -1,6 +1,6 @@
 """Displacement errors of forecasts: ADE, FDE and miss rate of modes, single path and constant velocity, by slice.
 
-They are kept of each road user for intervals over scenes, and large final errors of the single path are registered.
+Errors are kept per road user for intervals over scenes, and large final errors of the single path are registered.
 """
 
 from collections.abc import Mapping, Sequence
@@ -78,7 +78,7 @@ class TrajectoryEvaluation(Evaluated):
         return 1 / (1 + (every.minFDE_1 + every.minFDE_K) / 2)
 
     def numbers(self) -> Mapping[str, float]:
-        """Return the fields of `PathErrors` as "slice, field", of each slice that has samples."""
+        """Return the fields of `PathErrors` as "slice, field", for all slices that have samples."""
         return {
             f"{name}, {key}": value
             for name, errors in self.slices.items()
@@ -88,7 +88,7 @@ class TrajectoryEvaluation(Evaluated):
         }
 
     def lines(self) -> list[str]:
-        """Return a line per slice, each followed by a line per predictor."""
+        """Return a line per slice, followed by a line per predictor."""
         lines = [f"{plural(self.modes, 'mode')}, {plural(self.scenes, 'scene')}; errors in m: average / final / missed"]
         for name, e in self.slices.items():
             if e is None:
@@ -119,8 +119,8 @@ def evaluate_paths(
 ) -> TrajectoryEvaluation:
     """Return the displacement errors of all samples, of those at junctions, and of those turning at junctions.
 
-    `paths` (N, K, FUTURE, 2) [m] and `probabilities` (N, K) are the forecasts of N samples, whose columns the
-    others are.
+    `paths` (N, K, FUTURE, 2) [m] and `probabilities` (N, K) are the forecasts of N samples; the other arguments are
+    columns of the samples.
     """
     future = future.astype(np.float64)
     slices = {
@@ -138,22 +138,23 @@ def evaluate_paths(
 
 
 def is_turning(future: Array) -> Mask:
-    """Return (N,) whether a future (N, FUTURE, 2) [m] turns.
+    """Return the mask (N,) of futures (N, FUTURE, 2) [m] that turn.
 
-    It turns if the displacement in its last second is above 1 m and more than 20 degrees off the x axis.
+    A future turns if the displacement in its last second is above 1 m and more than 20 degrees off the x axis.
     """
     last = future[:, -1] - future[:, -5]
     return (np.abs(np.arctan2(last[:, 1], last[:, 0])) > TURN) & (np.linalg.norm(last, axis=1) > 1.0)
 
 
 def compute_errors(paths: Array, probabilities: Array, future: Array, baseline: Array) -> dict[str, Array]:
-    """Return ADE and FDE (N,) [m] of each sample by name: of likeliest mode, best mode, single path, and baseline.
+    """Return ADE and FDE (N,) [m] of the samples by name: of likeliest mode, best mode, single path, and baseline.
 
     `paths` are (N, K, FUTURE, 2), `probabilities` (N, K), `future` and `baseline` (N, FUTURE, 2), in one frame.
     """
     off = np.linalg.norm(paths - future[:, None], axis=3)  # (N, K, FUTURE)
     everyone = np.arange(len(off))
-    likeliest, only = off[everyone, probabilities.argmax(axis=1)], off[everyone, find_medoid(paths, probabilities)]
+    likeliest = off[everyone, probabilities.argmax(axis=1)]
+    only = off[everyone, find_medoid(paths, probabilities)]
     plain = np.linalg.norm(baseline - future, axis=2)
     return {
         "minADE_1": likeliest.mean(axis=1),
@@ -241,18 +242,18 @@ def register_path_errors(
     """
     columns = samples.columns
     paths, probabilities = predict_paths(network, samples, progress)
-    said = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
-    wrong = np.linalg.norm(said - columns.future[:, -1], axis=1) > MISS_M
+    ends = paths[np.arange(len(paths)), find_medoid(paths, probabilities), -1]
+    wrong = np.linalg.norm(ends - columns.future[:, -1], axis=1) > MISS_M
     town = data.town()
     traces: dict[str, Trace | None] = {scene: data.trace(scene) for scene in np.unique(columns.scene).tolist()}
-    found: dict[int, list[PerceptionError]] = {}
+    misses: dict[int, list[PerceptionError]] = {}
     for row in np.flatnonzero(wrong):
         scene, actor = str(columns.scene[row]), int(columns.actor[row])
         trace = traces[scene]
         assert trace is not None  # the samples come from it
         x, y, _ = columns.pose[row].tolist()
         z, label = 0.0 if town is None else town.ground(x, y), str(trace.category[actor])
-        found.setdefault(int(columns.frame[row]), []).append(
+        misses.setdefault(int(columns.frame[row]), []).append(
             PerceptionError(x, y, z, 1.0, FINAL_ERROR, label, 0, float("nan"), scene, str(trace.actor[actor]))
         )
-    return Registry.of(found)
+    return Registry.of(misses)

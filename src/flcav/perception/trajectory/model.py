@@ -1,4 +1,4 @@
-"""A multi-modal LSTM encoder-decoder over tracks, with bird's-eye features of rasters or of several cameras.
+"""A multi-modal LSTM encoder-decoder over tracks, with bird's-eye features from rasters or from several cameras.
 
 Encoder: an LSTM over the past, and convolutions over rasters or a cross-view transformer. Decoder: one LSTM with a
 different initial state per mode; at each step its inputs are position, last displacement and the ground's features at
@@ -92,7 +92,8 @@ class CrossViewEncoder(nn.Module):
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
         assert config.cameras is not None
-        settings, width = config.cameras, config.cameras.features
+        settings = config.cameras
+        width = config.cameras.features
         self.summary = 2 * config.hidden
         self.pictures = nn.Sequential(conv(3, width // 2, 2), conv(width // 2, width, 2), conv(width, width, (1, 2)))
         self.direction = nn.Linear(3, width)
@@ -160,8 +161,8 @@ class CrossAttention(nn.Module):
         lies = torch.cat((met, met.square().sum(dim=2, keepdim=True)), dim=2)[:, None]  # (B, 1, P, 3)
         query = torch.cat((query, asks.expand(len(query), -1, -1, -1)), dim=3)
         key = torch.cat((key, lies.expand(-1, self.heads, -1, -1)), dim=3)
-        found = functional.scaled_dot_product_attention(query, key, self._split(self.value(seen)), scale=1.0)
-        ground = ground + self.out(found.transpose(1, 2).flatten(2))
+        attended = functional.scaled_dot_product_attention(query, key, self._split(self.value(seen)), scale=1.0)
+        ground = ground + self.out(attended.transpose(1, 2).flatten(2))
         return ground + self.after(ground)
 
     def _split(self, tokens: Tensor) -> Tensor:
@@ -228,7 +229,8 @@ class TrajectoryNetwork(nn.Module):
     def __init__(self, config: TrajectoryConfig) -> None:
         super().__init__()
         self.config = config
-        hidden, ground = config.hidden, config.maps[1]
+        hidden = config.hidden
+        ground = config.maps[1]
         self.view = CrossViewEncoder(config) if config.cameras else RasterEncoder(config)
         self.track = nn.LSTM(TRACK, hidden, batch_first=True)
         self.context = nn.Sequential(nn.Linear(hidden + self.view.summary, 2 * hidden), nn.ReLU())
@@ -270,8 +272,8 @@ class TrajectoryNetwork(nn.Module):
         patch = self.config.patch
         half = patch.side_m / 2
         right_down = torch.stack((-position[..., 1] / half, (patch.middle_x_m - position[..., 0]) / half), dim=-1)
-        found = functional.grid_sample(ground, right_down[:, None], align_corners=False)
-        return found[:, :, 0].transpose(1, 2)
+        sampled = functional.grid_sample(ground, right_down[:, None], align_corners=False)
+        return sampled[:, :, 0].transpose(1, 2)
 
 
 def _features(past: Tensor) -> Tensor:

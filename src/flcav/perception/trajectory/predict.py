@@ -35,7 +35,7 @@ RASTERS, VIEWS = 256, 16  # batch sizes of inference with rasters and with camer
 
 @dataclass(frozen=True)
 class Pose2D:
-    """A 2D pose in the world."""
+    """A 2D pose in the world frame."""
 
     x: float  # world [m]
     y: float
@@ -44,7 +44,7 @@ class Pose2D:
 
 @dataclass(frozen=True)
 class ForecastMode:
-    """One mode of a forecast."""
+    """A mode of a forecast."""
 
     probability: float
     path: tuple[Point, ...]  # positions at `Forecasts.time_s`
@@ -52,7 +52,7 @@ class ForecastMode:
 
 @dataclass(frozen=True, kw_only=True)
 class RoadUserForecast:
-    """The forecast of one road user: the JSON record of a `RoadUser`."""
+    """The forecast of a road user: the JSON record of a `RoadUser`."""
 
     track: str
     label: Class
@@ -62,9 +62,9 @@ class RoadUserForecast:
     speed: float  # [m/s]
     length: float  # [m]
     width: float
-    modes: tuple[ForecastMode, ...]  # the first is the single path (the medoid), the others follow by probability
+    modes: tuple[ForecastMode, ...]  # first the single path (the medoid), then the others by decreasing probability
     constant_velocity: tuple[Point, ...] | None  # path at constant heading and speed
-    truth: tuple[Point, ...] | None  # path that was driven; None if not recorded
+    truth: tuple[Point, ...] | None  # the recorded path; None if not recorded
 
 
 @dataclass(frozen=True)
@@ -81,8 +81,8 @@ class Forecasts(Result):
         lines = []
         for agent in self.agents:
             x, y = agent.modes[0].path[-1]
-            said = f"at ({agent.x:.1f}, {agent.y:.1f}), in {self.time_s[-1]:g} s at ({x:.1f}, {y:.1f})"
-            lines.append(f"{agent.track} {said}")
+            positions = f"at ({agent.x:.1f}, {agent.y:.1f}), in {self.time_s[-1]:g} s at ({x:.1f}, {y:.1f})"
+            lines.append(f"{agent.track} {positions}")
         return lines or ["nobody to predict"]
 
 
@@ -122,7 +122,7 @@ def predict_paths(
 ) -> tuple[Array, Array]:
     """Return the forecasts of N samples: paths (N, K, FUTURE, 2) [m] in the samples' frames and probabilities (N, K).
 
-    The network's training mode is left as it was.
+    The network's training mode is restored.
     """
     paths, probabilities = [], []
     size = VIEWS if network.config.cameras else RASTERS
@@ -140,7 +140,7 @@ def find_medoid(paths: Array, probabilities: Array) -> Ints:
     """Return the index (N,) of the mode that is given as the single path: the medoid of the forecast.
 
     The medoid is the mode with the least expected average distance to the other modes under the predicted
-    probabilities. Unlike the likeliest mode it takes similar modes together. `paths` are (N, K, FUTURE, 2) [m],
+    probabilities. Unlike the likeliest mode it accounts for similar modes together. `paths` are (N, K, FUTURE, 2) [m],
     `probabilities` (N, K).
     """
     apart = np.linalg.norm(paths[:, :, None] - paths[:, None], axis=4).mean(axis=3)  # (N, K, K)
@@ -173,9 +173,9 @@ def _points(path: Array) -> tuple[Point, ...]:
     return tuple((x, y) for x, y in path.tolist())
 
 
-AROUND_M = 50.0  # half side of the map around the observer, and of the square whose vehicles are predicted with rasters
+AROUND_M = 50.0  # half side of the map around the observer, and of the square of predicted vehicles with rasters
 PIXEL_M = 0.2  # resolution of the map
-TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())  # of the path points, after the present
+TIMES_S = tuple((STEP_S * np.arange(1, FUTURE + 1)).tolist())  # times of the path points after the present [s]
 
 
 def forecast_frames(network: TrajectoryNetwork, path: Path, frames: Sequence[int] | None = None) -> Iterator[Finding]:
@@ -195,18 +195,21 @@ def forecast_frames(network: TrajectoryNetwork, path: Path, frames: Sequence[int
         trace = traces[key.scene]
         world_from_agent = data.frame(number).world_from_agent
         observer = np.array([*world_from_agent[:2, 3], yaw_of(world_from_agent)])
-        found = _predicted(network, data, number, trace, observer)
-        yield Finding(path / data.name(number), map_around(load_roads(data), observer), forecasts(found), (found,))
+        predicted = _predicted(network, data, number, trace, observer)
+        yield Finding(
+            path / data.name(number), map_around(load_roads(data), observer), forecasts(predicted), (predicted,)
+        )
 
 
 def map_around(roads: RoadMap, observer: Array) -> Mask:
-    """Return the raster (len(STATIC), H, W) of the map in the square of half side `AROUND_M` around x, y, yaw."""
+    """Return the raster (len(STATIC), H, W) of the map within `AROUND_M` of x, y, yaw [m, rad] to each side."""
     middle = pose(float(observer[0]), float(observer[1]), yaw=float(observer[2]))
     return rasterise(roads.layers, middle, (2 * AROUND_M, 2 * AROUND_M), PIXEL_M)[list(STATIC_ROWS)]
 
 
 def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Trace, observer: Array) -> Paths:
-    key, config = data.keys[number], network.config
+    key = data.keys[number]
+    config = network.config
     instant = int(np.argmin(np.abs(trace.time_s - key.time_s)))
     tracks = tracks_around(trace, key.time_s)
     if not config.cameras:
@@ -221,7 +224,8 @@ def _predicted(network: TrajectoryNetwork, data: Dataset, number: int, trace: Tr
     if len(columns.past):
         paths, probabilities = predict_paths(network, Samples(data, columns, config.cameras))
         first = find_medoid(paths, probabilities)
-        present, plain = columns.pose, constant_velocity(columns.past)
+        present = columns.pose
+        plain = constant_velocity(columns.past)
         for i, actor in enumerate(columns.actor):
             modes = [Mode(float(share), _in_world(way, present[i])) for share, way in zip(probabilities[i], paths[i])]
             truth = columns.future[i].astype(np.float64)

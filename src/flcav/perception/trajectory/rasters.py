@@ -1,6 +1,6 @@
 """Bird's-eye rasters around road users: the town's map, reachable lanes, traffic lights, and road users' tracks.
 
-`RoadMap` is the lane-level map that they are drawn from: raster, lane centre lines, reachable lanes, traffic lights.
+`RoadMap` is the lane-level map from which they are drawn: raster, lane centre lines, reachable lanes, traffic lights.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -29,39 +29,40 @@ RESOLUTION_M = 0.5  # of the town's raster
 DOT_M = 0.7  # spacing of the points of a lane's surface, so that each cell of 1 m has a point
 REACH_M = 70.0  # distance along the lanes up to which lanes are reachable
 ASIDE_M, TURNED = 1.5, np.radians(40.0)  # largest distance and angle between a road user and its lane's centre line
-BEFORE_M = 20.0  # distance before a junction from which on a road user is at the junction
+BEFORE_M = 20.0  # distance before a junction from which a road user counts as at the junction
 BAR_M = 2.0  # length along the lane of the bar of a traffic light, which spans the lane at its start
 
 
 @dataclass(frozen=True)
 class RoadMap:
-    """Map of a town with its lanes, all in the world's frame [m, rad]."""
+    """Lane-level map of a town, in the world frame [m, rad]."""
 
     layers: MapLayers
     raster: Mask  # (len(STATIC), H, W) cells of RESOLUTION_M; row 0 at the lowest x, column 0 the lowest y
     corner: Array  # (2,) x, y of the corner of the raster's first cell
-    line: KDTree  # of the (P, 2) points of the lanes' centre lines
+    line: KDTree  # of the points (P, 2) of the lanes' centre lines
     line_lane: Ints  # (P,) index of the lane
     line_yaw: Array  # (P,) driving direction
     line_to_junction_m: Array  # (P,) distance along the lane to a junction; 0 inside one, inf without
-    reach: tuple[Array, ...]  # of each lane: (D, 2) points of the surfaces of the lane and of all reachable lanes
+    reach: tuple[Array, ...]  # per lane: (D, 2) points on the surfaces of the lane and of all reachable lanes
     lights: Mapping[str, Array]  # entry of `Trace.light` -> (D, 2) points of the bars of its lanes
 
     def static(self, world: Array) -> Mask:
-        """Return (..., len(STATIC)) whether world points (..., 2) lie in each layer; False outside the town."""
+        """Return whether world points (..., 2) [m] lie in each layer (..., len(STATIC)); False outside the town."""
         cell = np.floor((world - self.corner) / RESOLUTION_M).astype(np.int64)
         inside = np.all((cell >= 0) & (cell < self.raster.shape[1:]), axis=-1)
         row, column = np.moveaxis(np.where(inside[..., None], cell, 0), -1, 0)
         return np.moveaxis(self.raster[:, row, column] & inside, 0, -1)
 
     def lanes_at(self, position: Array, yaw: Array) -> tuple[list[list[int]], Array]:
-        """Return the lanes of each of N road users, lists of indices, and the distance to the next junction (N,) [m].
+        """Return the lanes of N road users, as lists of indices, and the distances to their next junction (N,) [m].
 
-        `position` is (N, 2), `yaw` (N,). Lanes overlap inside junctions and at their start, so a road user may have
-        several: the nearest within `ASIDE_M` and `TURNED`, and those up to 0.5 m farther. The distance is `inf` if no
-        junction follows, and for a road user on no lane.
+        `position` is (N, 2) [m], `yaw` (N,) [rad]. Lanes overlap inside junctions and at their start, so that a road
+        user may have several: the nearest within `ASIDE_M` and `TURNED`, and those up to 0.5 m farther. The distance is
+        `inf` where no junction follows, and for a road user on no lane.
         """
-        lanes, distance = [], np.full(len(position), np.inf)
+        lanes = []
+        distance = np.full(len(position), np.inf)
         for i, near in enumerate(self.line.query_ball_point(position, ASIDE_M)):
             near = np.array(near, dtype=np.int64)
             near = near[np.abs(wrap_angle(self.line_yaw[near] - yaw[i])) < TURNED]
@@ -85,7 +86,7 @@ def load_roads(data: Dataset) -> RoadMap:
 
 
 def road_map(town: Town) -> RoadMap:
-    """Return the map of a town, of its driving and bicycle lanes."""
+    """Return the map of a town's driving and bicycle lanes."""
     layers = map_layers(town)
     lanes = [lane for lane in layers.lanes if lane.kind in ("driving", "bicycle") and len(lane.centre_line) > 1]
     number = {lane.id: i for i, lane in enumerate(lanes)}
@@ -116,8 +117,8 @@ def _raster(layers: MapLayers, bounds: tuple[float, float, float, float]) -> Mas
     cells = np.ceil((high - low) / RESOLUTION_M)
     size = cells * RESOLUTION_M
     middle = pose(float(low[0] + size[0] / 2), float(low[1] + size[1] / 2))
-    found = rasterise(layers, middle, (float(size[0]), float(size[1])), RESOLUTION_M)
-    return found[list(STATIC_ROWS), ::-1, ::-1].copy()
+    raster = rasterise(layers, middle, (float(size[0]), float(size[1])), RESOLUTION_M)
+    return raster[list(STATIC_ROWS), ::-1, ::-1].copy()
 
 
 def _where_streets_meet(lanes: Iterable[MapLane]) -> set[str]:
@@ -143,7 +144,7 @@ def _edge(lane: str) -> str:
 
 
 def _reach(lanes: list[MapLane], number: Mapping[str, int]) -> Iterable[Array]:
-    """Yield, for each lane, the surface points of the lane and of the lanes reachable within `REACH_M` of its end."""
+    """Yield, per lane, the surface points of the lane and of the lanes reachable within `REACH_M` of its end."""
     surface = [_surface(lane) for lane in lanes]
     length = [LineString(lane.centre_line).length for lane in lanes]
     for start in range(len(lanes)):
@@ -230,7 +231,7 @@ def draw_rasters(trace: Trace, tracks: Tracks, lit: Words, predicted: Ints, road
 
 
 class RasterCanvas:
-    """The rasters of N road users while they are drawn; `cells` (N, len(LAYERS), cells * cells) is changed in place."""
+    """The rasters of N road users while being drawn; `cells` (N, len(LAYERS), cells * cells) is changed in place."""
 
     def __init__(self, frame: Array, patch: Patch) -> None:
         """Create empty rasters; `frame` (N, 3) are the road users' poses x, y, yaw in the world."""
@@ -270,7 +271,7 @@ def _mark_others(
     instant: int,
     kind: Mask,
 ) -> None:
-    """Draw the bodies of the near actors of a `kind` (A,) at an instant, without the predicted road user itself."""
+    """Draw the bodies of the near actors of a `kind` (A,) at an instant, without the predicted road user."""
     apart = tracks.position[instant][None] - sheets.frame[:, None, :2]
     near = (np.abs(apart) < sheets.patch.side_m).all(axis=2) & kind  # False for NaN, the absent ones
     near[np.arange(len(predicted)), predicted] = False
@@ -287,7 +288,7 @@ def centres(patch: Patch) -> Array:
 
 
 def cell_of(points: Array, patch: Patch) -> tuple[Ints, Mask]:
-    """Return the cell index (...) of points (..., 2) in the road user's frame [m], and whether each is in the patch."""
+    """Return the cell indices (...) of points (..., 2) in the road user's frame [m], and whether they are in it."""
     ahead, left = patch.middle_x_m + patch.side_m / 2, patch.side_m / 2
     row = np.floor((ahead - points[..., 0]) / patch.cell_m).astype(np.int64)
     column = np.floor((left - points[..., 1]) / patch.cell_m).astype(np.int64)
@@ -296,15 +297,15 @@ def cell_of(points: Array, patch: Patch) -> tuple[Ints, Mask]:
 
 
 def _light_bars(roads: RoadMap, lights: Words, lit: Words, wanted: bool) -> Array:
-    found: Sequence[Array] = [
+    bars: Sequence[Array] = [
         roads.lights[name]
         for name, letter in zip(lights.tolist(), lit.tolist())
         if name in roads.lights and (letter in OPEN) == wanted
     ]
-    return np.concatenate(found) if found else np.zeros((0, 2))
+    return np.concatenate(bars) if bars else np.zeros((0, 2))
 
 
 def _bodies(trace: Trace, tracks: Tracks, instant: int, actors: Ints) -> Array:
-    """Return points (N, len(BODY), 2) inside the actors' boxes, in the world [m]."""
+    """Return points (N, len(BODY), 2) inside the actors' boxes, in the world frame [m]."""
     pose = np.concatenate((tracks.position[instant, actors], tracks.yaw[instant, actors, None]), axis=1)
     return out_of_frame(BODY * trace.size[actors, None, :2], pose)

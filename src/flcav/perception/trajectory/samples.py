@@ -1,8 +1,8 @@
 """Samples of the trajectory task: a vehicle's past and future in the frame of its present, and its surroundings.
 
 The surroundings are a raster of map and tracks, or resized images of the cameras near the vehicle with the calibration
-that projects the vehicle's frame into them. Nothing of them depends on what happens after the present: tracks are those
-of `tracks_around`, and images, which show the smoothed traffic, are `REACH_S` old.
+that projects the vehicle's frame into them. They do not depend on anything after the present: tracks are those of
+`tracks_around`, and images, which show the smoothed traffic, are `REACH_S` old.
 """
 
 import zlib
@@ -33,13 +33,13 @@ from flcav.world.traffic.traffic import REACH_S
 CAMERAS = 6  # typical number of cameras of a vehicle
 KEPT_BYTES = 2**30  # [B] of images cached in memory
 SEEN_M = 25.0  # largest distance from the observing vehicle to a road user that is predicted with cameras
-LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract its samples again
+LOOKED_AT_AGAIN = 4  # number of cached sets of samples, so that validation does not extract them again
 
 Pictured = tuple[Bytes, Array, Array]  # images, intrinsics and camera_from_world of a frame's cameras
 
 
 class Surround(NamedTuple):
-    """The images of n cameras, `REACH_S` before the present, with their calibration relative to a road user there."""
+    """The images of n cameras, `REACH_S` before the present, with their calibration relative to a road user."""
 
     pictures: Bytes  # (n, height, width, 3)
     intrinsics: Array  # (n, 3, 3) of the resized images [px]
@@ -47,10 +47,10 @@ class Surround(NamedTuple):
 
 
 def surround_vehicle(data: Dataset, number: int, present: Array, settings: CrossView) -> Surround:
-    """Return the resized images seen at frame `number` with their calibration relative to a road user at `present`.
+    """Return the resized images seen at frame `number`, with their calibration relative to a road user at `present`.
 
-    They are those of `find_pictured`. `present` is x, y, yaw in the world; poses and intrinsics of the cameras are the
-    agent's assumed calibration.
+    The images are those of `find_pictured`. `present` is x, y, yaw in the world frame [m, rad]; poses and intrinsics of
+    the cameras are the agent's assumed calibration.
     """
     pictures, intrinsics, camera_from_world = pictures_at(data, number, settings)
     world_from_frame = pose(float(present[0]), float(present[1]), yaw=float(present[2]))
@@ -58,16 +58,16 @@ def surround_vehicle(data: Dataset, number: int, present: Array, settings: Cross
 
 
 def pictures_at(data: Dataset, number: int, settings: CrossView) -> Pictured:
-    """Return the resized images seen at frame `number`, their intrinsics and camera_from_world, of `find_pictured`."""
+    """Return the resized images seen at frame `number`, their intrinsics and camera_from_world: see `find_pictured`."""
     pictured = find_pictured(data, number)
     assert pictured is not None
     return _kept(settings)(data, pictured)
 
 
 def find_pictured(data: Dataset, number: int) -> int | None:
-    """Return the number of the frame whose images are seen at frame `number`: its agent's last one `REACH_S` before.
+    """Return the number of the frame whose images are seen at frame `number`: its agent's last one `REACH_S` before it.
 
-    None where there is none, or only one more than `GAP_S` older than that.
+    None where there is none, or only one that is more than `GAP_S` older.
     """
     key = data.keys[number]
     numbers, time_s = _frames_of_agents(data)[key.scene, key.agent], key.time_s - REACH_S
@@ -79,7 +79,7 @@ def find_pictured(data: Dataset, number: int) -> int | None:
 
 @lru_cache(maxsize=2)
 def _frames_of_agents(data: Dataset) -> Mapping[tuple[str, str], Sequence[int]]:
-    """Return the numbers of each agent's frames by scene and agent, in order of time."""
+    """Return the numbers of the agents' frames, by scene and agent, in order of time."""
     numbers: dict[tuple[str, str], list[int]] = defaultdict(list)
     for number in sorted(range(len(data)), key=lambda i: data.keys[i].time_s):
         numbers[data.keys[number].scene, data.keys[number].agent].append(number)
@@ -114,7 +114,7 @@ def rescaled(intrinsics: Array, rgb: Picture, settings: CrossView) -> Array:
 
 
 class Columns(NamedTuple):
-    """The fields of N samples as arrays with a row for each, see `Sample`; without `surround`."""
+    """The fields of N samples as arrays with one row per sample, see `Sample`; without `surround`."""
 
     past: Array32  # (N, PAST + 1, 4)
     future: Array32  # (N, FUTURE, 2)
@@ -128,15 +128,15 @@ class Columns(NamedTuple):
 
 @dataclass(frozen=True)
 class Sample:
-    """One road user at one instant, in the frame of its present pose: x along its heading; metres, radians, seconds.
+    """A road user at an instant, in the frame of its present pose: x along its heading; metres, radians, seconds.
 
-    Past and present are those of `tracks_around`, which use nothing of later; the future is the recorded one.
+    Past and present are those of `tracks_around`, which use no later states; the future is the recorded one.
     """
 
     past: Array32  # (PAST + 1, 4) x, y, yaw, speed; the last is the present
     future: Array32  # (FUTURE, 2) x, y; NaN if unknown
     raster: Bytes  # (LAYERS, cells, cells / 8) packed bits of `flcav.perception.trajectory.rasters`
-    pose: Array  # (3,) x, y, yaw of the present in the world
+    pose: Array  # (3,) x, y, yaw of the present in the world frame
     actor: Ints  # () index in its trace
     at_junction: Mask  # () whether it is inside a junction or at most BEFORE_M before one
     scene: Words  # ()
@@ -145,7 +145,7 @@ class Sample:
 
 
 class Samples(Sequence[Sample]):
-    """Samples as arrays with a row per sample, `columns`; images are read when a sample is accessed."""
+    """Samples as arrays with one row per sample, `columns`; images are read when a sample is accessed."""
 
     def __init__(self, data: Dataset, columns: Columns, cameras: CrossView | None) -> None:
         self.columns = columns
@@ -170,8 +170,8 @@ def samples_of(data: Dataset, config: TrajectoryConfig, frames: Sequence[int] | 
     """Return the samples of a dataset's frames (None: all) with a complete past and future; cached.
 
     With rasters these are all vehicles on the road at the frames' instants, whichever agent observes; with cameras, the
-    vehicles within `SEEN_M` of each frame's own vehicle, which is included. Raises `InputError` if the dataset lacks
-    traffic, map or images, or has no such sample.
+    vehicles within `SEEN_M` of the frame's observing vehicle, which is included. Raises `InputError` where the dataset
+    lacks traffic, map or images, or has no such sample.
     """
     return _samples(data, config.patch, config.cameras, tuple(data.numbers(frames)))
 
@@ -207,7 +207,7 @@ def _parts(data: Dataset, patch: Patch, cameras: CrossView | None, frames: Seque
 
 
 def select_pictured_frames(data: Dataset, cameras: bool) -> Sequence[int]:
-    """Return the numbers of the frames that can have samples: all; with `cameras` those of vehicles, if any.
+    """Return the numbers of the frames that can have samples: all, or with `cameras` those of vehicles, if any.
 
     With cameras only road users around an observing vehicle are predicted, none around a pole.
     """
@@ -225,14 +225,14 @@ def load_traffic(data: Dataset, scene: str) -> Trace:
 
 
 def find_near(trace: Trace, tracks: Tracks, key: FrameKey) -> Mask:
-    """Return (A,) which actors are within `SEEN_M` of the observing vehicle, itself included; none for a pole.
+    """Return the mask (A,) of actors within `SEEN_M` of the observing vehicle, which is included; none for a pole.
 
     `tracks` are those around the time of `key`.
     """
-    own = trace.actor == key.agent
-    if not own.any():
-        return own
-    apart = tracks.position[PAST] - tracks.position[PAST, own]
+    observer = trace.actor == key.agent
+    if not observer.any():
+        return observer
+    apart = tracks.position[PAST] - tracks.position[PAST, observer]
     return np.linalg.norm(apart, axis=1) <= SEEN_M  # False for absent actors
 
 
@@ -277,9 +277,9 @@ def extract_columns(
 
 
 def pack_frames(data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) -> Iterator[bytes]:
-    """Yield the message of each frame: its samples, rasters compressed, or its images.
+    """Yield the messages of frames, with their samples: compressed rasters, or images.
 
-    With rasters, each agent that observes an instant sends all samples of the instant.
+    With rasters, all agents that observe an instant send all samples of the instant.
     """
     columns = samples_of(data, config, frames).columns
     instants = [i if config.cameras else (data.keys[i].scene, data.keys[i].index) for i in range(len(data))]
@@ -287,28 +287,30 @@ def pack_frames(data: Dataset, config: TrajectoryConfig, frames: Sequence[int]) 
     for row, i in enumerate(columns.frame.tolist()):
         rows.setdefault(instants[i], []).append(row)
     for i in frames:
-        own: dict[str, NDArray] = {name: each[rows.get(instants[i], [])] for name, each in columns._asdict().items()}
-        own["scene"] = from_names(own["scene"].tolist())
-        own["shape"] = np.array(own["raster"].shape)
-        own["raster"] = np.frombuffer(zlib.compress(own["raster"].tobytes()), dtype=np.uint8)
-        seen = pictures_at(data, i, config.cameras) if config.cameras and len(own["past"]) else None
-        yield pack_arrays(own if seen is None else own | dict(zip(Surround._fields, seen, strict=True)))
+        arrays: dict[str, NDArray] = {
+            name: column[rows.get(instants[i], [])] for name, column in columns._asdict().items()
+        }
+        arrays["scene"] = from_names(arrays["scene"].tolist())
+        arrays["shape"] = np.array(arrays["raster"].shape)
+        arrays["raster"] = np.frombuffer(zlib.compress(arrays["raster"].tobytes()), dtype=np.uint8)
+        seen = pictures_at(data, i, config.cameras) if config.cameras and len(arrays["past"]) else None
+        yield pack_arrays(arrays if seen is None else arrays | dict(zip(Surround._fields, seen, strict=True)))
 
 
 def unpack_frames(messages: Sequence[bytes]) -> list[Sample]:
-    """Return the samples in messages, each once: of several agents, the first one's."""
-    found: dict[tuple[int, int], Sample] = {}
+    """Return the samples in messages without duplicates: of several agents, the first one's."""
+    samples: dict[tuple[int, int], Sample] = {}
     for message in messages:
         arrays = unpack_arrays(message)
         arrays["scene"] = to_names(arrays["scene"])
         packed = zlib.decompress(arrays["raster"].tobytes())
         arrays["raster"] = np.frombuffer(packed, dtype=np.uint8).reshape(arrays["shape"])
         for row in zip(*(arrays[name] for name in Columns._fields), strict=True):
-            own = Columns(*map(np.asarray, row))
+            columns = Columns(*map(np.asarray, row))
             seen = None
             if "pictures" in arrays:
-                x, y, yaw = own.pose.tolist()
+                x, y, yaw = columns.pose.tolist()
                 views = arrays["camera_from_frame"] @ pose(x, y, yaw=yaw)
                 seen = Surround(arrays["pictures"], arrays["intrinsics"], views)
-            found.setdefault((int(own.frame), int(own.actor)), Sample(*own, surround=seen))
-    return [*found.values()]
+            samples.setdefault((int(columns.frame), int(columns.actor)), Sample(*columns, surround=seen))
+    return [*samples.values()]

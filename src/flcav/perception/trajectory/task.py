@@ -89,7 +89,7 @@ class TrajectoryTask(TrajectoryOutcomes):
     def study(self) -> StudyRecipe:
         """Return the study recipe with rasters: training in two towns, tests on held-out scenes and a held-out town.
 
-        Tests have seeds of their own, and new ones after a change that followed a look at their results: seeds 221 and
+        Tests have separate seeds, and new ones after a change that followed a look at their results: seeds 221 and
         25 (ring) were those of the first study.
         """
         grid = read_recipe("trajectory")

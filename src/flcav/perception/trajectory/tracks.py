@@ -1,7 +1,7 @@
 """Tracks of a traffic trace, interpolated at the task's instants and transformed into the frame of a pose.
 
 Interpolation is by cubic Hermite curves with Catmull-Rom tangents. What a network may know of the present is
-extrapolated, since a trace smooths over later states.
+extrapolated, since a trace's states are smoothed over later ones.
 """
 
 from typing import NamedTuple
@@ -37,11 +37,12 @@ def check_instants(trace: Trace, origin: str) -> None:
 
 
 def tracks_around(trace: Trace, time_s: float) -> Tracks:
-    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` depend on nothing that happens after it.
+    """Return the tracks at `time_s + OFFSETS_S`; points up to `time_s` [s] depend on nothing that happens after it.
 
-    A trace's states are averages that include states up to `REACH_S` later. So points up to `time_s` are made of the
-    instants up to `REACH_S` before it: interpolated between these, and extrapolated from the last. An actor is present
-    at an extrapolated point if it is at the last instant up to that point. Points after `time_s` are the trace's.
+    A trace's states are averages that include states up to `REACH_S` later. Points up to `time_s` are therefore
+    computed from the instants up to `REACH_S` before it: interpolated between these, and extrapolated from the last
+    one. An actor is present at an extrapolated point if it is at the last instant up to that point. Points after
+    `time_s` are the trace's.
     """
     times_s = np.round(time_s + OFFSETS_S, 6)
     known = int(np.searchsorted(trace.time_s, time_s - REACH_S + 1e-6, side="right"))
@@ -56,7 +57,7 @@ def tracks_around(trace: Trace, time_s: float) -> Tracks:
 
 
 def _rebuilt(trace: Trace, times_s: Array, instant: int) -> Tracks:
-    """Return the tracks extrapolated from an instant to `times_s` (S,), of the actors that are present then."""
+    """Return the tracks, extrapolated from an instant to `times_s` (S,) [s], of the actors that are then present."""
     there = trace.present[np.searchsorted(trace.time_s, times_s + 1e-6, side="right") - 1]
     position, yaw, speed = extrapolate(trace, instant, times_s - trace.time_s[instant])
     return Tracks(
@@ -72,7 +73,8 @@ def extrapolate(trace: Trace, instant: int, ahead_s: Array) -> Tracks:
     distance driven is laid on an arc, which is exact at constant speed and on straight lines. Pedestrians, whom SUMO
     moves without turning them, keep their velocity. NaN where an actor is absent at the instant.
     """
-    velocity, yaw = trace.velocity[instant, :, :2], trace.yaw[instant]
+    velocity = trace.velocity[instant, :, :2]
+    yaw = trace.yaw[instant]
     walking = trace.category == "pedestrian"
     speed = np.linalg.norm(velocity, axis=1)
     gain = np.where(walking, 0.0, (trace.acceleration[instant, :, :2] * heading_vectors(yaw)).sum(axis=1))
@@ -94,7 +96,8 @@ def tracks_at(trace: Trace, times_s: Array, known: int | None = None) -> Tracks:
     Positions are on cubic Hermite curves with Catmull-Rom tangents, yaw and speed are linear. An actor is present at a
     time if it is present at both instants around it.
     """
-    knots, position = trace.time_s[:known], trace.position[:known, :, :2]
+    knots = trace.time_s[:known]
+    position = trace.position[:known, :, :2]
     if not len(knots):
         shape = (len(times_s), len(trace.actor))
         return Tracks(np.full((*shape, 2), np.nan), np.full(shape, np.nan), np.full(shape, np.nan))

@@ -1,4 +1,4 @@
-"""Predictions of the weather classifier, their metrics, and the outcome of each image for intervals over scenes.
+"""Predictions of the weather classifier, their metrics, and the outcomes per image for intervals over scenes.
 
 Metrics are accuracy, recall per class, and the confusion matrix.
 """

@@ -49,7 +49,7 @@ CONFIGURATIONS = {
 
 
 SIDE = 32  # [px] of the input image
-# Table I: which of the six maps of S2 are inputs of each of the sixteen maps of C3
+# Table I of the paper: which of the six maps of S2 are inputs of each of the sixteen maps of C3
 _RUNS = [[i % 6, (i + 1) % 6, (i + 2) % 6] for i in range(6)]
 _LONGER_RUNS = [[(i + k) % 6 for k in range(4)] for i in range(6)]
 _PAIRS = [[i, i + 1, (i + 3) % 6, (i + 4) % 6] for i in range(3)]

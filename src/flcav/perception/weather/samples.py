@@ -17,7 +17,7 @@ from flcav.world.weather import Weather, classify_weather
 
 @dataclass(frozen=True)
 class Sample:
-    """One labelled image."""
+    """A labelled image."""
 
     picture: Picture  # (32, 32, 3)
     label: int  # index of the class
@@ -40,12 +40,12 @@ def label_pictures(
     if all(weather is None for _, weather, _ in seen):
         raise InputError(f"{data.folder}: the weather was not recorded, which 'weather' needs")
     names = [None if weather is None else named(weather) for _, weather, _ in seen]
-    found = [
+    samples = [
         Sample(picture, classes.index(name), scene) for (picture, _, scene), name in zip(seen, names) if name in classes
     ]
-    if not found:
+    if not samples:
         raise InputError(f"{data.folder}: no picture in any of the weathers {', '.join(classes)}")
-    return found
+    return samples
 
 
 @lru_cache(maxsize=4)  # since a validation reads the same images after every epoch
@@ -97,4 +97,6 @@ def unpack_frame(message: bytes, classes: Sequence[str]) -> list[Sample]:
     label, scene = map(str, to_names(arrays["label"]))
     if label not in classes:
         return []
-    return [Sample(reduce_picture(each), classes.index(label), scene) for each in unpack_pictures(arrays).values()]
+    return [
+        Sample(reduce_picture(picture), classes.index(label), scene) for picture in unpack_pictures(arrays).values()
+    ]

@@ -27,22 +27,22 @@ CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyc
 PICTURES = "image_2"
 SUFFIXES = {"calib": "txt", "velodyne": "bin", PICTURES: "png", "label_2": "txt"}
 FOLDERS = ("training", "testing")
-TRUNCATION = np.array([0.0, 0.25, 0.75])  # share outside the image that stands for a level of the tracking benchmark
+TRUNCATION = np.array([0.0, 0.25, 0.75])  # shares outside the image for the tracking benchmark's levels
 LEVELS = (0, 1, 2, 3)  # of occlusion
-ASSUMED_SIZE = (375, 1242)  # height, width [px] of most of KITTI's images: of those that are missing
-MARGIN_PX = 1.0  # KITTI's own labels extend up to a pixel beyond the image
+ASSUMED_SIZE = (375, 1242)  # height, width [px] of a missing image: those of most of KITTI's images
+MARGIN_PX = 1.0  # KITTI's labels extend up to a pixel beyond the image
 
 
 @dataclass(frozen=True)
 class KittiCalibration:
-    """Extrinsics and projection of the left colour camera (camera 2)."""
+    """Extrinsics and projection matrix of the left colour camera (camera 2)."""
 
-    camera_from_lidar: Array  # (4, 4), rectified camera frame
+    camera_from_lidar: Array  # (4, 4) [m], rectified camera frame
     image_from_camera: Array  # (3, 4) projection to pixels
 
 
 def read_points(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x, y, z [m] and reflectance [0, 1] of a point cloud, LiDAR frame.
+    """Return points (N, 4) of a point cloud: x, y, z [m] and reflectance [0, 1], LiDAR frame.
 
     Raises `InputError` where the file is missing, empty, truncated within a point, of another layout by its numbers,
     or holds a number that is not finite or an intensity outside 0 to 1.
@@ -56,9 +56,9 @@ def read_points(path: Path) -> NDArray[np.float32]:
 
 
 def _refuse_points(data: bytes, path: Path) -> Never:
-    """Raise `InputError` that says what the bytes are in place of a point cloud."""
-    if (found := describe_numbers(data)) not in ("", LAYOUT):
-        raise InputError(f"{path}: {found} by its numbers; wanted are {LAYOUT}: {POINT}")
+    """Raise `InputError`, naming what the bytes are instead of a point cloud."""
+    if (layout := describe_numbers(data)) not in ("", LAYOUT):
+        raise InputError(f"{path}: {layout} by its numbers; wanted are {LAYOUT}: {POINT}")
     if len(data) % POINT_BYTES:
         raise InputError(
             f"{path}: truncated; {len(data)} bytes are not a multiple of {POINT_BYTES}, the size of a point"
@@ -68,9 +68,9 @@ def _refuse_points(data: bytes, path: Path) -> Never:
 
 
 def read_calibration(path: Path) -> KittiCalibration:
-    """Return the calibration of a frame from its file; raises `InputError` for a missing, malformed or singular matrix.
+    """Return the calibration of a frame from its file, which has the matrices in MATRICES.
 
-    Needs the matrices in MATRICES.
+    Raises `InputError` for a missing, malformed or singular matrix.
     """
     rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
     matrices = {}
@@ -113,9 +113,9 @@ def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = Fa
     """Return the labelled objects of a frame from its label file.
 
     Boxes are upright in the LiDAR frame: the tilt of about a degree between camera and LiDAR is neglected in their
-    orientation, but not in their position. Scores are kept where every row has one. levels: truncation is given by the
-    levels of KITTI's tracking benchmark, for which shares stand. Raises `InputError` where the file
-    is missing or a line is not a label.
+    orientation, but not in their position. Scores are kept where every row has one. With `levels`, truncation is given
+    in the levels of KITTI's tracking benchmark, and converted to shares. Raises `InputError` where the file is missing
+    or a line is not a label.
     """
     label, rows, unlabelled = [], [], []
     for number, line in enumerate(_lines(path), 1):
@@ -153,7 +153,7 @@ def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = Fa
 
 
 def _read_levels(truncation: Array) -> Array:
-    """Return the shares that stand for the levels of truncation 0, 1 and 2; other numbers as they are."""
+    """Return the shares for the levels of truncation 0, 1 and 2; other numbers are returned unchanged."""
     known = np.isin(truncation, range(len(TRUNCATION)))
     return np.where(known, TRUNCATION[np.where(known, truncation, 0).astype(int)], truncation)
 
@@ -166,15 +166,15 @@ def _lines(path: Path) -> list[str]:
 
 
 def is_drive(folder: Path) -> bool:
-    """Return whether a folder is a drive of KITTI: it has the sweeps itself, and no `training` or `testing`.
+    """Return whether a folder is a drive of KITTI: it holds the sweeps, and no `training` or `testing`.
 
-    Its labels have levels of truncation, as those of the tracking benchmark do, and one calibration may be for all.
+    Its labels have levels of truncation, as those of the tracking benchmark, and it may have a single calibration file.
     """
     return (folder / "velodyne").is_dir() and folder.name not in FOLDERS
 
 
 def find_part(folder: Path, part: str, number: str) -> Path:
-    """Return the file of a part of a frame, a key of `SUFFIXES`, in `training`, `testing` or a drive."""
+    """Return the file of a frame in `training`, `testing` or a drive; `part` is a key of `SUFFIXES`."""
     common = folder / "calib.txt"
     if part == "calib" and is_drive(folder) and common.is_file():
         return common
@@ -183,7 +183,7 @@ def find_part(folder: Path, part: str, number: str) -> Path:
 
 @dataclass(frozen=True)
 class KittiFrame:
-    """One frame of the benchmark."""
+    """A frame of the benchmark."""
 
     name: str  # "000008"
     points: NDArray[np.float32]  # (N, 4) x, y, z [m], reflectance; LiDAR frame
@@ -202,10 +202,10 @@ class KittiFolder:
 
     @classmethod
     def open(cls, path: Path | str, split: str | None = None, *, pictures: bool = True) -> "KittiFolder":
-        """Return the frames of the KITTI folder `path` that `ImageSets/<split>.txt` lists, or all of `training`.
+        """Open the frames of the KITTI folder `path` that `ImageSets/<split>.txt` lists, or all of `training`.
 
         The split "test" is read from `testing`, any other from `training`. Raises `InputError` where the folder, the
-        list or a file of a frame is missing; without `pictures`, images may be.
+        list or a file of a frame is missing; images may be missing unless `pictures`.
         """
         root, part_of = Path(path), "testing" if split == "test" else "training"
         folder = root if is_drive(root) and split is None else root / part_of
@@ -266,9 +266,9 @@ def check_objects(objects: Objects, width: int | None, height: int | None, path:
 
 
 def read_split(path: Path) -> list[str]:
-    """Return the names of the frames that a file of `ImageSets` lists.
+    """Return the names of the frames that a file in `ImageSets` lists.
 
-    Raises `InputError` where one is there twice, or leads out of the folders of frames.
+    Raises `InputError` where a name is listed twice, or leads out of the folders of frames.
     """
     try:
         names = read_file(path).decode("utf-8-sig").split() if path.exists() else None

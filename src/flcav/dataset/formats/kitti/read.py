@@ -1,11 +1,11 @@
 """Reading of KITTI's object detection benchmark as a source of frames.
 
-Its frames are of no sequence: each is a scene of its own, at time 0 and at the world's origin. Only an export of
-flcav's says more, in `frames.csv`. A drive is a folder that itself has `velodyne` and `calib`, or one `calib.txt`: its
-sweeps follow one another in one scene, its poses are not known, and its labels have levels of truncation, as those of
-KITTI's tracking benchmark do. The LiDAR stands where KITTI's does, HEIGHT_M above the ground, and but for an export's
-has the BEAMS and RANGE_M of an HDL-64E (Geiger et al., IJRR 32(11), 2013, section 2 and fig. 3); a label's rectangle is
-of the whole object as far as it lies in the image.
+Its frames belong to no sequence: each is a scene, at time 0 and at the world's origin. Only an export of flcav has
+more, in `frames.csv`. A drive is a folder that itself holds `velodyne` and `calib`, or one `calib.txt`: its sweeps
+follow one another in a single scene, its poses are unknown, and its labels have levels of truncation, as those of
+KITTI's tracking benchmark. The LiDAR is mounted as KITTI's, HEIGHT_M above the ground and, except in an export, has the
+BEAMS and RANGE_M of an HDL-64E (Geiger et al., IJRR 32(11), 2013, section 2 and fig. 3). A label's rectangle covers the
+whole object as far as it lies in the image.
 """
 
 import csv
@@ -55,10 +55,10 @@ CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their 
     "Pedestrian": "pedestrian",
     "Cyclist": "bicycle",
 }
-OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # share that stands for the levels 0 fully visible, 1, 2, 3 unknown
+OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # shares for the levels 0 fully visible, 1, 2, 3 unknown
 HEIGHT_M, BEAMS, RANGE_M = 1.73, 64, 120.0
 LIDAR, CAMERA = "velodyne", PICTURES
-DRIVE_HZ = 10.0  # sweeps of a drive follow one another at this rate
+DRIVE_HZ = 10.0  # rate of the sweeps of a drive
 LISTS = ("train", "val", "test")
 
 
@@ -72,7 +72,7 @@ class KittiShot(NamedTuple):
     spin: int
     vehicle: str
     time_s: float
-    exported: bool  # by flcav, whose camera may have moved on since the spin: an agent keeps its first calibration
+    exported: bool  # by flcav: its camera may have moved since the spin, so an agent keeps its first calibration
 
 
 class KittiSource(LogSource):
@@ -81,14 +81,14 @@ class KittiSource(LogSource):
     FORMAT = "kitti"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where `folder` has no frames, none of `split`, or a file of a frame is missing."""
+        """Open the frames; raises `InputError` where there is none, none of `split`, or a file of one is missing."""
         self.folder, self.split = folder, split
         shots = _find_shots(folder)
         split_of: dict[str, str | None] = {}
         for shot in shots:
             assign_split(split_of, shot.scene, shot.split, folder)
         chosen = set(choose_split(folder, split_of, split))
-        self.split_of = {scene: own for scene, own in split_of.items() if scene in chosen}
+        self.split_of = {scene: scene_split for scene, scene_split in split_of.items() if scene in chosen}
         self._shots: dict[str, list[KittiShot]] = defaultdict(list)
         self._agent: dict[KittiShot, str] = {}
         self._calibration: dict[str, Calibration] = {}
@@ -108,11 +108,11 @@ class KittiSource(LogSource):
             kind: [shot.number for shot in every if not _path(shot, kind).is_file()] for kind in ("label_2", CAMERA)
         }
         self.labelled = not lost["label_2"]
-        told = {"label_2": "so no boxes there", CAMERA: "so LiDAR alone there"}
+        effects = {"label_2": "so no boxes there", CAMERA: "so LiDAR alone there"}
         self.notes = tuple(
-            f"no {kind} of {len(own)} of {plural(len(every), 'frame')}, {told[kind]}: {name_some(own)}"
-            for kind, own in lost.items()
-            if own
+            f"no {kind} of {len(numbers)} of {plural(len(every), 'frame')}, {effects[kind]}: {name_some(numbers)}"
+            for kind, numbers in lost.items()
+            if numbers
         )
 
     def frame_count(self, scene: str) -> int:
@@ -130,8 +130,9 @@ IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "ve
 
 
 def _calibrate(calibrated: KittiCalibration) -> Calibration:
-    agent_from_lidar, projection = pose(0.0, 0.0, HEIGHT_M), calibrated.image_from_camera
-    shifted = np.eye(4)  # the projection's fourth column as a translation
+    agent_from_lidar = pose(0.0, 0.0, HEIGHT_M)
+    projection = calibrated.image_from_camera
+    shifted = np.eye(4)  # the projection's fourth column, K t, as a translation t of the camera
     shifted[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
     return Calibration(
         {LIDAR: agent_from_lidar, CAMERA: agent_from_lidar @ inverse(shifted @ calibrated.camera_from_lidar)},
@@ -179,7 +180,7 @@ def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> Linked
 def _find_shots(folder: Path) -> list[KittiShot]:
     """Return the frames of `training` and `testing` in the order of their numbers, in folders with a point cloud.
 
-    A frame is one that is listed, or that any of its files is there of.
+    A frame is a listed number, or one for which any file exists.
     """
     listed = {}
     for name in LISTS:
@@ -192,7 +193,7 @@ def _find_shots(folder: Path) -> list[KittiShot]:
     shots = []
     for part in FOLDERS:
         found = {kind: {path.stem for path in (folder / part / kind).glob(f"*.{SUFFIXES[kind]}")} for kind in SUFFIXES}
-        numbers = set().union(*found.values(), (number for own, number in listed if own == part))
+        numbers = set().union(*found.values(), (number for listed_part, number in listed if listed_part == part))
         for number in sorted(numbers) if found["velodyne"] else ():
             split = listed.get((part, number), "test" if part == "testing" else None)
             where = origin.get(number, (f"kitti-{part}-{number}", 0, "ego", 0.0))
@@ -206,7 +207,7 @@ def _find_shots(folder: Path) -> list[KittiShot]:
 
 
 def _check_complete(shots: list[KittiShot]) -> None:
-    """Raise `InputError` where a file of a frame is missing: images may be, and all labels of a folder."""
+    """Raise `InputError` where a file of a frame is missing; images may be missing, or all labels of a folder."""
     labelled = {shot.folder for shot in shots if _path(shot, "label_2").is_file()}
     for shot in shots:
         for part in SUFFIXES:
@@ -217,16 +218,17 @@ def _check_complete(shots: list[KittiShot]) -> None:
 
 
 def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
-    """Return number -> scene, spin, agent and time [s] from the list of an export, empty where there is none."""
+    """Return scene, spin, agent and time [s] by number, from the list of an export; empty where there is none."""
     if not path.is_file():
         return {}
-    found, numbers = {}, dict[str, str]()
+    origins = {}
+    numbers = dict[str, str]()
     check_is_file(path)
     try:
         with path.open(newline="", encoding="utf-8-sig") as file:
             for row in csv.DictReader(file):
                 scene, index, _ = row["frame"].removesuffix(row["agent"]).rsplit("_", 2)
-                found[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])
+                origins[row["number"]] = scene, int(index), row["agent"], float(row["time_s"])
                 if (one := numbers.setdefault(row["frame"], row["number"])) != row["number"]:
                     raise InputError(f"{path}: {row['number']} is the frame {shorten(row['frame'])}, as {one} is")
     except InputError:
@@ -235,7 +237,7 @@ def _read_origins(path: Path) -> dict[str, tuple[str, int, str, float]]:
         raise InputError(
             f"{path}: not the list of frames of an export; without it the folder can be read, too"
         ) from None
-    return found
+    return origins
 
 
 def _path(shot: KittiShot, part: str) -> Path:

@@ -1,7 +1,7 @@
 """Export to KITTI's 3D object detection benchmark, as OpenPCDet and the development kit read it.
 
-A frame is one spin of an agent with a LiDAR and a level camera that looks ahead. This camera stands for all four of
-KITTI's, and its optical frame for the rectified camera frame.
+A frame is a spin of an agent with a LiDAR and a level camera that looks ahead. This camera stands for all four of
+KITTI's cameras, and its optical frame for the rectified camera frame.
 """
 
 import csv
@@ -44,14 +44,14 @@ CLASSES = {
     "bicycle": "Cyclist",
     "pedestrian": "Pedestrian",
 }
-PARTLY, LARGELY = 0.1, 0.5  # occlusion from which an object counts as partly and as largely occluded
+PARTLY, LARGELY = 0.1, 0.5  # occlusion from which an object counts as partly, and as largely occluded
 UNKNOWN = 3  # KITTI's occlusion level of objects without a visible pixel
-NOTHING = "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10"  # for a frame without labels: readers need a line
+NOTHING = "DontCare -1 -1 -10 0 0 1 1 -1 -1 -1 -1000 -1000 -1000 -10"  # in a frame without labels: readers need a line
 FRAMES = "frames.csv"  # maps each number to a frame of the dataset
 
 
 def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write `dataset` as `training` and `ImageSets`, a dataset recorded for testing as `testing`: see `ExportFormat`.
+    """Write `dataset` as `training` and `ImageSets`, or as `testing` if it was recorded for tests: see `ExportFormat`.
 
     Frames without a LiDAR or a level camera that looks ahead are left out.
     """
@@ -66,7 +66,8 @@ def export_kitti(dataset: Dataset, out: Path, options: ExportOptions, progress: 
         if camera is None or not frame.lidar:
             exported.leave_out(frame, "no level camera that looks ahead" if frame.lidar else "no LiDAR", frame.agent)
         else:
-            split, number = split_of[key.scene], f"{counts['frames']:06d}"
+            split = split_of[key.scene]
+            number = f"{counts['frames']:06d}"
             folder = out / ("testing" if split == "test" else "training")
             objects, regions, left_out = _write_frame(frame, camera, folder, number, options.min_points)
             numbers[split].append(number)
@@ -111,13 +112,13 @@ def _write_frame(
 def format_label_lines(
     frame: Frame, camera: str, lidar: str, min_points: int
 ) -> tuple[list[str], list[str], Counter[LeftOut]]:
-    """Return the lines of a label file: of labelled actors, and of DontCare regions around other visible actors.
+    """Return the lines of a label file, for labelled actors and for DontCare regions around other visible actors.
 
-    Actors that are not labelled are counted by reason.
     Labelled are actors in the image and ahead of the camera with at least `min_points` LiDAR points in their box, and
-    at least one point or visible pixel.
+    at least one point or visible pixel. The others are counted by reason.
     """
-    truth, views = frame.annotations, frame.annotations.views[camera]
+    truth = frame.annotations
+    views = frame.annotations.views[camera]
     height, width = frame.images[camera].rgb.shape[:2]
     edge = (width - 1, height - 1, width - 1, height - 1)
     rectangle = np.clip(views.amodal_box, 0, edge)
@@ -150,15 +151,15 @@ def format_label_lines(
 
 
 def dont_care(rectangle: Array) -> str:
-    """Return the label line of a DontCare region: (4,) left, top, right, bottom [px]."""
+    """Return the label line of a DontCare region, given left, top, right, bottom (4,) [px]."""
     left, top, right, bottom = (f"{number:.4f}" for number in rectangle)
     return f"DontCare -1 -1 -10 {left} {top} {right} {bottom} -1 -1 -1 -1000 -1000 -1000 -10"
 
 
 def occlusion_levels(occlusion: Array, pixels: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return (M,) KITTI's occlusion levels: 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown.
+    """Return KITTI's occlusion levels (M,): 0 fully visible, 1 partly occluded, 2 largely occluded, 3 unknown.
 
-    `occlusion` is (M,) in [0, 1] or NaN, `pixels` (M,) the visible ones.
+    `occlusion` (M,) is in [0, 1] or NaN, `pixels` (M,) is the number of visible ones.
     """
     level = np.digitize(occlusion, (PARTLY, LARGELY))
     return np.where((pixels != 0) & ~np.isnan(occlusion), level, UNKNOWN)
@@ -167,7 +168,7 @@ def occlusion_levels(occlusion: Array, pixels: NDArray[np.int64]) -> NDArray[np.
 def format_calibration(intrinsics: Array, camera_from_lidar: Array, lidar_from_imu: Array) -> list[str]:
     """Return the lines of a calibration file, in the order that readers expect.
 
-    `intrinsics` is (3, 3), the transforms are (4, 4).
+    `intrinsics` is (3, 3) [px]; the transforms are (4, 4) [m].
     """
     projection = np.column_stack((intrinsics, np.zeros(3)))
     matrices = {

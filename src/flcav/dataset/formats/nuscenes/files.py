@@ -14,7 +14,7 @@ from flcav.geometry import Array
 from flcav.sensors.radar import compute_echo_directions
 from flcav.world.map.town import Town
 
-OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # nuScenes': x right, y ahead
+OURS_FROM_LIDAR = np.array([[0.0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])  # nuScenes: x right, y ahead
 POINT_BYTES = 20  # x, y, z, intensity, ring, each float32
 RESOLUTION_M = 0.1  # size of a pixel of the map
 RADAR = np.dtype(
@@ -29,10 +29,10 @@ MOVING, STATIONARY, UNAMBIGUOUS, CERTAIN = 0, 1, 3, 1
 
 
 def encode_lidar(points: NDArray[np.float32], elevations: Array) -> bytes:
-    """Return the bytes of (N, 5) float32 x, y, z [m] in nuScenes' LiDAR frame, intensity 0 to 255, ring.
+    """Return the bytes of points (N, 5) float32: x, y, z [m] in nuScenes' LiDAR frame, intensity 0 to 255, ring.
 
-    `points` is (N, 4) x, y, z, intensity [0, 1] in our LiDAR frame (x ahead, y left). The ring is the index of the
-    channel nearest in elevation; `elevations` [rad] lists the channels from the lowest. Without any, it is 0.
+    `points` is (N, 4): x, y, z [m], intensity [0, 1] in flcav's LiDAR frame (x ahead, y left). The ring is the index of
+    the channel nearest in elevation; `elevations` [rad] lists the channels from the lowest. Without any, it is 0.
     """
     x, y, z, intensity = points.T
     ring = np.zeros(len(points), np.float32)
@@ -43,7 +43,7 @@ def encode_lidar(points: NDArray[np.float32], elevations: Array) -> bytes:
 
 
 def read_nuscenes_points(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a file of `encode_lidar`.
+    """Return points (N, 4) of a file of `encode_lidar`: x ahead, y left, z [m], intensity [0, 1].
 
     Raises `InputError` where it is missing, truncated, or has a point that is not finite or an intensity out of range.
     """
@@ -56,11 +56,11 @@ def read_nuscenes_points(path: Path) -> NDArray[np.float32]:
 
 
 def encode_radar(echoes: NDArray[np.float32], velocity: Array) -> bytes:
-    """Return a binary PCD file of (N, 5) radar returns: range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
+    """Return a binary PCD file of radar returns (N, 5): range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
 
-    `velocity` is the radar's own (3,) [m/s], in its frame. Only the radial velocity of a return is measured: `vx`, `vy`
-    are its components relative to the radar, `vx_comp`, `vy_comp` those over ground, with the radar's own motion added.
-    Without returns the file has a single point, at NaN.
+    `velocity` (3,) is that of the radar, in its frame [m/s]. Only the radial velocity of a return is measured: `vx`,
+    `vy` are its components relative to the radar, `vx_comp`, `vy_comp` those over ground, with the radar's motion
+    added. Without returns the file has a single point, at NaN.
     """
     rows = np.zeros(max(len(echoes), 1), RADAR)
     if not len(echoes):
@@ -83,9 +83,9 @@ def encode_radar(echoes: NDArray[np.float32], velocity: Array) -> bytes:
 
 
 def decode_radar(rows: NDArray[np.void]) -> NDArray[np.float32]:
-    """Return (N, 5) range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm] of the points of a radar's PCD file.
+    """Return radar returns (N, 5) of a PCD file: range [m], azimuth, elevation [rad], Doppler [m/s], RCS [dBsm].
 
-    Those that the devkit leaves out by default, as invalid or ambiguous, are left out.
+    Points that the devkit leaves out by default, as invalid or ambiguous, are left out.
     """
     kept = (rows["invalid_state"] == 0) & (rows["ambig_state"] == UNAMBIGUOUS) & np.isfinite(rows["x"])
     x, y, z, vx, vy, rcs = (rows[name][kept].astype(np.float64) for name in ("x", "y", "z", "vx", "vy", "rcs"))
@@ -96,7 +96,7 @@ def decode_radar(rows: NDArray[np.void]) -> NDArray[np.float32]:
 
 
 def map_mask(town: Town) -> NDArray[np.uint8]:
-    """Return the (H, W) mask of a town at RESOLUTION_M, north up: 255 on roads and sidewalks, else 0.
+    """Return the mask (H, W) of a town at RESOLUTION_M, north up: 255 on roads and sidewalks, else 0.
 
     Its lower left corner is that of the town's bounds.
     """
@@ -171,7 +171,7 @@ def token(*names: str | int) -> str:
 
 
 def constant_rows() -> dict[str, list[Row]]:
-    """Return table -> rows of all TABLES: `category`, `attribute` and `visibility` filled, the others empty."""
+    """Return the rows of all TABLES, by table: `category`, `attribute` and `visibility` filled, the others empty."""
     shares = ("0 to 40 %", "40 to 60 %", "60 to 80 %", "80 to 100 %")
     tables: dict[str, list[Row]] = {name: [] for name in TABLES}
     tables["category"] = [
@@ -187,16 +187,16 @@ def constant_rows() -> dict[str, list[Row]]:
 
 
 def visibility(occlusion: float) -> str:
-    """Return the token of the visibility level of an object, from its `occlusion` in [0, 1]; "" for NaN, unknown."""
+    """Return the token of the visibility level for an `occlusion` in [0, 1]; "" for NaN, unknown."""
     if np.isnan(occlusion):
         return ""
     return str(int(np.digitize(1 - occlusion, VISIBILITY)) + 1)
 
 
 def attributes(category: str, track: str, speed_m_s: float) -> list[str]:
-    """Return the token of an actor's attribute, e.g. "vehicle.moving"; none where it needs a speed that is NaN.
+    """Return the token of an actor's attribute, e.g. "vehicle.moving"; none where it depends on a speed that is NaN.
 
-    It follows from the actor's class, its track id, which says whether it is parked, and its speed.
+    It follows from the actor's class, its track id, which shows whether it is parked, and its speed.
     """
     if np.isnan(speed_m_s) and category not in ("bicycle", "motorcycle"):
         return []
@@ -213,7 +213,7 @@ def attributes(category: str, track: str, speed_m_s: float) -> list[str]:
 
 
 def link_rows(rows: list[Row]) -> None:
-    """Set `prev` and `next` of each of the consecutive `rows` to the tokens of its neighbours, "" at the ends."""
+    """Set `prev` and `next` of consecutive `rows` to the tokens of their neighbours, "" at the ends."""
     for row, before, after in zip(rows, [None, *rows], [*rows[1:], None]):
         row["prev"] = before["token"] if before else ""
         row["next"] = after["token"] if after else ""

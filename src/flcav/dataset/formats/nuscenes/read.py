@@ -1,7 +1,7 @@
 """Reading of nuScenes' tables and files, as nuscenes-devkit reads them: the key frames, which are those with boxes.
 
-The ego vehicle's frame is on the ground below the rear axle, the world is nuScenes' global frame. Splits of nuScenes
-are in its devkit's code and not in its files; an export of flcav's has them, and its logs name scene and agent.
+The ego vehicle's frame is on the ground below the rear axle; the world is nuScenes' global frame. Splits of nuScenes
+are in its devkit's code rather than in its files; an export of flcav has them, and its logs name scene and agent.
 """
 
 from array import array
@@ -48,10 +48,10 @@ CATEGORIES = group_classes(
 )
 RIDDEN = {"vehicle.bicycle": "bicycle", "vehicle.motorcycle": "motorcycle"}
 RIDER = "cycle.with_rider"
-OCCLUSION = {"1": 0.8, "2": 0.5, "3": 0.3, "4": 0.1}  # middle of the level: 0-40 %, 40-60, 60-80, 80-100 visible
+OCCLUSION = {"1": 0.8, "2": 0.5, "3": 0.3, "4": 0.1}  # middles of the levels: 0-40 %, 40-60, 60-80, 80-100 visible
 TOP, MOUNTED = "LIDAR_TOP", "calibrated_sensor.json"
-BEAMS, RANGE_M = 32, 70.0  # of nuScenes' own LiDAR (Caesar et al., CVPR 2020, table 2); others' folders do not say
-VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # nuScenes' own tables
+BEAMS, RANGE_M = 32, 70.0  # of nuScenes' LiDAR (Caesar et al., CVPR 2020, table 2); other folders do not state them
+VERSIONS = ("v1.0-mini", "v1.0-trainval", "v1.0-test")  # tables distributed by nuScenes
 
 
 class Spin(NamedTuple):
@@ -64,12 +64,12 @@ class Spin(NamedTuple):
 
 
 class NuscenesSource(LogSource):
-    """The key frames of a nuScenes folder, or of a folder of tables in it, such as `v1.0-mini`."""
+    """The key frames of a nuScenes folder, or of a folder with its tables, such as `v1.0-mini`."""
 
     FORMAT = "nuscenes"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where tables are missing or malformed, or there is nothing of `split`."""
+        """Open the tables; raises `InputError` where they are missing or malformed, or there is nothing of `split`."""
         self.folder, self.split = folder, split
         self._tables = _find_tables(folder)
         self._root = self._tables.parent
@@ -80,7 +80,8 @@ class NuscenesSource(LogSource):
         self._data: dict[str, dict[str, Row]] = defaultdict(dict)  # sample -> channel -> row of sample_data
         self._mounted, self._channel = table["calibrated_sensor"], table["sensor"]
         self._lost: dict[str, set[str]] = defaultdict(set)  # sample -> channels whose file is not there
-        listed, first_lost = self._tables / "sample_data.json", None
+        listed = self._tables / "sample_data.json"
+        first_lost = None
         for row in self._stream("sample_data"):
             if not row["is_key_frame"]:
                 continue
@@ -89,12 +90,15 @@ class NuscenesSource(LogSource):
                 continue
             path_within(self._root, row["filename"], listed)
             mounted = self._at(self._mounted, row, "calibrated_sensor_token")
-            channel, own = self._at(self._channel, mounted, "sensor_token")["channel"], self._data[row["sample_token"]]
+            channel, of_sample = (
+                self._at(self._channel, mounted, "sensor_token")["channel"],
+                self._data[row["sample_token"]],
+            )
             if not (file := self._root / row["filename"]).is_file():  # a device, too, would be read without end
                 first_lost = first_lost or file
                 self._lost[row["sample_token"]].add(channel)
                 continue
-            if (one := own.setdefault(channel, row)) is not row:
+            if (one := of_sample.setdefault(channel, row)) is not row:
                 raise InputError(
                     f"{listed}: {shorten(row['filename'])} is a second one of {channel} at {row['timestamp']} of a "
                     f"sample, beside {shorten(one['filename'])}"
@@ -113,20 +117,20 @@ class NuscenesSource(LogSource):
         self.notes = () if self.labelled else ("no annotations in its tables, so no boxes",)
         self.notes += tuple(self._references.notes())
         if lost := sum(map(len, self._lost.values())):
-            whole = sum(TOP not in own for own in self._lost.values())
+            whole = sum(TOP not in channels for channels in self._lost.values())
             self.notes += (
                 f"files of its tables that are not there: {lost}, the first is {first_lost}; left out with them: "
                 f"{len(self._lost) - whole} of {len(table['sample'])} key frames, which lack {TOP}",
             )
 
     def _at(self, table: Mapping[str, Row], row: Row, column: str) -> Row:
-        """Return the row that a column of another one refers to; raises `InputError` where there is none."""
+        """Return the row to which a column of another row refers; raises `InputError` where there is none."""
         if row[column] not in table:
             raise self._unknown(row, column)
         return table[row[column]]
 
     def _stream(self, name: str) -> Iterator[Row]:
-        """Yield the rows of a table, and check where they lead."""
+        """Yield the rows of a table, and check their references."""
         return self._references.check_links(stream_table(self._tables, name), name, self._tables / f"{name}.json")
 
     def _unknown(self, row: Row, column: str) -> InputError:
@@ -141,7 +145,7 @@ class NuscenesSource(LogSource):
         return self._at(self._channel, mounted, "sensor_token")["modality"]
 
     def _pixels(self, row: Row) -> tuple[int, int]:
-        """Return width and height of a picture, of its row of sample_data."""
+        """Return width and height [px] of a picture, from its row of sample_data."""
         if not row.get("width") or not row.get("height"):
             raise InputError(f"{self._tables / 'sample_data.json'}: no width and height of '{row['filename']}'")
         return row["width"], row["height"]
@@ -152,7 +156,7 @@ class NuscenesSource(LogSource):
         return tuple(f"{channel} {[mounted[channel][name] for name in names]}" for channel in sorted(mounted))
 
     def _calibrate(self, data: Mapping[str, Row], spin: int) -> Calibration:
-        """Return the calibration of an agent from its first row for each channel; trigger times are those of `spin`."""
+        """Return the calibration of an agent from its first row per channel; trigger times relative to `spin` [µs]."""
         mounted = {channel: self._at(self._mounted, row, "calibrated_sensor_token") for channel, row in data.items()}
         ours = {channel: inverse(OURS_FROM_LIDAR) for channel, row in data.items() if self._kind(row) == "lidar"}
         cameras = [channel for channel, row in data.items() if self._kind(row) == "camera"]
@@ -166,13 +170,14 @@ class NuscenesSource(LogSource):
     def _order(
         self, scenes: Mapping[str, Row], logs: Mapping[str, Row], samples: Mapping[str, Row]
     ) -> tuple[dict[str, list[Spin]], dict[str, str | None]]:
-        """Return scene -> its spins in order of time and agent, and scene -> split."""
-        ours, names = self._tables.name == VERSION, AgentNames()
+        """Return the spins by scene, ordered by time and agent, and the splits by scene."""
+        ours = self._tables.name == VERSION
+        names = AgentNames()
         splits = self._tables / "splits.json"
         listed = read_json(splits) if splits.is_file() else {}
         split_by_name: dict[str, str | None] = {}
-        for split, own in listed.items() if isinstance(listed, dict) else ():
-            for name in own if isinstance(own, list) else ():
+        for split, names_of in listed.items() if isinstance(listed, dict) else ():
+            for name in names_of if isinstance(names_of, list) else ():
                 assign_split(split_by_name, str(name), split.removeprefix("flcav_"), splits)
         of_scene: dict[str, list[str]] = defaultdict(list)
         for token, row in samples.items():
@@ -191,7 +196,7 @@ class NuscenesSource(LogSource):
                     raise InputError(f"{self._tables / 'sample_data.json'}: no {TOP} of the sample '{sample}'")
             if not of_scene[token]:
                 continue
-            own = log["logfile"] if ours else name
+            own_scene = log["logfile"] if ours else name
             first: dict[str, Row] = {}  # channel -> its first row in the scene
             for sample in of_scene[token]:
                 first = {**self._data[sample], **first}
@@ -202,15 +207,15 @@ class NuscenesSource(LogSource):
             late = name.rpartition("-")[2] if ours else "0"  # [microseconds], see `Drive._micros`
             if not late.isdecimal():
                 raise InputError(f"{self._tables / 'scene.json'}: the scene '{name}' is none of an export by flcav")
-            times[own] += [((samples[s]["timestamp"] - int(late)) / 1e6, agent, s) for s in of_scene[token]]
-            if own in split_of and not ours:
+            times[own_scene] += [((samples[s]["timestamp"] - int(late)) / 1e6, agent, s) for s in of_scene[token]]
+            if own_scene in split_of and not ours:
                 raise InputError(f"{self._tables / 'scene.json'}: two scenes are called {shorten(name)}")
             split = split_by_name.get(name, "test" if self._tables.name.endswith("-test") else None)
-            assign_split(split_of, own, split, splits)
+            assign_split(split_of, own_scene, split, splits)
         spins = {}
-        for scene, found in times.items():
-            rank = {time: index for index, time in enumerate(sorted({time for time, _, _ in found}))}
-            spins[scene] = [Spin(sample, agent, rank[time], time) for time, agent, sample in sorted(found)]
+        for scene, frames in times.items():
+            rank = {time: index for index, time in enumerate(sorted({time for time, _, _ in frames}))}
+            spins[scene] = [Spin(sample, agent, rank[time], time) for time, agent, sample in sorted(frames)]
             for one, other in pairwise(spins[scene]):
                 if (one.time_s, one.agent) == (other.time_s, other.agent):
                     raise InputError(
@@ -220,14 +225,14 @@ class NuscenesSource(LogSource):
         return spins, split_of
 
     def _read_notes(self, table: Mapping[str, Mapping[str, Row]]) -> None:
-        """Keep the annotations: boxes in the global frame by sample, with velocities by their instances."""
+        """Store the annotations: boxes in the global frame by sample, with velocities by their instances."""
         category = {
             token: self._at(table["category"], row, "category_token")["name"]
             for token, row in table["instance"].items()
         }
         attribute = {token: row["name"] for token, row in table["attribute"].items()}
         track, time_s, label, occlusion, numbers = [], array("d"), [], array("d"), array("d")
-        self._notes: dict[str, list[int]] = defaultdict(list)  # sample -> places of its annotations
+        self._notes: dict[str, list[int]] = defaultdict(list)  # sample -> indices of its annotations
         for number, row in enumerate(self._stream("sample_annotation")):
             self._notes[row["sample_token"]].append(number)
             track.append(row["instance_token"])
@@ -261,15 +266,16 @@ class NuscenesSource(LogSource):
     def _frame(self, scene: str, spin: Spin) -> LinkedFrame:
         data = self._data[spin.sample]
         calibration = self._calibration[spin.agent]
-        mounts, kind = calibration.agent_from_sensor, {name: self._kind(row) for name, row in data.items()}
+        mounts = calibration.agent_from_sensor
+        kind = {name: self._kind(row) for name, row in data.items()}
         poses = {name: _placed(self._at(self._pose, row, "ego_pose_token")) for name, row in data.items()}
         cameras = [name for name in data if kind[name] == "camera"]
         path = {name: self._root / row["filename"] for name, row in data.items()}
         ranging = sorted((name for name in data if kind[name] == "lidar"), key=lambda name: name != TOP)
         clouds = {name: read_nuscenes_points(path[name]) for name in ranging}
         radar = {name: decode_radar(read_pcd(path[name])) for name in data if kind[name] == "radar"}
-        own = self._notes[spin.sample]
-        boxes = self._boxes[own]
+        rows = self._notes[spin.sample]
+        boxes = self._boxes[rows]
         pictures = {
             name: LogPicture(
                 path[name],
@@ -289,12 +295,12 @@ class NuscenesSource(LogSource):
             assumed=calibration,
             lidar=clouds,
             annotations=annotate(
-                self._track[own].tolist(),
+                self._track[rows].tolist(),
                 boxes,
                 {name: (cloud, poses[name] @ mounts[name]) for name, cloud in clouds.items()},
                 view_boxes(boxes, pictures),
-                velocity=self._velocity[own],
-                occlusion=self._occlusion[own],
+                velocity=self._velocity[rows],
+                occlusion=self._occlusion[rows],
             ),
             images=link_pictures(files),
             radar=radar,
@@ -309,18 +315,18 @@ IMPORT = ImportFormat(NuscenesSource, ("v1.0-*/sample.json", "sample.json", "sam
 def _find_tables(folder: Path) -> Path:
     if (folder / "sample.json").is_file():
         return folder
-    found = sorted(path.parent for path in folder.glob("v1.0-*/sample.json"))
-    if not found:
+    folders = sorted(path.parent for path in folder.glob("v1.0-*/sample.json"))
+    if not folders:
         raise InputError(f"{folder}: no nuScenes tables; it holds no folder such as 'v1.0-mini' with a 'sample.json'")
-    if len(found) > 1:
+    if len(folders) > 1:
         raise InputError(
-            f"{folder}: several folders of tables, {', '.join(path.name for path in found)}: name one of them"
+            f"{folder}: several folders of tables, {', '.join(path.name for path in folders)}: name one of them"
         )
-    return found[0]
+    return folders[0]
 
 
 def _placed(row: Row) -> Array:
-    """Return the (4, 4) transform of a row's rotation, w x y z, and translation."""
+    """Return the transform (4, 4) [m] of a row's rotation, w x y z, and translation."""
     w, x, y, z = row["rotation"]
     matrix = np.eye(4)
     matrix[:3, :3] = Rotation.from_quat((x, y, z, w)).as_matrix()

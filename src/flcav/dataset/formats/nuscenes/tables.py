@@ -1,4 +1,4 @@
-"""nuScenes' tables as streams of rows: a table of gigabytes is never in memory as a whole."""
+"""nuScenes' tables as streams of rows, so that tables of gigabytes are never in memory as a whole."""
 
 import math
 import sys
@@ -17,7 +17,7 @@ from flcav.interface.wording import plural
 Row = Mapping[str, Any]  # column -> value
 
 CHUNK = 1 << 20  # characters read at a time
-COLUMNS = {  # what is read of each table
+COLUMNS = {  # required columns of each table
     "scene": ("name", "log_token", "first_sample_token"),
     "log": ("logfile", "vehicle"),
     "sample": ("timestamp", "scene_token"),
@@ -43,41 +43,43 @@ OPTIONAL = {
     "sample_data": ("width", "height", *LINKS),
     "sample_annotation": ("attribute_tokens", "visibility_token", *LINKS),
 }
-NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of so many numbers
+NUMBERS = {"translation": 3, "size": 3, "rotation": 4}  # columns of lists of numbers, with their length
 MODALITIES = ("lidar", "camera", "radar")
 BLANKS = " \t\n\r"
 
 
 class References:
-    """References of rows to rows that are not there: counted by table and column, with the first of each.
+    """References from rows to missing rows: counted by table and column, with the first of each.
 
-    Of LINKS only hashes are kept, eight bytes each, since tables have millions of rows.
+    Only hashes of LINKS are kept, eight bytes each, since tables have millions of rows.
     """
 
     def __init__(self) -> None:
-        self._lost: dict[tuple[str, str], list[str]] = {}  # table and column -> first token, and one for each other
+        self._lost: dict[
+            tuple[str, str], list[str]
+        ] = {}  # (table, column) -> the first token, and an entry per further one
 
     def check_links(self, rows: Iterable[Row], name: str, path: Path) -> Iterator[Row]:
-        """Yield the rows of a table without their LINKS; then count those that lead to no row, or back in time.
+        """Yield the rows of a table without their LINKS; then count links that lead to no row, or back in time.
 
-        Raises `InputError` where two rows have one token.
+        Raises `InputError` where two rows have the same token.
         """
         token, time = array("q"), array("q")
         links = {link: array("q") for link in LINKS}
         for row in rows:
             token.append(hash(row["token"]))
             time.append(row.get("timestamp", 0))
-            for link, own in links.items():
-                own.append(hash(row[link]) if row.get(link) else 0)
+            for link, hashes in links.items():
+                hashes.append(hash(row[link]) if row.get(link) else 0)
             yield {column: value for column, value in row.items() if column not in LINKS}
         known, times = np.array(token), np.array(time)
         order = np.argsort(known, kind="stable")
         if len(twins := np.flatnonzero(np.diff(known[order]) == 0)):
             one, other = order[twins[0] : twins[0] + 2].tolist()
             raise InputError(f"{path}: the rows {one} and {other} have one token; each row has its own")
-        for link, own in links.items():
-            linked = np.flatnonzero(np.array(own))
-            wanted = np.array(own)[linked]
+        for link, hashes in links.items():
+            linked = np.flatnonzero(np.array(hashes))
+            wanted = np.array(hashes)[linked]
             at = order[np.minimum(np.searchsorted(known[order], wanted), len(known) - 1)]
             there = known[at] == wanted
             self._lost.setdefault((name, link), []).extend(f"of row {row}" for row in linked[~there].tolist())
@@ -87,11 +89,11 @@ class References:
             )
 
     def miss(self, name: str, column: str, token: str) -> None:
-        """Count a reference of a table's row to no row."""
+        """Count a reference from a row of a table to a missing row."""
         self._lost.setdefault((name, column), []).append(shorten(token))
 
     def notes(self) -> Iterator[str]:
-        """Yield a sentence for each table and column with such references."""
+        """Yield a sentence for every table and column with such references."""
         for (name, column), lost in self._lost.items():
             link, _, timed = column.partition(" ")
             what = "leads back in time" if timed else "is the token of no row"
@@ -105,9 +107,9 @@ def keep_all(_row: Row) -> bool:
 
 
 def read_rows_by_token(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> dict[str, Row]:
-    """Return token -> row of a table, the rows that are `kept`.
+    """Return the rows of a table by token, those that are `kept`.
 
-    Raises `InputError` as `stream_table`, and where two rows have one token.
+    Raises `InputError` as `stream_table` does, and where two rows have the same token.
     """
     rows: dict[str, Row] = {}
     for row in stream_table(folder, name, kept):
@@ -117,7 +119,7 @@ def read_rows_by_token(folder: Path, name: str, kept: Callable[[Row], bool] = ke
 
 
 def stream_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all) -> Iterator[Row]:
-    """Yield the rows of the table `name` in `folder` that are `kept`, with token, COLUMNS and the OPTIONAL they have.
+    """Yield the rows of the table `name` in `folder` that are `kept`, with token, COLUMNS and their OPTIONAL columns.
 
     Raises `InputError` where the file is missing or no table, or a row lacks one of COLUMNS.
     """
@@ -126,21 +128,21 @@ def stream_table(folder: Path, name: str, kept: Callable[[Row], bool] = keep_all
         if not isinstance(row, dict) or not row.keys() >= set(wanted):
             lost = next(column for column in wanted if column not in row) if isinstance(row, dict) else "token"
             raise InputError(f"{path}: row {number} has no '{lost}'")
-        own = {column: row[column] for column in (*wanted, *also) if column in row}
-        if odd := [column for column, value in own.items() if not _fits(column, value)]:
-            raise InputError(f"{path}: row {number} has a '{odd[0]}' that is none: {shorten(own[odd[0]])}")
-        if kept(own):
-            yield {column: _share(value) if column.endswith("token") else value for column, value in own.items()}
+        columns = {column: row[column] for column in (*wanted, *also) if column in row}
+        if odd := [column for column, value in columns.items() if not _fits(column, value)]:
+            raise InputError(f"{path}: row {number} has a '{odd[0]}' that is none: {shorten(columns[odd[0]])}")
+        if kept(columns):
+            yield {column: _share(value) if column.endswith("token") else value for column, value in columns.items()}
 
 
 def _share(token: object) -> object:
-    """Return the one string that is equal to a token: it is in many rows, and once in memory."""
+    """Return the interned string equal to a token, which is in many rows but then only once in memory."""
     return sys.intern(token) if isinstance(token, str) else token
 
 
 def _stream_list(path: Path) -> Iterator[object]:
-    """Yield the elements of the JSON list in a file, one at a time; raises `InputError` where there is none."""
-    check_is_file(path, None)  # it is read in pieces
+    """Yield the elements of the JSON list in a file one by one; raises `InputError` where it holds none."""
+    check_is_file(path, None)  # without a limit of size, as it is read in pieces
     try:
         with path.open(encoding="utf-8-sig") as file:
             yield from _decode_list(file, path)
@@ -153,14 +155,15 @@ def _stream_list(path: Path) -> Iterator[object]:
 
 
 def _decode_list(file: TextIO, path: Path) -> Iterator[object]:
-    """Yield the elements of a JSON list; an element is taken once what follows it has been read, too."""
+    """Yield the elements of a JSON list; an element is complete once what follows it has been read, too."""
     decoder, text, more = JSONDecoder(), "", CHUNK
     while (read := file.read(CHUNK)) and not (text := read.lstrip(BLANKS)):
         pass
     if not text.startswith("["):
         read_json(path)
         raise InputError(f"{path}: not a table of nuScenes; a list of rows is wanted")
-    begin, at = True, 1
+    begin = True
+    at = 1
     while True:
         try:
             end = _skip(text, at)
@@ -170,7 +173,7 @@ def _decode_list(file: TextIO, path: Path) -> Iterator[object]:
                 if text[end : end + 1] not in (",", "]"):
                     raise JSONDecodeError("Expecting ',' delimiter", text, end)
                 yield element
-        except JSONDecodeError:  # the element may go on in what is not read yet
+        except JSONDecodeError:  # the element may continue in what is not read yet
             if not (read := file.read(more)):
                 raise
             text, at, more = text[at:] + read, 0, 2 * more
@@ -186,14 +189,14 @@ def _decode_list(file: TextIO, path: Path) -> Iterator[object]:
 
 
 def _skip(text: str, at: int) -> int:
-    """Return the place of the next character that is no white space."""
+    """Return the index of the next character that is not white space."""
     while at < len(text) and text[at] in BLANKS:
         at += 1
     return at
 
 
 def _fits(column: str, value: object) -> bool:
-    """Return whether a value can be one of a column of COLUMNS or OPTIONAL."""
+    """Return whether a value is valid in a column of COLUMNS or OPTIONAL."""
     if column in NUMBERS:
         return _are_numbers(value, NUMBERS[column]) and (column != "rotation" or _has_length_1(value))
     if column == "camera_intrinsic":

@@ -1,6 +1,6 @@
 """Export to nuScenes: tables, `samples` and `maps`, to be opened as version `v1.0-flcav`.
 
-A nuScenes scene has one vehicle, so each agent of a scene becomes a scene of its own. Every spin is a key frame. The
+A nuScenes scene has one vehicle, so that each agent of a scene becomes a separate scene. Every spin is a key frame. The
 global frame is the world frame, shifted so that the map's lower left corner is its origin.
 """
 
@@ -60,7 +60,7 @@ UNKNOWN_MARGIN_M = 120.0  # margin of the map around the agents where the town i
 
 
 def export_nuscenes(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write one nuScenes scene for each agent and scene of `dataset`: see `ExportFormat`."""
+    """Write one nuScenes scene per agent and scene of `dataset`: see `ExportFormat`."""
     split_of = split_scenes(dataset, options)
     tables = constant_rows()
     global_from_world = _write_map(dataset, out / MAP)
@@ -106,7 +106,7 @@ EXPORT = ExportFormat(export_nuscenes, ("validation", "calibration"))
 
 
 def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
-    """Return LiDAR -> elevations [rad] of its channels from the lowest; empty where the manifest has no rig."""
+    """Return the elevations [rad] of the channels, from the lowest, by LiDAR; empty where the manifest has no rig."""
     rig = dataset.manifest.recipe.get("pole_rig" if agent.startswith("pole") else "vehicle_rig")
     lidars = rig.get("lidars") if isinstance(rig, Mapping) else None
     elevations = {}
@@ -121,7 +121,7 @@ def _elevations(dataset: Dataset, agent: str) -> dict[str, Array]:
 
 
 def _write_map(dataset: Dataset, path: Path) -> Array:
-    """Write the map, all zero where the dataset's town is unknown; return the (4, 4) `global_from_world`."""
+    """Write the map, all zero where the dataset's town is unknown; return `global_from_world` (4, 4) [m]."""
     town = dataset.town()
     if town is None:
         positions = np.array([dataset.world_from_agent(i)[:2, 3] for i in range(len(dataset))])
@@ -140,14 +140,14 @@ UNDATED = "1970-01-01"  # date of capture: simulated time has none
 
 @dataclass
 class NuscenesScene:
-    """A nuScenes scene that collects table rows while frames are added, and writes their files."""
+    """A nuScenes scene under construction: it collects table rows as frames are added, and writes their files."""
 
     number: int  # of the scene, from 1
     scene: str  # its name in the dataset
     agent: str
     location: str
     out: Path
-    global_from_world: Array  # (4, 4)
+    global_from_world: Array  # (4, 4) [m]
     elevations: Mapping[str, Array]  # LiDAR -> elevations of its channels [rad]: see `encode_lidar`
     samples: list[Row] = field(default_factory=list)
     sensors: dict[str, Row] = field(default_factory=dict)  # by channel
@@ -164,7 +164,7 @@ class NuscenesScene:
         return f"scene-{self.number:04d}"
 
     def add(self, frame: Frame, velocity: Array) -> None:
-        """Write the files of a frame and add its rows; `velocity` is the agent's (3,), world frame [m/s].
+        """Write the files of a frame and add its rows; `velocity` (3,) is the agent's, world frame [m/s].
 
         Raises `InputError` where a camera distorts.
         """
@@ -209,14 +209,16 @@ class NuscenesScene:
             **_placed(ego_from_sensor),
             "camera_intrinsic": [] if picture is None else true.intrinsics[name].tolist(),
         }
-        own = token(self.name, channel, frame.index)
+        data_token = token(self.name, channel, frame.index)
         world_from_agent = frame.agent_at_trigger.get(name, frame.world_from_agent)
-        self.poses.append({"token": own, "timestamp": stamp, **_placed(self.global_from_world @ world_from_agent)})
+        self.poses.append(
+            {"token": data_token, "timestamp": stamp, **_placed(self.global_from_world @ world_from_agent)}
+        )
         self.data[channel].append(
             {
-                "token": own,
+                "token": data_token,
                 "sample_token": self.samples[-1]["token"],
-                "ego_pose_token": own,
+                "ego_pose_token": data_token,
                 "calibrated_sensor_token": token(self.name, channel),
                 "timestamp": stamp,
                 "fileformat": "png" if picture is not None else "pcd",
@@ -232,7 +234,8 @@ class NuscenesScene:
         return round(time_s * 1e6) + self.number
 
     def _add_annotations(self, frame: Frame) -> None:
-        truth, boxes = frame.annotations, frame.annotations.boxes
+        truth = frame.annotations
+        boxes = frame.annotations.boxes
         top, cloud = next(iter(frame.lidar.items()))
         lidar = count_readable_points(frame, top, cloud)
         radar = np.zeros_like(lidar)
@@ -242,7 +245,8 @@ class NuscenesScene:
         labelled, left_out = select_objects("nuScenes", boxes.label, CATEGORIES, {})  # imported datasets have others
         self.left_out.update(left_out)
         for i in np.flatnonzero(labelled).tolist():
-            track, category = str(truth.track[i]), str(boxes.label[i])
+            track = str(truth.track[i])
+            category = str(boxes.label[i])
             length, width, height = boxes.size[i].tolist()
             speed = float(np.linalg.norm(truth.velocity[i]))
             self.category[track] = category
@@ -262,7 +266,7 @@ class NuscenesScene:
             )
 
     def rows(self) -> dict[str, list[Row]]:
-        """Return table -> rows of the scene, and link consecutive rows (`prev`, `next`)."""
+        """Return the rows of the scene by table, and link consecutive rows (`prev`, `next`)."""
         for rows in (self.samples, *self.data.values(), *self.annotations.values()):
             link_rows(rows)
         scene = {

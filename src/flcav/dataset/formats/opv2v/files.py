@@ -1,9 +1,9 @@
 """OPV2V's files: poses in CARLA's left-handed frame, point clouds, and the YAML file of a frame.
 
-Poses are x, y, z [m], roll, yaw, pitch [degrees] (OpenCOOD's `transformation_utils.x_to_world`). V2X-Real has raw
+Poses are x, y, z [m], roll, yaw, pitch [degrees] (OpenCOOD's `transformation_utils.x_to_world`). V2X-Real has raw point
 clouds in the same frame.
 
-YAML files of OPV2V and V2X-Real were written by PyYAML's unsafe dumper, which names classes of Python. Of these only
+YAML files of OPV2V and V2X-Real were written by PyYAML's unsafe dumper, which names Python classes. Of these only
 NumPy's scalars and arrays are read, by their bytes; nothing is imported or called.
 """
 
@@ -26,12 +26,12 @@ from flcav.dataset.formats.reading import (
 )
 from flcav.geometry import Array, wrap_angle
 
-About = Mapping[str, Any]  # content of the file of a frame, its poses as (4, 4) `world_from_body`
+About = Mapping[str, Any]  # content of a frame's file, with poses as `world_from_body` (4, 4) [m]
 
 CAMERAS = ("camera0", "camera1", "camera2", "camera3", "cam1", "cam2", "cam3", "cam4")  # of OPV2V, of V2X-Real
 EGO = ("true_ego_pos", "true_ego_pose")  # likewise
-RADIANS = "radians"  # whether the angles of one of the poses are those of the other in radians
-SAME_RAD, OTHER_DEG = 0.02, 2.0  # yaws that are equal, and that differ
+RADIANS = "radians"  # whether the angles of one pose are those of the other, in radians
+SAME_RAD, OTHER_DEG = 0.02, 2.0  # tolerance of equal yaws, and difference of different ones
 EXACT = 1e-6  # rounding of a matrix's last row
 TAG = "tag:yaml.org,2002:"
 CODES = {"f2", "f4", "f8", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8"}
@@ -43,7 +43,7 @@ MIRRORED = np.diag((*MIRROR, 1.0))
 
 
 def carla_pose(world_from_body: Array) -> list[float]:
-    """Return OPV2V's [x, y, z [m], roll, yaw, pitch [degrees]], in CARLA's frame, of a (4, 4) `world_from_body`.
+    """Return OPV2V's pose [x, y, z [m], roll, yaw, pitch [degrees]], in CARLA's frame, of a `world_from_body` (4, 4).
 
     The body's axes are x ahead, y left, z up.
     """
@@ -52,9 +52,9 @@ def carla_pose(world_from_body: Array) -> list[float]:
 
 
 def from_carla(values: ArrayLike) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
+    """Return the `world_from_body` (4, 4) [m] of a pose x, y, z, roll, yaw, pitch: the inverse of `carla_pose`.
 
-    `values` may also be the (4, 4) matrix of that pose in CARLA's frame, OpenCOOD's `x_to_world`.
+    `values` may also be the matrix (4, 4) of that pose in CARLA's frame, OpenCOOD's `x_to_world`.
     """
     numbers = np.asarray(values, np.float64)
     if numbers.shape == (4, 4):
@@ -64,7 +64,7 @@ def from_carla(values: ArrayLike) -> Array:
 
 
 def encode_cloud(points: NDArray[np.float32]) -> bytes:
-    """Return a PCD file of (N, 4) x, y, z [m], intensity [0, 1], with y mirrored.
+    """Return a PCD file of points (N, 4), x, y, z [m], intensity [0, 1], with y mirrored to CARLA's frame.
 
     The intensity is the red channel of the colour, as in OPV2V.
     """
@@ -75,7 +75,7 @@ def encode_cloud(points: NDArray[np.float32]) -> bytes:
 
 
 class NumbersLoader(Loader):
-    """A safe YAML loader that also reads NumPy's numbers as PyYAML dumps them."""
+    """A safe YAML loader that also reads NumPy's numbers as dumped by PyYAML."""
 
 
 def read_about(stem: Path) -> About:
@@ -111,14 +111,14 @@ def read_about(stem: Path) -> About:
 
 
 def _check_numbers(values: Any, *shape: int) -> None:
-    """Raise `ValueError` where values are not numbers of that shape, one number for ()."""
+    """Raise ValueError where `values` are not numbers of that shape; () stands for one number."""
     numbers = np.array(values)
     if numbers.shape != shape or numbers.dtype.kind not in "iuf" or not (np.abs(numbers) < FARTHEST).all():
         raise ValueError(f"{shape[0]} numbers are wanted" if shape else "a number is wanted")
 
 
 def _read_pose(values: Any, name: str) -> Array:
-    """Return the (4, 4) `world_from_body` of a pose: x, y, z, roll, yaw, pitch, or a matrix in CARLA's frame."""
+    """Return the `world_from_body` (4, 4) of a pose: x, y, z, roll, yaw, pitch, or a matrix in CARLA's frame."""
     matrix = np.shape(values) == (4, 4)
     try:
         _check_numbers(values, *((4, 4) if matrix else (6,)))
@@ -136,7 +136,7 @@ def _read_pose(values: Any, name: str) -> Array:
 
 
 def _differ_as_radians(one: Any, other: Any) -> bool:
-    """Return whether of two poses of 6 numbers the yaw of one is that of the other in radians."""
+    """Return whether, for two poses of 6 numbers, one yaw is the other in radians."""
     if np.shape(one) != (6,) or np.shape(other) != (6,):
         return False
     yaws = float(one[4]), float(other[4])
@@ -147,7 +147,7 @@ def _differ_as_radians(one: Any, other: Any) -> bool:
 
 
 def _read_parts(loader: Any, node: yaml.Node) -> list[Any]:
-    """Return what a dumped object is made of: the items of a sequence, or a mapping's `args` and its `state`."""
+    """Return the parts of a dumped object: the items of a sequence, or a mapping's `args` and `state`."""
     if isinstance(node, yaml.MappingNode):
         parts = loader.construct_mapping(node, deep=True)
         return [*parts.get("args", ()), parts.get("state")]
@@ -188,9 +188,9 @@ NumbersLoader.add_constructor(f"{TAG}python/tuple", _read_parts)
 
 
 def read_raw_cloud(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a raw cloud with y to the right.
+    """Return points (N, 4) of a raw cloud with y to the right: x ahead, y left, z [m], intensity [0, 1].
 
-    Points that are not finite are left out; intensities may reach 255. Raises `InputError` for other files.
+    Points that are not finite are left out; intensities in the file may reach 255. Raises `InputError` for other files.
     """
     data = read_file(path)
     if not data or len(data) % (4 * POINT):
@@ -203,7 +203,7 @@ def read_raw_cloud(path: Path) -> NDArray[np.float32]:
 
 
 def read_cloud(path: Path) -> NDArray[np.float32]:
-    """Return (N, 4) x ahead, y left, z [m], intensity [0, 1] of a PCD file, whose red channel the intensity is."""
+    """Return points (N, 4) of a PCD file: x ahead, y left, z [m], intensity [0, 1] from the red channel."""
     rows = read_pcd(path)
     try:
         x, y, z, colour = (rows[name] for name in ("x", "y", "z", "rgb"))

@@ -1,9 +1,9 @@
 """Reading of OPV2V, as OpenCOOD reads it: scenarios of several agents in CARLA's left-handed frames.
 
-OPV2V has one class, vehicle, which is read as car; no times, but spins at 10 Hz; of a velocity the speed, along the
-heading. V2X-Real (Xiang et al., ECCV 2024) has its files, but raw point clouds, JPEG pictures and classes: its code
-takes clouds and poses as left-handed, too. Sensors' poses are those in the world: mounts are those of the agent's first
-frame.
+OPV2V has a single class, vehicle, which is read as car; it has no times, but spins at 10 Hz, and for velocities only
+the speed, along the heading. V2X-Real (Xiang et al., ECCV 2024) has its files, but raw point clouds, JPEG pictures and
+classes: its code takes clouds and poses as left-handed, too. Sensor poses in the files are in the world frame: mounts
+are derived from the agent's first frame.
 """
 
 import re
@@ -52,9 +52,9 @@ from flcav.sensors.lens import BODY_FROM_OPTICAL
 
 PERIOD_S = 0.1
 LIDAR, CATEGORY = "lidar", "car"
-CATEGORIES = {"policecar": "car", "longvehicle": "car", "motorcyle": "motorcycle"}  # V2X-Real's with another name here
+CATEGORIES = {"policecar": "car", "longvehicle": "car", "motorcyle": "motorcycle"}  # V2X-Real's, named otherwise here
 CLOUDS, PICTURES = (".pcd", ".bin"), (".png", ".jpeg", ".jpg")
-DIGITS = 9  # of mounts, which are computed of poses
+DIGITS = 9  # decimals of mounts, which are computed from poses
 PROTOCOL = "data_protocol.yaml"
 
 
@@ -68,61 +68,65 @@ class Opv2vShot(NamedTuple):
 
 
 class Opv2vSource(LogSource):
-    """The scenarios of a folder: one of a split, a split of scenarios, or the folder of splits."""
+    """The scenarios in a folder: a single one, a split of scenarios, or a folder of splits."""
 
     FORMAT = "opv2v"
 
     def __init__(self, folder: Path, split: str | None = None) -> None:
-        """Raises `InputError` where there is no scenario, none of `split`, or a file of a frame is missing."""
+        """Open the scenarios; raises `InputError` where there is none, none of `split`, or a file of one is missing."""
         self.folder, self.split = folder, split
-        self.folders = found = _find_scenarios(folder)
-        split_of = {scene: _split_of(path) for scene, path in found.items()}
+        self.folders = folders = _find_scenarios(folder)
+        split_of = {scene: _split_of(path) for scene, path in folders.items()}
         self.split_of = {scene: split_of[scene] for scene in choose_split(folder, split_of, split)}
         self._calibration: dict[str, Calibration] = {}
         self._track: dict[str, dict[str, str]] = {}
         names = AgentNames()
-        self._blind: dict[str, list[str]] = {}  # agent -> its cameras of which there is no picture
+        self._blind: dict[str, list[str]] = {}  # agent -> its cameras without any picture
         self._frames = 0  # in the folder
-        self._lost, self._unseen = list[str](), list[str]()  # frames without a file, pictures that are not there
+        self._lost, self._unseen = list[str](), list[str]()  # incomplete frames, and missing pictures
         self._pairs = PosePairs(f"'lidar_pose' and '{EGO[0]}'")
-        self._shots = {scene: self._open(scene, found[scene], names) for scene in self.split_of}
+        self._shots = {scene: self._open(scene, folders[scene], names) for scene in self.split_of}
         agents, frames = plural(len(self._calibration), "agent"), plural(self._frames, "frame")
         if not self._calibration:
             raise InputError(f"{folder}: none of {frames} has both a YAML file and a point cloud")
-        blind, dark = len(self._blind), len({path.rpartition("_")[0] for path in self._unseen})
-        cameras = name_some([f"{camera} of {agent}" for agent, own in self._blind.items() for camera in own])
-        told = {
+        blind = len(self._blind)
+        dark = len({path.rpartition("_")[0] for path in self._unseen})
+        cameras = name_some([f"{camera} of {agent}" for agent, blinded in self._blind.items() for camera in blinded])
+        notes = {
             f"no pictures of a camera of {blind} of {agents}, so no images of it: {cameras}": blind,
             f"left out {len(self._lost)} of {frames}: no YAML file or no point cloud of {name_some(self._lost)}": len(
                 self._lost
             ),
             f"no picture of a camera of {dark} of {frames}, so no image there: {name_some(self._unseen)}": dark,
         }
-        self._lacking = self.notes = tuple(note for note, count in told.items() if count)
+        self._lacking = self.notes = tuple(note for note, count in notes.items() if count)
 
     def _open(self, scene: str, folder: Path, names: AgentNames) -> list[Opv2vShot]:
         known = self._track[scene] = _read_names(folder / PROTOCOL)
-        found = {path: self._list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
-        rank = {spin: number for number, spin in enumerate(sorted({int(s) for own, _ in found.values() for s in own}))}
+        stamps_of = {path: self._list_stamps(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+        rank = {
+            spin: number
+            for number, spin in enumerate(sorted({int(s) for stamps, _ in stamps_of.values() for s in stamps}))
+        }
         shots = []
-        for path, (own, pictured) in found.items():
-            if own:
+        for path, (stamps, pictured) in stamps_of.items():
+            if stamps:
                 kind = "pole" if path.name.startswith("-") else "cav"
                 vehicle = known.get(path.name, f"{kind}{path.name.lstrip('-')}")
-                calibration = _calibrate(path / own[0])
+                calibration = _calibrate(path / stamps[0])
                 lidar, cameras = calibration.agent_from_sensor[LIDAR] + 0.0, calibration.intrinsics  # no -0.0
                 agent = names.of(vehicle, (lidar.tobytes(), *((name, cameras[name].tobytes()) for name in cameras)))
                 self._calibration.setdefault(agent, calibration)
                 if lacking := sorted(cameras.keys() - pictured):
                     self._blind[agent] = lacking
-                shots += [Opv2vShot(path / stamp, agent, int(stamp), rank[int(stamp)] * PERIOD_S) for stamp in own]
+                shots += [Opv2vShot(path / stamp, agent, int(stamp), rank[int(stamp)] * PERIOD_S) for stamp in stamps]
         return sorted(shots, key=lambda shot: (shot.spin, shot.agent))
 
     def _list_stamps(self, folder: Path) -> tuple[list[str], set[str]]:
-        """Return the times of an agent's whole frames, in order, and its cameras that the folder has pictures of.
+        """Return the time stamps of an agent's complete frames, in order, and its cameras that have pictures.
 
-        A whole frame has a YAML file and a point cloud; others are noted, and so are pictures that are not there.
-        Raises `InputError` where two frames have one number.
+        A complete frame has a YAML file and a point cloud; others are noted, and so are missing pictures. Raises
+        `InputError` where two frames have the same number.
         """
         names = {path.name for path in folder.iterdir()}
         stems = {re.split(r"[_.]", name, maxsplit=1)[0] for name in names}
@@ -134,7 +138,7 @@ class Opv2vSource(LogSource):
             stamp for stamp in stamps if f"{stamp}.yaml" in names and any(f"{stamp}{end}" in names for end in CLOUDS)
         ]
         pictured = {camera: {s for s in whole if _picture(folder / s, camera) is not None} for camera in CAMERAS}
-        cameras = {camera for camera, own in pictured.items() if own}
+        cameras = {camera for camera, stamped in pictured.items() if stamped}
         place = "/".join((folder.parent.name, folder.name))
         self._frames += len(stamps)
         self._lost += [f"{place}/{stamp}" for stamp in stamps if stamp not in whole]
@@ -152,7 +156,8 @@ class Opv2vSource(LogSource):
             self.notes = (*self._lacking, *self._pairs.notes())
 
     def _frame(self, scene: str, shot: Opv2vShot) -> LinkedFrame:
-        calibration, about = self._calibration[shot.agent], read_about(shot.stem)
+        calibration = self._calibration[shot.agent]
+        about = read_about(shot.stem)
         mounts = calibration.agent_from_sensor
         world_from_lidar = about["lidar_pose"]
         world_from_agent = world_from_lidar @ inverse(mounts[LIDAR])
@@ -206,7 +211,7 @@ def _read_points(stem: Path) -> NDArray[np.float32]:
 
 
 def _calibrate(stem: Path) -> Calibration:
-    """Return the calibration of an agent by its first frame: poses of sensors in its frame."""
+    """Return the calibration of an agent by its first frame: sensor poses in the agent frame."""
     about = read_about(stem)
     agent_from_world = inverse(about[EGO[0]])
     cameras = [name for name in CAMERAS if name in about]
@@ -220,7 +225,7 @@ def _calibrate(stem: Path) -> Calibration:
 
 
 def _read_vehicles(about: About) -> tuple[Boxes, Array]:
-    """Return the boxes of a frame's vehicles, world frame, and their (M, 3) velocities."""
+    """Return the boxes of a frame's vehicles, world frame, and their velocities (M, 3) [m/s]."""
     rows = list(about["vehicles"].values())
     placed = [from_carla([*np.add(row["location"], row["center"]), *row["angle"]]) for row in rows]
     poses = np.array(placed).reshape(-1, 4, 4)
@@ -235,7 +240,7 @@ def _read_vehicles(about: About) -> tuple[Boxes, Array]:
 
 
 def _read_names(path: Path) -> dict[str, str]:
-    """Return number -> name of agents and tracks by an export's `data_protocol.yaml`; empty of any other."""
+    """Return the names of agents and tracks by number, from an export's `data_protocol.yaml`; else empty."""
     if not path.is_file():
         return {}
     protocol = read_yaml(path)
@@ -244,7 +249,7 @@ def _read_names(path: Path) -> dict[str, str]:
 
 
 def _picture(stem: Path, camera: str) -> Path | None:
-    """Return the picture of a camera, None where there is none, or an empty file: V2X-Real has one."""
+    """Return the picture of a camera; None where it is missing or an empty file, as one in V2X-Real is."""
     paths = (stem.with_name(f"{stem.name}_{camera}{suffix}") for suffix in PICTURES)
     return next((path for path in paths if path.is_file() and path.stat().st_size), None)
 
@@ -254,14 +259,14 @@ def _find_cloud(stem: Path) -> Path | None:
 
 
 def _find_scenarios(folder: Path) -> dict[str, Path]:
-    """Return name -> folder of the scenarios in `folder`: folders of agents, which hold a YAML file for each frame."""
+    """Return the folders of the scenarios in `folder`, by name: folders of agents with a YAML file per frame."""
     for depth in ("*/*.yaml", "*/*/*.yaml", "*/*/*/*.yaml"):
         if frames := [path for path in folder.glob(depth) if path.stem.isdigit()]:
-            found = sorted({path.parent.parent for path in frames})
-            return name_folders(found)
+            scenarios = sorted({path.parent.parent for path in frames})
+            return name_folders(scenarios)
     raise InputError(f"{folder}: no scenario of OPV2V; agents' folders with a YAML file for each frame are wanted")
 
 
 def _split_of(scenario: Path) -> str | None:
     name, _ = name_place(scenario)
-    return {own: split for split, own in FOLDERS.items()}.get(name, "test" if name.startswith("test") else None)
+    return {folder: split for split, folder in FOLDERS.items()}.get(name, "test" if name.startswith("test") else None)

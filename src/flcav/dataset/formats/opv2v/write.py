@@ -1,7 +1,7 @@
 """Export to OPV2V, as OpenCOOD reads it: `<split>/<scenario>/<agent>/<time>.yaml`, `.pcd`, `_camera0.png`.
 
 All frames are CARLA's left-handed ones (y to the right); poses are x, y, z [m], roll, yaw, pitch [degrees]. Agents and
-vehicles are numbered in one list. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `transformation_utils.x_to_world`.
+vehicles share one numbering. Xu et al., OPV2V, ICRA 2022; OpenCOOD's `transformation_utils.x_to_world`.
 """
 
 from collections import Counter, defaultdict
@@ -51,20 +51,21 @@ class Opv2vVehicle(TypedDict):
     """A vehicle in OPV2V's file of a frame."""
 
     angle: list[float]  # roll, yaw, pitch [degrees]
-    center: list[float]  # of the box, from `location` [m]
+    center: list[float]  # of the box, relative to `location` [m]
     extent: list[float]  # half length, width, height [m]
     location: list[float]  # x, y, z of the ground centre [m]
     speed: float  # [km/h]
 
 
 def export_opv2v(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
-    """Write one scenario for each scene of `dataset`: see `ExportFormat`.
+    """Write one scenario per scene of `dataset`: see `ExportFormat`.
 
-    Spins that not every agent of a scene has are left out.
+    Spins that some agent of a scene lacks are left out.
     """
     split_of = split_with_validation(dataset, options, "OPV2V")
     exported = Exported(Counter(scenarios=0, frames=0, objects=0))
-    counts, done = exported.counts, 0
+    counts = exported.counts
+    done = 0
     for split in ("train", "val") if "train" in split_of.values() else ():
         (out / FOLDERS[split]).mkdir()
     for scene, split in split_of.items():
@@ -100,7 +101,7 @@ EXPORT = ExportFormat(export_opv2v, ("validation", "min_points", "calibration"))
 
 
 def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
-    """Return the spins that every agent of a scene has; a recording limited to a number of frames may end in others.
+    """Return the spins common to all agents of a scene: a recording with a limit of frames may end within a spin.
 
     Raises `InputError` where there is none.
     """
@@ -114,7 +115,7 @@ def _shared_spins(dataset: Dataset, scene: str) -> set[int]:
 
 
 def agent_numbers(agents: list[str]) -> dict[str, int]:
-    """Return agent -> number; vehicles sort before poles, since OpenCOOD takes the first agent as the ego vehicle."""
+    """Return numbers by agent; vehicles sort before poles, since OpenCOOD takes the first agent as the ego vehicle."""
     cars = [agent for agent in agents if not agent.startswith("pole")]
     poles = [agent for agent in agents if agent.startswith("pole")]
     return {
@@ -157,18 +158,19 @@ def _write_frame(frame: Frame, folder: Path, vehicles: dict[int, Opv2vVehicle], 
 def _vehicles(
     frame: Frame, numbers: dict[str, int], min_points: int
 ) -> tuple[dict[int, Opv2vVehicle], Counter[LeftOut]]:
-    """Return number -> OPV2V's box of each vehicle with at least `min_points` points of the first LiDAR in its box.
+    """Return OPV2V's boxes, by number, of vehicles with at least `min_points` points of the first LiDAR in the box.
 
     Other actors are counted by reason.
     """
-    truth, boxes = frame.annotations, frame.annotations.boxes
+    truth = frame.annotations
+    boxes = frame.annotations.boxes
     few = count_readable_points(frame, *next(iter(frame.lidar.items()))) < min_points
     labelled, left_out = select_objects("OPV2V", boxes.label, VEHICLES, {lacks_points(min_points): few})
     vehicles: dict[int, Opv2vVehicle] = {}
     for i in np.flatnonzero(labelled):
         tall = boxes.size[i, 2]
         placed = boxes.pose(int(i))
-        placed[2, 3] -= tall / 2  # below the centre, upright too where the box leans: OpenCOOD adds the two unturned
+        placed[2, 3] -= tall / 2  # straight down, also where the box leans: OpenCOOD adds location and center unrotated
         x, y, z, *rotation = carla_pose(placed)
         vehicles[numbers[str(truth.track[i])]] = {
             "angle": rotation,
