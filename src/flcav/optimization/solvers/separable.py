@@ -5,7 +5,8 @@
 At multipliers lambda >= 0, x_j is the point at which its marginal gain equals its price p_j = sum_l cost_jl lambda_l,
 or a bound (water-filling). For a single power it is (a b / p)^(1 / (b + 1)) - x0; for several, Newton's method finds
 it, starting from the largest of the single powers' points. The dual function is concave in the multipliers, and its
-gradient is the overspend. All steps are vectorised over the quantities. `solve_two_budgets` is for two budgets, the rest for any.
+gradient is the overspend. All steps are vectorised over the quantities. `solve_two_budgets` is for two budgets,
+the rest for any.
 """
 
 from dataclasses import dataclass
