@@ -47,7 +47,7 @@ class Warmth(NamedTuple):
 
     sun_k: float = 10.0  # warming when facing a clear sun at noon [K]
     sky_k: float = 4.0  # cooling under a clear night sky [K]
-    emissivity: float = 0.94
+    emissivity: float = 0.94  # thermal radiation relative to that of a black body, 0 to 1
     moving_k: float = 0.0  # warming while its vehicle moves [K]
     body_c: float | None = None  # surface temperature of people in any weather [deg C]
 

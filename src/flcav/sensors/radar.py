@@ -184,7 +184,7 @@ def detect_cells(cells: Cells, radar: Radar, rain_mm_h: float, rng: np.random.Ge
 
 
 def false_alarms(radar: Radar, rain_mm_h: float, rng: np.random.Generator) -> Array:
-    """Draw false alarms (M, 5), as in `detect_cells`: a Poisson number of them, at uniformly random places."""
+    """Draw false alarms (M, 5), with the columns of `detect_cells`: a Poisson number, at uniformly random places."""
     low, high = radar.extent().T
     cells = np.prod(np.ceil((high - low) / radar.resolution()))
     count = rng.poisson(cells * radar.false_alarm_rate)

@@ -120,7 +120,7 @@ class Hull(NamedTuple):
 
 @lru_cache(maxsize=256)
 def hull(category: str, shape: int, size: tuple[float, ...] | None = None) -> Hull:
-    """Return the convex hull of an actor's mesh, body frame: see `actor_mesh`."""
+    """Compute the convex hull of an actor's mesh, body frame [m]: see `actor_mesh`."""
     vertices = actor_mesh(category, shape, size).vertices.astype(np.float64)
     convex = ConvexHull(vertices)
     rows = np.searchsorted(convex.vertices, convex.simplices, sorter=(order := np.argsort(convex.vertices)))

@@ -178,7 +178,7 @@ def make_transform(pose: Array, frame: MapFrame) -> "carla.Transform":
 
 
 def read_vector(vector: "carla.Vector3D") -> Array:
-    """Convert a CARLA vector to an array (3,) in right-handed axes."""
+    """Convert a CARLA vector to an array (3,) in right-handed axes; the unit stays the same."""
     return mirror(np.array((vector.x, vector.y, vector.z)))
 
 

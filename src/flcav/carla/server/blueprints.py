@@ -64,8 +64,8 @@ class Field(NamedTuple):
 
     type: int
     default: str
-    low: float
-    high: float
+    low: float  # least value, in CARLA's unit of the attribute
+    high: float  # largest value
 
 
 def _read_fields(served: str) -> dict[str, dict[str, Field]]:

@@ -143,30 +143,30 @@ class EpisodeSettings(NamedTuple):
 
 
 class WeatherParameters(NamedTuple):
-    """CARLA's weather: percentages, degrees and metres."""
+    """CARLA's weather; percentages are from 0 to 100."""
 
-    cloudiness: float = 0.0
-    precipitation: float = 0.0
-    precipitation_deposits: float = 0.0
-    wind_intensity: float = 0.0
-    sun_azimuth_angle: float = 0.0
-    sun_altitude_angle: float = 0.0
-    fog_density: float = 0.0
-    fog_distance: float = 0.0
-    fog_falloff: float = 0.0
-    wetness: float = 0.0
+    cloudiness: float = 0.0  # [%]
+    precipitation: float = 0.0  # rain [%]
+    precipitation_deposits: float = 0.0  # puddles [%]
+    wind_intensity: float = 0.0  # [%]
+    sun_azimuth_angle: float = 0.0  # [deg]
+    sun_altitude_angle: float = 0.0  # elevation, from -90 to 90 [deg]
+    fog_density: float = 0.0  # [%]
+    fog_distance: float = 0.0  # distance at which fog begins [m]
+    fog_falloff: float = 0.0  # decrease of the density of fog with height, from 0 on
+    wetness: float = 0.0  # of roads [%]
     scattering_intensity: float = 0.0
     mie_scattering_scale: float = 0.0
     rayleigh_scattering_scale: float = 0.0331
-    dust_storm: float = 0.0
+    dust_storm: float = 0.0  # [%]
 
 
 class VehicleControl(NamedTuple):
-    """The control of a vehicle; throttle and brake are 0 to 1."""
+    """The control of a vehicle."""
 
-    throttle: float = 0.0
+    throttle: float = 0.0  # 0 to 1
     steer: float = 0.0  # -1 to 1, positive to the right
-    brake: float = 0.0
+    brake: float = 0.0  # 0 to 1
     hand_brake: bool = False
     reverse: bool = False
     manual: bool = False
@@ -402,12 +402,12 @@ def pack_sign(sign: str) -> bytes:
 
 
 def pack_image(width: int, height: int, fov_deg: float, bgra: NDArray[np.uint8]) -> bytes:
-    """Serialise an image (H, W, 4) of blue, green, red and alpha."""
+    """Serialise an image (H, W, 4) of blue, green, red and alpha, and its horizontal field of view [deg]."""
     return struct.pack("<IIf", width, height, fov_deg) + bgra.tobytes()
 
 
 def pack_lidar(angle_rad: float, per_channel: NDArray[np.integer], points: NDArray[Any]) -> bytes:
-    """Serialise a LiDAR sweep: points channel by channel, as rows of float32 or of `SEMANTIC_POINT`."""
+    """Serialise a LiDAR sweep: points by channel, as rows of float32 (x, y, z [m], intensity) or `SEMANTIC_POINT`."""
     return struct.pack("<fI", angle_rad, len(per_channel)) + per_channel.astype("<u4").tobytes() + points.tobytes()
 
 
