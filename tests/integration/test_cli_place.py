@@ -80,6 +80,27 @@ def test_a_certificate_is_verified_and_one_that_does_not_hold_is_exit_1(files, b
 
 
 @pytest.mark.parametrize(
+    ("limit", "told"),
+    [
+        (
+            ("--cover", 1),
+            "its dual alone proves 1.5; sums of the costs below 2 are at most 1, so that nothing better exists",
+        ),
+        (("--count", 1), "its dual alone proves 2, a gap of"),
+    ],
+)
+def test_where_sums_are_whole_numbers_a_gap_is_not_told_beside_an_optimum(limit, told, files, capsys):
+    """Each of three poles covers two of three points: fractions of poles cover all with one and a half."""
+    files[0].write_text("x,y,z\n0,0,0\n10,0,0\n5,8,0\n")
+    files[1].write_text("id,x,y,z\n1,5,0,0\n2,2.5,4,0\n3,7.5,4,0\n")
+    assert called("place", "--errors", files[0], "--poles", files[1], "--range", 5.5, *limit, "--verify") == 0
+    said = capsys.readouterr().out
+    assert "(optimal)" in said
+    assert told in said
+    assert "the solver's word" not in said
+
+
+@pytest.mark.parametrize(
     ("errors", "change", "named"),
     [
         ("x,y\n0,0\n", {}, "'z'"),

@@ -43,6 +43,7 @@ class Edge:
     end: str  # id of the junction it leads to; empty inside a junction
     type: str  # street type of the town's parameters
     lanes: tuple[Lane, ...]  # from the kerb to the middle of the road
+    name: str = ""  # of the street; empty where the net has none
 
     def lanes_of(self, kind: str) -> tuple[Lane, ...]:
         """Return the lanes of a kind, from the kerb to the middle."""
@@ -158,7 +159,8 @@ def _edge(row: ElementTree.Element) -> Edge:
         )
         for lane in row.iterfind("lane")
     )
-    return Edge(row.attrib["id"], function, row.get("from", ""), row.get("to", ""), row.get("type", ""), lanes)
+    ends = (row.get("from", ""), row.get("to", ""))
+    return Edge(row.attrib["id"], function, *ends, row.get("type", ""), lanes, row.get("name", ""))
 
 
 def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
