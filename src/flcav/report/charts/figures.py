@@ -17,12 +17,19 @@ EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of 
 
 @style.styled
 def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
-    """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles."""
+    """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles.
+
+    It has a title, coordinates, a scale bar, and the names of the streets that have one.
+    """
     x_low, y_low, x_high, y_high = scene.town.bounds
     bar = 0.9 if scene.heat else 0.0  # [inch] beside the map
-    figure = style.canvas(width_in + bar, width_in * (y_high - y_low) / (x_high - x_low) + 0.8)
+    beside = 0.9 + bar  # coordinates on both sides
+    figure = style.canvas(width_in + beside, width_in * (y_high - y_low) / (x_high - x_low) + 1.2)
     axes = figure.add_subplot()
     maps.draw_errors(axes, scene)
+    maps.draw_street_names(axes, scene)
+    maps.draw_coordinates(axes, scene.town)
+    axes.set_title(scene.title, fontweight="bold")
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=ACROSS)
     return figure
 

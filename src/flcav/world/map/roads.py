@@ -3,11 +3,13 @@
 Format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 """
 
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -184,6 +186,20 @@ def _number(text: str) -> float:
     if not abs(value) <= FARTHEST_M:
         raise ValueError(f"{shorten(text)} is no place in a town")
     return value
+
+
+EDGE = re.compile(r'(<edge id="([^":]+)"(?: from="[^"]*")?(?: to="[^"]*")?)')
+
+
+def name_streets(net: Path, name_of: Callable[[str], str]) -> None:
+    """Write into a net file the names of streets: `name_of` an edge's id, "" where it has none."""
+
+    def add(found: re.Match[str]) -> str:
+        name = name_of(found[2])
+        return f"{found[0]} name={quoteattr(name)}" if name else found[0]
+
+    text = net.read_text(encoding="utf-8")
+    net.write_text(EDGE.sub(add, text), encoding="utf-8")
 
 
 SHORTEST_M = 20.0  # a route begins on a lane that is longer

@@ -58,7 +58,7 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     kept: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
     added = False
     for row in rows:
-        road = _road(row.attrib["id"], document)
+        road = find_road(row.attrib["id"], document)
         lanes = _lanes(row, road, add)
         if not any(lane.kind == "driving" for lane in lanes):
             edges.getroot().remove(row)
@@ -103,7 +103,7 @@ def _write_widths(rows: list[ElementTree.Element], net: RoadNet) -> None:
             ElementTree.SubElement(row, "lane", {**lane, "index": str(i), "width": f"{exact:.2f}"})
 
 
-def _road(edge: str, document: Document) -> RoadType:
+def find_road(edge: str, document: Document) -> RoadType:
     """Return the road of an edge, which netconvert names by the road's id with a sign before and a section behind.
 
     A road that ends where it begins is cut: "1#0", "1#1".

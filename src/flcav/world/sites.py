@@ -1,17 +1,21 @@
 """Candidate sites of roadside sensors beside the streets of any town, and the names of its streets."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import shapely
 from scipy.spatial import KDTree
 from shapely.geometry import LineString
 
 from flcav.arrays import Array
+from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.parameters import PoleParameters, StreetParameters
 from flcav.world.map.roads import CARRIAGEWAY, Edge, read_net
 from flcav.world.map.street_furniture import Verge
 from flcav.world.map.town import BESIDE_BRIDGE_M, Town
 
 MOUNT_M: float = PoleParameters.model_fields["height_m"].default  # height of a mount above the ground
+NEAR_M = 25.0  # from a site to the middle of the street that it stands at
 BESIDE_M = 0.35  # from the outer edge of the carriageway to a site
 
 
@@ -53,6 +57,37 @@ def measure_streets(town: Town, *, bare: bool = False) -> float:
         if edge.lanes_of("driving") and not (bare and edge.lanes_of("sidewalk")):
             length.setdefault(frozenset((edge.start, edge.end)), LineString(edge.lanes_of("driving")[0].shape).length)
     return sum(length.values())
+
+
+@dataclass(frozen=True)
+class Located:
+    """Where a site is."""
+
+    x: float  # [m, world]
+    y: float
+    z: float
+    latitude: float  # [deg, WGS 84], by the town's geo-reference
+    longitude: float
+    street: str | None  # name of the street that it stands at; None: it has none
+
+    def __str__(self) -> str:
+        """Return the place in words."""
+        street = "" if self.street is None else f", {self.street}"
+        return (
+            f"x {self.x:.1f}, y {self.y:.1f} m (latitude {self.latitude:.6f}, longitude {self.longitude:.6f}){street}"
+        )
+
+
+def locate_sites(town: Town, sites: Array) -> list[Located]:
+    """Return where the `sites` (N, 3) [m, world] are: coordinates, and the nearest named street within `NEAR_M`."""
+    named = [(name, shapely.MultiLineString(lines)) for name, lines in list_street_names(town).items()]
+    found = []
+    for site in sites:
+        apart = [(line.distance(shapely.Point(site[:2])), name) for name, line in named]
+        street = next((name for far, name in sorted(apart)[:1] if far <= NEAR_M), None)
+        (latitude, longitude, _), (x, y, z) = convert_to_geodetic(town.geo, site).tolist(), site.tolist()
+        found.append(Located(x, y, z, latitude, longitude, street))
+    return found
 
 
 def list_street_names(town: Town) -> dict[str, list[Array]]:
