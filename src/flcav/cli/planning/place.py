@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flcav.world.trace import Trace
 
 MAP_IN = 6.4  # width of the map [inch]
-LISTED = 30  # candidates: of more than these only those that are placed are listed
+LISTED = 20  # candidates: of more than these only those that are placed are listed
 
 
 @answer_json

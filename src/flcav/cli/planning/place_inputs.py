@@ -118,7 +118,7 @@ def read_given(
         check_inside(town, placed.xyz, sites.xyz, (errors, poles or "poles"), (placed.degrees, sites.degrees))
         x_low, y_low, x_high, y_high = town.bounds
         out = ((placed.xyz[:, :2] < (x_low, y_low)) | (placed.xyz[:, :2] > (x_high, y_high))).any(axis=1)
-        notes.append(f"{errors}: {out.sum()} of {len(out)} lie outside {town.name}" if out.any() else "")
+        notes.append(f"{errors}: {out.sum()} of {len(placed.xyz)} lie outside {town.name}" if out.any() else "")
     names, ranges, sensor_cost = (None,), np.array([range_m], np.float64), np.zeros(1)
     if sensors is not None:
         kinds = _read(sensors, SENSORS, SENSORS)
