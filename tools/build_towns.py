@@ -22,6 +22,8 @@ from xml.sax.saxutils import quoteattr
 
 import sumo  # pyright: ignore[reportMissingImports]  (scratch environment only)
 
+from flcav.world.map.roads import name_streets
+
 TOWNS = Path(__file__).parents[1] / "src/flcav/world/towns"
 MAPS = Path(__file__).parents[1] / "recipes/maps"
 Point = tuple[float, float]
@@ -48,6 +50,7 @@ class Sketch:
     edges: list[str] = field(default_factory=list)
     connections: list[str] = field(default_factory=list)
     roundabouts: list[str] = field(default_factory=list)
+    names: dict[str, str] = field(default_factory=dict)  # of streets, by edge
 
     def node(self, name: str, at: Point, kind: str = "priority") -> None:
         """Add a junction at `at` [m]; `kind`: a SUMO node type."""
@@ -69,6 +72,11 @@ class Sketch:
         """Add both directions of a street; the edges are named `start_end` and `end_start`."""
         self.edge(f"{start}_{end}", start, end, kind, via)
         self.edge(f"{end}_{start}", end, start, kind, via[::-1])
+
+    def name(self, street: str, *nodes: str) -> None:
+        """Give the street along the nodes a name, in both directions."""
+        for start, end in pairwise(nodes):
+            self.names |= {f"{start}_{end}": street, f"{end}_{start}": street}
 
     def turning_loop(self, end: str, start: str, kind: str, radius: float = 9.0) -> None:
         """Close the dead end `end` of the street from `start` with a one-way loop wide enough for a bus."""
@@ -136,6 +144,7 @@ class Sketch:
         if out.suffix == ".xodr":
             text = re.sub(r"\n\s+", "\n", re.sub(r' date="[^"]*"', "", text))  # half as large without indents
         out.write_text(text)
+        name_streets(out, lambda edge: self.names.get(edge, ""))
 
     def _format(self, out: Path) -> list[str]:
         """Return netconvert's output options by the suffix of `out`: an OpenDRIVE map, or a net with crossings."""
@@ -183,6 +192,15 @@ def suburb() -> Sketch:
     for start, end in *zip(rim, (*rim[1:], rim[0])), *across:
         town.street(start, end, "side")
     town.turning_loop("close", "b2", "loop", radius=8.0)
+    town.name("Main Street", "w", "m1", "m3", "m2", "e")
+    town.name("North Road", "nw", "t1", "t2", "ne")
+    town.name("South Road", "sw", "b2", "b1", "se")
+    town.name("West Road", "nw", "w", "sw")
+    town.name("East Road", "ne", "e", "se")
+    town.name("School Lane", "t1", "m1")
+    town.name("Church Lane", "t2", "m2")
+    town.name("Mill Lane", "m3", "b1")
+    town.name("The Close", "b2", "close")
     return town
 
 
@@ -235,6 +253,12 @@ def grid() -> Sketch:
         town.edge(f"{middle}_{here}_a", middle, here, "bend", shape[half - 1 :: -1])
         town.edge(f"{here}_{middle}_b", here, middle, "bend", shape[:half:-1])
         town.edge(f"{middle}_{here}_b", middle, here, "bend", shape[half + 1 :])
+    town.name("South Street", "x00", "x10", "x20")
+    town.name("Market Avenue", "west", "x01", "x11", "x21", "east")
+    town.name("Park Boulevard", "x02", "x12", "x22")
+    town.name("West Street", "x00", "x01", "x02")
+    town.name("Station Street", "south", "x10", "x11", "x12", "north")
+    town.name("East Street", "x20", "x21", "x22")
     return town
 
 
@@ -265,6 +289,11 @@ def ring() -> Sketch:
     town.street("tw", "tn", "outer", ((-136, 10), (-126, 56), (-96, 92), (-58, 112)))
     town.street("x", "end", "stub")
     town.turning_loop("end", "x", "loop")
+    town.name("Ring Road", "tn", "x", "ts", "tw", "tn")
+    town.name("Station Road", "re", "x", "end")
+    town.name("Hill Road", "rn", "tn")
+    town.name("Mill Road", "rw", "tw")
+    town.name("Bridge Road", "rs", "ts")
     return town
 
 
@@ -307,6 +336,11 @@ def arterial() -> Sketch:
         town.street(start, end, "through")
     for start, end in ("c1", "c2"), ("c2", "c3"), ("n2", "c2"), ("c2", "s2"):
         town.street(start, end, "lane")
+    town.name("Bypass", *rim, rim[0])
+    town.name("Village Street", "w", "c1", "c2", "c3", "e")
+    town.name("Mill Road", "n1", "c1", "s1")
+    town.name("Church Lane", "n2", "c2", "s2")
+    town.name("Station Road", "n3", "c3", "s3")
     return town
 
 

@@ -138,12 +138,9 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--range": ALWAYS,
         "--count": ALWAYS,
         **dict.fromkeys(
-            ("--sensors", "--budget", "--cover", "--data", "--line-of-sight", "--class-weight", "--driving"), ALWAYS
+            ("--every", "--sensors", "--curve", "--budget", "--cover", "--data", "--line-of-sight"), ALWAYS
         ),
-        "--method": ALWAYS,
-        "--town": ALWAYS,
-        "--map": ALWAYS,
-        "--verify": ALWAYS,
+        **dict.fromkeys(("--class-weight", "--driving", "--method", "--town", "--map", "--verify"), ALWAYS),
     },
     "fit": {
         **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed", "--held-out"), ALWAYS),

@@ -22,6 +22,9 @@ def test_it_reads_masks_and_scores(labels: str, streets: Dataset, peer: Callable
     for split in read.values():
         assert min(split["ap"].values()) > 0.999
     frames = {f"{frame.key}_{camera}": (frame, camera) for frame in _frames(streets) for camera in frame.images}
+    for row in rows if labels == "signs" else []:
+        assert row["mask_bbox"] == row["bbox"]
+        assert row["area"] == row["sum"] >= row["said"]
     for row in rows if labels == "actors" else []:
         frame, camera = frames[row["image"]]
         number = 1 + frame.annotations.track.tolist().index(row["track"])

@@ -4,8 +4,9 @@
 
 It needs the extra `gym`. An action is the pedals, from full brake (-1) to full throttle (1), and the steering, from
 right (-1) to left (1). The reward is the progress along the route [m], less `COLLISION` for a collision; the episode
-ends with a collision, `OFF_M` off the route, and at the end of the route. Observations are in the ego frame, x forward
-and y left:
+ends with a collision, `OFF_M` off the route, and at the end of the route: `info["ended"]` says which.
+`render_mode="rgb_array"` has `render` return the picture of a camera above and behind the ego. Observations are in the
+ego frame, x forward and y left:
 
 - `ego` (5,): speed [m/s], yaw rate [rad/s], angle of the front wheels [rad], offset to the left of the route [m],
   heading less the route's [rad]
@@ -22,18 +23,23 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.config import InputError
+from flcav.arrays import Bytes
+from flcav.config import InputError, shorten
 from flcav.geometry import Array, rotate, wrap_angle
 from flcav.interface.wording import format_install_command
+from flcav.sensors.camera import Camera, photograph
+from flcav.sensors.lens import BODY_FROM_OPTICAL
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Mount, MountedLidar, Rig
+from flcav.statistics.streams import stream
 from flcav.world.commands import Controls, Spawn
 from flcav.world.live import LiveWorld, Settings
 from flcav.world.map.roads import Route, draw_route, read_net
 from flcav.world.map.town import Town, load_town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
+from flcav.world.weather import Weather
 
 try:
     import gymnasium
@@ -52,12 +58,14 @@ ACTORS, SIGHT_M = 16, 80.0
 ROUTE_M = 400.0
 FAR = 1e4  # no value of an observation is greater
 TRIES = 100  # to find room for the car
+BEHIND = Mount(x=-9.0, z=5.0, pitch_deg=18.0)  # of the camera that `render` looks through
+VIEW = Camera(width=480, height=320, noise=0.0)
 
 
 class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     """One car among the traffic of a live world."""
 
-    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
+    metadata: dict[str, Any] = {"render_modes": ["rgb_array"], "render_fps": 10}  # noqa: RUF012 - as Gymnasium has it
 
     def __init__(
         self,
@@ -67,8 +75,16 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         pedestrians: int = 0,
         dt_s: float = 0.1,
         lidar: Lidar | None = None,
+        render_mode: str | None = None,
     ) -> None:
-        """Take a town or its name, the number of SUMO's vehicles and pedestrians, and the time between actions."""
+        """Take a town or its name, the number of SUMO's vehicles and pedestrians, and the time between actions.
+
+        Raises `InputError` for a `render_mode` that is neither None nor "rgb_array".
+        """
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise InputError(f"render_mode = {shorten(render_mode)}: must be rgb_array, or None for no pictures")
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": max(round(1 / dt_s), 1) if dt_s > 0 else 1}
         self.town = load_town(town) if isinstance(town, str) else town
         self._net = read_net(self.town.net)
         self._settings = {"traffic": traffic, "pedestrians": pedestrians, "dt_s": dt_s}
@@ -101,7 +117,11 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observe(self._world.snapshot), {}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Drive for one step; `info` has the collisions, the progress [m] and the time [s]."""
+        """Drive for one step.
+
+        `info` has the collisions, the progress [m], the time [s], and in "ended" why the episode ends: "collision",
+        "off the route" or "arrived"; None while it goes on.
+        """
         if self._world is None or self._route is None:
             raise InputError("the environment must be reset before the first step")
         pedal, steer = (float(value) for value in np.clip(action, -1.0, 1.0))
@@ -110,9 +130,24 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         seen = self._observe(snapshot)
         hits = [hit for hit in snapshot.collisions if EGO in (hit.name, hit.other)]
         arrived = self._along >= self._route.length_m - 1.0
-        ended = bool(hits) or arrived or abs(float(seen["ego"][3])) > OFF_M
+        off = abs(float(seen["ego"][3])) > OFF_M
+        ended = "collision" if hits else "off the route" if off else "arrived" if arrived else None
         info = {"collisions": hits, "arrived": arrived, "progress_m": self._along, "time_s": snapshot.time_s}
-        return seen, self._along - before - COLLISION * bool(hits), ended, False, info
+        return seen, self._along - before - COLLISION * bool(hits), ended is not None, False, {**info, "ended": ended}
+
+    def render(self) -> Bytes | None:  # pyright: ignore[reportIncompatibleMethodOverride] # narrower than the base's
+        """Return the picture (H, W, 3) of the car from behind, sRGB; None without the `render_mode` "rgb_array".
+
+        Raises `InputError` before the first `reset`.
+        """
+        if self.render_mode is None:
+            return None
+        if self._world is None:
+            raise InputError("the environment must be reset before it is rendered")
+        snapshot = self._world.snapshot
+        scene = self._follow(snapshot)
+        camera = scene.world_from_actor(snapshot.row(EGO)) @ BEHIND.agent_from_sensor() @ BODY_FROM_OPTICAL
+        return photograph(scene, camera, VIEW, Weather(), stream(self._seed, "render", snapshot.step)).rgb
 
     def close(self) -> None:
         """End the world."""
@@ -180,14 +215,19 @@ class DrivingEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
     def _scan(self, snapshot: Snapshot) -> NDArray[np.float32]:
         """Return (N, 4) points x, y, z [m] in the LiDAR frame and intensity, zero-padded to the number of rays."""
         assert self._rig is not None
-        if self._scene is None:
-            self._scene = Scene(self.town, snapshot.trace)
-        self._scene.follow(snapshot.trace)
-        frame = observe(self._scene, self._rig, EGO, 0, scene_name="driving", seed=self._seed, number=snapshot.step)
+        scene = self._follow(snapshot)
+        frame = observe(scene, self._rig, EGO, 0, scene_name="driving", seed=self._seed, number=snapshot.step)
         lidar = self._rig.lidars["lidar"].settings
         points = np.zeros((lidar.channels * lidar.azimuth_steps, 4), np.float32)
         points[: len(frame.lidar["lidar"])] = frame.lidar["lidar"]
         return points
+
+    def _follow(self, snapshot: Snapshot) -> Scene:
+        """Return the scene of the world at this instant."""
+        if self._scene is None:
+            self._scene = Scene(self.town, snapshot.trace)
+        self._scene.follow(snapshot.trace)
+        return self._scene
 
 
 def _box(*shape: int) -> Box:

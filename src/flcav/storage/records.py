@@ -3,6 +3,7 @@
 Tables of users: reading of CSV, and writing as CSV or Parquet by the suffix of the file's name.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -94,22 +95,68 @@ def check_ending(path: Path) -> None:
 def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str = "") -> pa.Table:
     """Return the table in the CSV file at `path`, or in an open one called `origin`, the columns `texts` as text.
 
-    Only an empty cell is None; "NaN" is a number, "NA" is text. Raises `InputError` where the file is missing or not a
-    table, or where two columns have the same name.
+    Only an empty cell is None; "NaN" is a number, "NA" is text. The file may be as spreadsheets write it: with semicolons
+    or tabs between the cells, decimal commas, in a Windows code page or UTF-16. Raises `InputError` where the file is
+    missing or not a table, or where two columns have the same name.
     """
     named = origin or str(path)
     written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
     if isinstance(path, Path | str):
         check_is_file(Path(path))
     try:
-        table = csv.read_csv(path, convert_options=written)
+        data = Path(path).read_bytes() if isinstance(path, Path | str) else path.read()
+        data, delimiter = _as_utf8(data)
+        table = csv.read_csv(
+            pa.BufferReader(data), parse_options=csv.ParseOptions(delimiter=delimiter), convert_options=written
+        )
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         reason = str(error) if str(error).isprintable() else "its bytes are no text"
         raise InputError(f"{named}: not a table ({reason})") from None
     for name in table.column_names:
         if name and table.column_names.count(name) > 1:
             raise InputError(f"{named}: column '{name}' is there twice; found {', '.join(table.column_names)}")
+    for place, name in enumerate(table.column_names):
+        if pa.types.is_string(table[name].type) and name not in texts:
+            table = table.set_column(place, name, _read_decimal_commas(table[name], delimiter))
     return table
+
+
+MARK = b"\xef\xbb\xbf"  # of UTF-8, at the beginning of a spreadsheet's CSV
+WIDE = (b"\xff\xfe", b"\xfe\xff")  # marks of UTF-16, in which spreadsheets save "Unicode text"
+DECIMAL = re.compile(r"\s*[+-]?(\d+|\d{1,3}(\.\d{3})+)(,\d+)?\s*")
+THOUSANDS = re.compile(r"\s*[+-]?\d{1,3}(,\d{3})+\s*")
+
+
+def _as_utf8(data: bytes) -> tuple[bytes, str]:
+    """Return the text of a CSV file as UTF-8, without the mark of its encoding, and what separates its cells."""
+    if data.startswith(WIDE):
+        data = data.decode("utf-16").encode()
+    data = data.removeprefix(MARK)
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        if b"\0" not in data:
+            data = data.decode("cp1252").encode()
+    head, _, rest = data.partition(b"\n")
+    if head.rstrip().lower().startswith(b"sep=") and len(head.rstrip()) == 5:  # as Excel says it
+        return rest, chr(head[4])
+    bare = re.sub(rb'"[^"]*"', b"", head)
+    return data, max(",;\t", key=lambda sign: bare.count(sign.encode()))
+
+
+def _read_decimal_commas(column: pa.ChunkedArray, delimiter: str) -> pa.ChunkedArray:
+    """Return a column of text as numbers where all of it is numbers with decimal commas.
+
+    Where commas are between the cells "1,234" is text, since it is a thousand there.
+    """
+    said = column.to_pylist()
+    known = [text for text in said if text is not None and text.strip()]
+    if not any("," in text for text in known) or not all(map(DECIMAL.fullmatch, known)):
+        return column
+    if delimiter == "," and all(THOUSANDS.fullmatch(text) for text in known if "," in text):
+        return column
+    numbers = [None if not (text or "").strip() else float(text.replace(".", "").replace(",", ".")) for text in said]
+    return pa.chunked_array([pa.array(numbers, pa.float64())])
 
 
 def write_any_table(table: pa.Table, path: Path) -> None:

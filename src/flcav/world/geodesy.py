@@ -6,9 +6,11 @@ accuracy of geodetic latitude and height equations", Survey Review 28:202, 1985)
 """
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from flcav.arrays import Array
 from flcav.world.map.parameters import GeoReference
+from flcav.world.map.town import Town
 
 EQUATOR_M = 6_378_137.0  # semi-major axis of the WGS 84 ellipsoid
 FLATTENING = 1 / 298.257223563
@@ -34,6 +36,21 @@ def convert_to_map(origin: GeoReference, geodetic: Array) -> Array:
     """Convert latitude, longitude [deg], altitude [m] (..., 3) to x, y, up [m], as the inverse of the above."""
     enu = (_place_on_earth(*np.moveaxis(geodetic, -1, 0)) - _to_earth(origin)) @ _earth_from_enu(origin)
     return enu @ np.linalg.inv(_enu_from_map(origin)).T
+
+
+def find_on_ground(town: Town, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> Array:
+    """Return the places (..., 3) x, y, z [m, world] on the ground of a town at latitudes and longitudes [deg, WGS 84].
+
+    >>> from flcav import load_town
+    >>> find_on_ground(load_town("suburb"), 49.0, [8.4, 8.401]).round(1).tolist()
+    [[0.0, 0.0, 0.0], [73.2, 0.0, 0.0]]
+    """
+    latitude, longitude = np.broadcast_arrays(
+        np.asarray(latitude_deg, np.float64), np.asarray(longitude_deg, np.float64)
+    )
+    geodetic = np.stack((latitude, longitude, np.full(latitude.shape, town.geo.altitude_m)), axis=-1)
+    x, y, _ = np.moveaxis(convert_to_map(town.geo, geodetic), -1, 0)
+    return np.stack((x, y, town.grounds(x, y)), axis=-1)
 
 
 def _to_earth(at: GeoReference) -> Array:

@@ -292,9 +292,12 @@ def test_coco_s_readers_find_the_source_s_labels_and_masks(
             for note in notes:
                 x, y, w, h = note["bbox"]
                 rows.append((coco.loadCats([note["category_id"]])[0]["name"], x, y, x + w, y + h))
+                mask = coco.annToMask(note).astype(bool)
+                assert mask.sum() == note["area"]
+                if name == "signs":
+                    v, u = np.nonzero(mask)
+                    assert [u.min(), v.min(), u.max() + 1, v.max() + 1] == [x, y, x + w, y + h]
                 if name == "actors":
-                    mask = coco.annToMask(note).astype(bool)
-                    assert mask.sum() == note["area"]
                     painted = (pixels == painted_source.colour(int(note["track"][3:]))).all(axis=2)
                     np.testing.assert_array_equal(mask, painted)
                     checked += 1

@@ -22,11 +22,10 @@ def _check(coco: COCO, folder: Path) -> list:
             assert picture.size == (image["width"], image["height"])
         row = {"image": Path(image["file_name"]).stem, "name": coco.loadCats([note["category_id"]])[0]["name"]}
         row |= {"bbox": note["bbox"], "said": note["area"]}
-        if note["segmentation"]:
-            encoded = coco.annToRLE(note)
-            assert encoded is note["segmentation"], "pycocotools takes the mask as it is"
-            row |= {"area": int(area(encoded)), "mask_bbox": toBbox(encoded).tolist(), "track": note["track"]}
-            row["sum"] = int(coco.annToMask(note).sum())
+        encoded = coco.annToRLE(note)
+        assert encoded is note["segmentation"], "pycocotools takes the mask as it is"
+        row |= {"area": int(area(encoded)), "mask_bbox": toBbox(encoded).tolist(), "track": note.get("track")}
+        row["sum"] = int(coco.annToMask(note).sum())
         rows.append(row)
     return rows
 
@@ -49,7 +48,7 @@ read = {}
 for split in ("train", "val"):
     coco = COCO(str(export / "annotations" / f"{labels}_{split}.json"))
     read[split] = {"rows": _check(coco, export / "images" / split)}
-    read[split]["ap"] = {kind: _evaluate(coco, kind) for kind in ("bbox", *(["segm"] if labels == "actors" else []))}
+    read[split]["ap"] = {kind: _evaluate(coco, kind) for kind in ("bbox", "segm")}
     assert np.isfinite(list(read[split]["ap"].values())).all()
 print()
 print(json.dumps(read))

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from toy_source import ToySource
 
 from flcav.cli.main import run
-from flcav.dataset.formats.coco import encode_run_lengths
+from flcav.dataset.formats.coco import encode_run_lengths, mask_sign
 from flcav.dataset.formats.nuscenes.files import (
     CAMERAS,
     RADAR,
@@ -31,6 +31,7 @@ from flcav.dataset.formats.opv2v.write import agent_numbers
 from flcav.dataset.formats.writing import assign_channels, find_front_camera, quaternion
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import pose
+from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import BODY_FROM_OPTICAL
 from flcav.sensors.lidar.lidar import Lidar, build_ray_pattern
 from flcav.world.map.town import load_town
@@ -44,6 +45,18 @@ def test_run_lengths_are_coco_s(mask: np.ndarray):
     runs = encode_run_lengths(mask)
     theirs = coco_mask.encode(np.asfortranarray(mask, np.uint8))
     assert runs == {"size": theirs["size"], "counts": str(theirs["counts"], "ascii")}  # pyright: ignore[reportArgumentType, reportCallIssue]
+
+
+def test_a_sign_s_mask_is_its_pixels_or_its_rectangle_where_others_show_in_it():
+    semantic = np.zeros((6, 8), np.uint8)
+    semantic[1:3, 2:5] = SEMANTICS["traffic_sign"]
+    semantic[1, 2] = SEMANTICS["vegetation"]  # a leaf before a corner
+    semantic[1:3, 6] = SEMANTICS["traffic_light"]
+    alone = mask_sign(semantic, np.array([2.0, 1.0, 5.0, 3.0]), 5)
+    np.testing.assert_array_equal(np.argwhere(alone), [[1, 3], [1, 4], [2, 2], [2, 3], [2, 4]])
+    around = mask_sign(semantic, np.array([2.0, 1.0, 7.0, 3.0]), 5)  # the light stands in the rectangle
+    assert around.sum() == 10
+    assert around[1:3, 2:7].all()
 
 
 @pytest.mark.parametrize("beams", [{"beams": "hdl64e"}, {"channels": 16, "up_deg": 15.0, "down_deg": -15.0}])

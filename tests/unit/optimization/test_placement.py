@@ -221,7 +221,7 @@ def test_place_refuses_in_a_sentence_what_goes_together_with_nothing(given, said
 
 
 def test_place_refuses_errors_that_lie_on_no_map_of_the_town():
-    with pytest.raises(InputError, match="errors: row 2 lies at 1e\\+06, 0, far from grid"):
+    with pytest.raises(InputError, match="errors: row 2 lies at 1000000, 0, far from grid"):
         place([[0, 0, 1], [1e6, 0, 1]], load_town("grid").poles.position, 40, 1, town="grid")
 
 

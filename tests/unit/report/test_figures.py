@@ -14,7 +14,9 @@ from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
 from flcav.statistics.seeds import MeanOverSeeds
+from flcav.world.geodesy import find_on_ground
 from flcav.world.line_of_sight import Viewshed
+from flcav.world.sites import list_street_names
 
 TESTED, ROUNDS = made_up_run.chart_rows(), made_up_run.rounds()
 BUDGETS, SENT = made_up_run.BUDGETS, made_up_run.sent()
@@ -58,7 +60,7 @@ def test_the_map_shows_every_error_once_and_the_reach_of_the_chosen_pole() -> No
     x, y, z = scene.town.poles.position[list(scene.town.poles.id).index(2)]
     assert rim.get_center() == pytest.approx((x, y))
     assert rim.get_radius() == pytest.approx(np.sqrt(scene.chosen["2"] ** 2 - z**2))
-    words = {text.get_text() for text in axes.texts}
+    words = {text.get_text() for text in axes.texts} - {*list_street_names(scene.town)}
     assert words == {*map(str, scene.town.poles.id), "50 m"}  # no notes over the town
 
 
@@ -92,7 +94,38 @@ def test_of_many_poles_only_those_that_are_named_below_have_their_ids_on_the_map
     scene = made_up_run.error_map()
     masts = {str(number): scene.errors[number] for number in range(40)}
     crowd = replace(scene, poles=masts, chosen={"7": 40.0}, conventional={DENSEST: ("9",)})
-    assert {text.get_text() for text in figures.town_map(crowd).axes[0].texts} == {"7", "9", "50 m"}
+    words = {text.get_text() for text in figures.town_map(crowd).axes[0].texts}
+    assert words & {*masts} == {"7", "9"}
+
+
+def test_a_sensor_is_drawn_above_all_errors_and_candidates() -> None:
+    scene = made_up_run.error_map(errors=300)
+    sensor = scene.poles["2"][:2]
+    scene = replace(scene, errors=np.r_[scene.errors, [[*sensor, 1.0]]], kind=np.r_[scene.kind, ["miss"]])
+    axes = figures.town_map(scene).axes[0]
+    drawn = [line for line in axes.get_lines() if len(line.get_xdata())]  # type: ignore
+    (mark,) = (line for line in drawn if line.get_marker() == "o" and line.get_color() == style.BLUE)
+    (number,) = (text for text in axes.texts if text.get_text() == "2")
+    others = [each for each in (*drawn, *axes.collections, *axes.texts, *axes.patches) if each not in (mark, number)]
+    assert number.get_zorder() > mark.get_zorder() > max(each.get_zorder() for each in others)
+
+
+def test_the_map_has_coordinates_and_the_names_of_streets() -> None:
+    scene = replace(made_up_run.error_map(), title="grid: one sensor")
+    figure = figures.town_map(scene)
+    figure.draw_without_rendering()
+    axes = figure.axes[0]
+    assert axes.get_title(loc="left") == "grid: one sensor"
+    assert "100 m" in {label.get_text() for label in axes.get_xticklabels()}
+    east, north = axes.child_axes
+    degrees = [label.get_text() for label in east.get_xticklabels()]
+    place = find_on_ground(scene.town, 49.0, float(degrees[-1].removesuffix("° E")))
+    assert east.xaxis.get_majorticklocs()[-1] == pytest.approx(float(degrees[-1].removesuffix("° E")))
+    shown = axes.transData.inverted().transform(east.transData.transform((float(degrees[-1].removesuffix("° E")), 0)))
+    assert shown[0] == pytest.approx(place[0], abs=0.2)
+    assert all(label.get_text().endswith("° N") for label in north.get_yticklabels())
+    words = {text.get_text() for text in axes.texts}
+    assert {"Market Avenue", "Park Boulevard", "West Street"} <= words
 
 
 def test_a_viewshed_takes_the_place_of_the_filled_range() -> None:

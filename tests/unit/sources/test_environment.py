@@ -80,7 +80,43 @@ def test_leaving_the_road_ends_the_episode_with_or_without_a_collision(env: Driv
         seen, reward, ended, _, info = env.step(np.array([1.0, 0.3], np.float32))
         assert info["time_s"] < 20
     assert bool(info["collisions"]) == (reward < -COLLISION / 2)
+    assert info["ended"] == ("collision" if info["collisions"] else "off the route")
     assert info["collisions"] or abs(seen["ego"][3]) > 6.0
+
+
+def test_the_end_of_an_episode_has_a_reason(env: DrivingEnv, monkeypatch: pytest.MonkeyPatch):
+    seen, _ = env.reset(seed=3)
+    *_, ended, _, info = env.step(follow(seen, 5.0))
+    assert (ended, info["ended"]) == (False, None)
+    for reason, changed, value in (
+        ("off the route", "flcav.sources.environment.OFF_M", -1.0),
+        ("arrived", "flcav.world.map.roads.Route.length_m", 0.0),
+    ):
+        seen, _ = env.reset(seed=3)
+        with monkeypatch.context() as patch:
+            patch.setattr(changed, value)
+            *_, ended, _, info = env.step(follow(seen, 5.0))
+        assert (ended, info["ended"]) == (True, reason)
+
+
+def test_it_is_rendered_as_a_picture_that_follows_the_car():
+    made = DrivingEnv("suburb", traffic=2, render_mode="rgb_array", dt_s=0.5)
+    with pytest.raises(InputError, match="must be reset before it is rendered"):
+        made.render()
+    seen, _ = made.reset(seed=3)
+    first = made.render()
+    assert first is not None
+    assert (first.dtype, first.shape) == (np.uint8, (320, 480, 3))
+    assert made.metadata["render_fps"] == 2
+    for _ in range(4):
+        seen, *_ = made.step(follow(seen, 8.0))
+    later = made.render()
+    assert later is not None
+    assert not np.array_equal(later, first)
+    made.close()
+    assert DrivingEnv("suburb", traffic=0).render() is None
+    with pytest.raises(InputError, match="render_mode = 'human': must be rgb_array"):
+        DrivingEnv("suburb", render_mode="human")
 
 
 def test_a_step_before_the_reset_is_refused(env: DrivingEnv):

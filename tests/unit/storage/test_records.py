@@ -1,11 +1,12 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import pytest
 
 from flcav.config import InputError
-from flcav.storage.records import LEFT_OUT, Class, Record, to_rows
+from flcav.storage.records import LEFT_OUT, Class, Record, read_csv, to_rows
 
 
 @dataclass(frozen=True)
@@ -50,3 +51,25 @@ def test_rows_have_a_column_for_each_number_of_a_nested_record() -> None:
         {"town": "grid", "row.class": "Car", "row.ap": 0.5, "seeds": [1, 2]},
         {"town": "ring", "row.class": "Van", "row.ap": None, "seeds": []},
     ]
+
+
+@pytest.mark.parametrize(
+    ("written", "encoding"),
+    [
+        ("id;x;y;street\n7;1,5;-2;Kö\n8;1.000,25;;Kö\n", "utf-8-sig"),
+        ("id\tx\ty\tstreet\n7\t1,5\t-2\tKö\n8\t1000,25\t\tKö\n", "utf-16"),
+        ("sep=;\r\nid;x;y;street\r\n7;1.5;-2;Kö\r\n8;1000.25;;Kö\r\n", "cp1252"),
+        ('id,x,y,street\n7,"1,5",-2,Kö\n8,"1000,25",,Kö\n', "utf-8"),
+    ],
+)
+def test_tables_of_spreadsheets_are_read(written: str, encoding: str, tmp_path: Path):
+    (tmp_path / "own.csv").write_bytes(written.encode(encoding))
+    assert read_csv(tmp_path / "own.csv", ["id"]).to_pylist() == [
+        {"id": "7", "x": 1.5, "y": -2, "street": "Kö"},
+        {"id": "8", "x": 1000.25, "y": None, "street": "Kö"},
+    ]
+
+
+def test_thousands_and_lists_stay_text(tmp_path: Path):
+    (tmp_path / "own.csv").write_text('cost,tags\n"1,234","2,5 m"\n"12,500","3,5"\n')
+    assert read_csv(tmp_path / "own.csv").to_pydict() == {"cost": ["1,234", "12,500"], "tags": ["2,5 m", "3,5"]}

@@ -23,17 +23,28 @@ if TYPE_CHECKING:
     from flcav.world.trace import Trace
 
 MAP_IN = 6.4  # width of the map [inch]
+LISTED = 20  # candidates: of more than these only those that are placed are listed
 
 
 @answer_json
 def place(
     errors: Path = typer.Option(
-        ..., help="CSV or Parquet of errors: x, y, z [m], optionally weight, severity, exposure, class, kind."
+        ...,
+        help="CSV or Parquet of errors, or points of your own: x, y [m], maybe z, or latitude, longitude; optionally "
+        "weight, severity, exposure, class, kind.",
     ),
-    poles: Path = typer.Option(..., help="CSV or Parquet of candidate poles: id, x, y, z [m], optionally cost."),
+    poles: Path | None = typer.Option(
+        None,
+        help="CSV or Parquet of candidate poles: id, x, y [m], maybe z, or latitude, longitude; optionally cost. By "
+        "default the town's, and sites along its streets that have none.",
+    ),
+    every: float | None = typer.Option(
+        None, "--every", help="Candidates every so many metres along the town's streets.", callback=check_finite
+    ),
     sensors: Path | None = typer.Option(None, help="CSV or Parquet of sensors: name, range_m, cost; one a pole."),
     range_m: float | None = typer.Option(None, "--range", help="How far a sensor covers errors [m]."),
     count: int | None = typer.Option(None, help="How many sensors to place."),
+    curve: bool = typer.Option(False, "--curve", help="With --count: what each further sensor gains, from the first."),
     budget: float | None = typer.Option(None, help="What sensors and poles may cost together.", callback=check_finite),
     cover: float | None = typer.Option(
         None, help="Share of the errors' weight, 0 to 1: the cheapest sensors for it.", callback=check_finite
@@ -73,9 +84,14 @@ def place(
     from flcav.optimization.placement import solve
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
-    from flcav.optimization.placement.place import check_inside, find_seen
+    from flcav.optimization.placement.place import find_seen
     from flcav.storage.files import check_writable
+    from flcav.world.sites import locate_sites
 
+    if poles is not None and every is not None:
+        raise InputError("--poles and --every: one of the two says where sensors may stand")
+    if curve and count is None:
+        raise InputError("--curve: needs --count, up to which it goes")
     for file in (errors, poles, sensors):
         if file is not None and not file.exists():
             raise InputError(f"{file}: no such file")
@@ -91,11 +107,10 @@ def place(
             raise InputError(f"{option}: needs --town, or --data whose town is known")
     if driving and not traces:
         raise InputError("--driving: needs --data with recorded traffic")
-    given = place_inputs.read_given(errors, poles, sensors, range_m, class_weight)
-    if here is not None:
-        check_inside(here, given.errors, given.poles, (errors, poles))
+    given = place_inputs.read_given(errors, poles, sensors, range_m, class_weight, town=here, every_m=every)
     if budget is not None and not given.priced:
-        raise InputError(f"--budget: nothing has a cost; give {poles} a column 'cost', or give --sensors")
+        table = poles or "a table of --poles"
+        raise InputError(f"--budget: nothing has a cost; give {table} a column 'cost', or give --sensors")
     seen = None
     if line_of_sight and here is not None:
         seen = find_seen(given.errors, given.poles, float(given.ranges_m.max()), here, traces)
@@ -103,7 +118,10 @@ def place(
     if count is not None or not given.priced:
         candidates = candidates.at_unit_cost()
     least: float | None = None
+    steps: list[solve.Placement] = []
     if count is not None:
+        fewer = range(1, count) if curve else ()
+        steps = [solve.place_count(candidates, each, method=method.value) for each in fewer]
         result = solve.place_count(candidates, count, method=method.value)
     elif budget is not None:
         result = solve.place_budget(candidates, budget, method=method.value)
@@ -132,6 +150,13 @@ def place(
         "cost_lower_bound": least,
         "marginal_gain": result.marginal_gain,
         "certificate": None if result.certificate is None else asdict(result.certificate),
+        **({"curve": _tell_curve(given, [*steps, result])} if curve else {}),
+        **(
+            {}
+            if here is None
+            else {"sites": [asdict(each) for each in locate_sites(here, given.poles[list(result.chosen)])]}
+        ),
+        **({"notes": [*given.notes]} if given.notes else {}),
         **({} if hidden is None else {"hidden": hidden.as_json()}),
         **({} if verified is None else {"verification": asdict(verified)}),
         "baselines": {
@@ -139,7 +164,10 @@ def place(
             "random": {"covered": random.covered, "covered_weight": random.covered_weight},
         },
     }
-    yield from _list_lines(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least)
+    yield from given.notes
+    yield from _list_lines(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least, here)
+    if curve:
+        yield from _list_curve(given, [*steps, result])
     if hidden is not None:
         yield from hidden.lines()
     if verified is not None:
@@ -154,26 +182,54 @@ def _list_lines(
     result: "Placement",
     conventional: "dict[str, Placement | None]",
     least: float | None,
+    town: "Town | None",
 ) -> Iterator[str]:
     """Yield the placement in words; `near` are the numbers of errors within range of each candidate."""
+    from flcav.world.sites import locate_sites
+
     cost, by_range = given.cost_of(result), given.names == (None,)
     chosen = [f"{each['pole']}" + ("" if by_range else f" ({each['sensor']})") for each in _name(given, result)]
     yield (f"poles {', '.join(chosen)}")
-    if by_range:
-        for number, (pole, errors_near) in enumerate(zip(given.ids, near, strict=True)):
-            placed = ", placed" if number in result.chosen else ""
-            yield (f"    pole {pole}: {plural(errors_near, 'error')} within {given.ranges_m[0]:g} m{placed}")
+    places = [] if town is None else [f" at {site}" for site in locate_sites(town, given.poles[list(result.chosen)])]
+    at = dict(zip(result.chosen, places))
+    listed = range(len(given.ids)) if len(given.ids) <= LISTED else result.chosen
+    for number in listed if by_range else ():
+        placed = f", placed{at.get(number, '')}" if number in result.chosen else ""
+        yield f"    pole {given.ids[number]}: {plural(near[number], given.noun)} within {given.ranges_m[0]:g} m{placed}"
+    if by_range and len(listed) < len(near):
+        most = max((each for number, each in enumerate(near) if number not in result.chosen), default=0)
+        yield f"    {plural(len(near) - len(listed), 'other candidate')}: at most {plural(most, given.noun)}"
+    yield from () if by_range else (f"    pole {pole}{place}" for pole, place in zip(chosen, places))
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.10g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.10g} has to be spent for that"
     told = "" if cost is None else f", cost {cost:.10g}"
-    yield (
-        f"cover {result.covered} of {plural(len(given.errors), 'error')}, "
-        f"weight {result.covered_weight:.10g}{told} ({proof})"
-    )
+    yield (f"cover {given.count(result.covered)}, weight {result.covered_weight:.10g}{told} ({proof})")
     for name, placed in conventional.items():
         if placed is not None:
             yield (f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.10g}")
+
+
+def _list_curve(given: "Given", steps: "list[Placement]") -> Iterator[str]:
+    """Yield what each further sensor gains: `steps` are the placements of 1, 2, ... sensors."""
+    yield "gain of each further sensor, all of them placed anew:"
+    before = 0.0
+    for number, placed in enumerate(steps, start=1):
+        gain, before = placed.covered_weight - before, placed.covered_weight
+        share = 100 * placed.covered_weight / float(given.weight.sum())
+        poles = ", ".join(str(given.ids[pole]) for pole in placed.chosen)
+        proof = "" if placed.optimal else f", at most {placed.upper_bound:.10g} can be covered"
+        told = f"weight {placed.covered_weight:.10g} ({share:.1f} %), gain {gain:.10g}{proof}"
+        yield f"    {plural(number, 'sensor')}: {told}; on {poles}"
+
+
+def _tell_curve(given: "Given", steps: "list[Placement]") -> "Json":
+    before, told = 0.0, []
+    for placed in steps:
+        gain, before = placed.covered_weight - before, placed.covered_weight
+        proof = {"gain": gain, "upper_bound": placed.upper_bound, "optimal": placed.optimal}
+        told.append({**_describe(given, placed), **proof})
+    return told
 
 
 def _verify(
@@ -228,8 +284,10 @@ def _name(given: "Given", placed: "Placement") -> "list[dict[str, Json]]":
 
 
 def _tell(given: "Given", placed: "Placement | None") -> "Json":
-    if placed is None:
-        return None
+    return None if placed is None else _describe(given, placed)
+
+
+def _describe(given: "Given", placed: "Placement") -> "dict[str, Json]":
     return {"chosen": _name(given, placed), "covered": placed.covered, "covered_weight": placed.covered_weight}
 
 
@@ -277,6 +335,8 @@ def _draw(
         notes,
         noted,
         heat=True,
+        title=f"{town.name}: {plural(len(placed.chosen), 'sensor')} for {given.count()}",
+        noun=given.noun,
     )
     write_bytes(path, style.png(town_map(scene, MAP_IN)))
 
@@ -294,7 +354,7 @@ def _note(given: "Given", placed: "Placement") -> list[str]:
         return f", cost {own:.6g}" if given.priced else ""
 
     pairs = list(zip(placed.chosen, placed.sensors, strict=True))
-    lines = [f"{placed.covered} of {plural(len(given.errors), 'error')} covered{cost(pairs)}"]
+    lines = [f"{given.count(placed.covered)} covered{cost(pairs)}"]
     for kind, (sensor_name, range_m) in enumerate(zip(given.names, given.ranges_m, strict=True)):
         if own := [(pole, sensor) for pole, sensor in pairs if sensor == kind]:
             poles = name_poles([name(pole) for pole, _ in own])

@@ -10,24 +10,30 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from flcav.cli.planning.places import AXES, NAMES, read_places
 from flcav.cli.tables import numbers, read_input_table
+from flcav.cli.tables import numbers, read_table
 from flcav.config import InputError, shorten
 from flcav.dataset.store import Dataset
+from flcav.interface.wording import plural
 from flcav.optimization.placement.instance import find_covered
+from flcav.optimization.placement.place import check_inside
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates
 from flcav.optimization.verification.record import exact
-from flcav.perception.errors import CLASS
+from flcav.perception.errors import CLASS, FALSE_POSITIVE, FINAL_ERROR, MISS
 from flcav.world.map.town import Town, load_town
+from flcav.world.sites import MOUNT_M, draw_sites, measure_streets
 from flcav.world.trace import Trace
 
 Array = NDArray[np.float64]
 
-AXES = ("x", "y", "z")
 FACTORS = ("weight", "severity", "exposure")  # columns of errors whose product is an error's weight
 ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "track")
-POLES = ("id", *AXES, "cost", "yaw_deg", "kind")
+POLES = ("id", *AXES, "cost", "yaw_deg", "kind", "height_m")
 SENSORS = ("name", "range_m", "cost")
-NAMES = ("id", "name")  # columns that are kept as they are written
+REGISTERED = {MISS, FALSE_POSITIVE, FINAL_ERROR}  # kinds of errors; other rows are points of the user's own
+EVERY_M = 50.0  # between sites that are drawn where a town has none
+NEAREST_M, FARTHEST_M = 5.0, 1000.0  # between sites
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class Given:
 
     errors: Array  # (E, 3) world [m]
     weight: Array  # (E,)
-    kind: NDArray[np.str_]  # (E,)
+    kind: NDArray[np.str_]  # (E,) "point" where the user's table has none
     ids: tuple[int | str, ...]  # (P,) of the poles
     poles: Array  # (P, 3) world [m]
     pole_cost: Array  # (P,)
@@ -44,6 +50,17 @@ class Given:
     ranges_m: Array  # (S,)
     sensor_cost: Array  # (S,)
     priced: bool  # whether anything has a cost
+    notes: tuple[str, ...] = ()  # sentences on what was assumed and what was not used
+
+    def count(self, covered: int | None = None) -> str:
+        """Return "11 errors", or of points that are the user's own "your 300 points"; "8 of" them that are covered."""
+        every = f"{'your ' if self.noun == 'point' else ''}{plural(len(self.errors), self.noun)}"
+        return every if covered is None else f"{covered} of {every}"
+
+    @property
+    def noun(self) -> str:
+        """Return what a row of the errors' table is called."""
+        return "error" if {*self.kind.tolist()} <= REGISTERED else "point"
 
     def cost_of(self, placed: Placement) -> float | None:
         """Return what a placement costs; None where nothing has a cost."""
@@ -70,32 +87,97 @@ class Given:
         return covered
 
 
+@dataclass(frozen=True)
+class Sites:
+    """Candidate sites of sensors."""
+
+    ids: tuple[int | str, ...]  # (P,)
+    xyz: Array  # (P, 3) world [m]
+    cost: Array | None  # (P,)
+    note: str  # a sentence on where they come from
+    degrees: Array | None = None  # (P, 2) latitude and longitude, where the user's table has them
+
+
 def read_given(
-    errors: Path, poles: Path, sensors: Path | None, range_m: float | None, class_weights: Sequence[str]
+    errors: Path,
+    poles: Path | None,
+    sensors: Path | None,
+    range_m: float | None,
+    class_weights: Sequence[str],
+    *,
+    town: Town | None = None,
+    every_m: float | None = None,
 ) -> Given:
-    """Return the tables; raises `InputError` for files, columns, numbers, ids and factors that are wrong."""
-    mistakes, sites = _read(errors, AXES, ERRORS), _read(poles, ("id", *AXES), POLES)
-    ids = _identify(sites["id"].to_pylist(), poles, "poles", "id")
-    pole_cost = _costs(sites, poles)
+    """Return the tables; raises `InputError` for files, columns, numbers, places, ids and factors that are wrong.
+
+    Without a table of `poles` they are those of `find_sites`.
+    """
+    placed = read_places(errors, "point", ERRORS, town)
+    mistakes, sites = placed.table, find_sites(town, every_m) if poles is None else _read_sites(poles, town)
+    notes = [placed.note, sites.note]
+    if town is not None:
+        check_inside(town, placed.xyz, sites.xyz, (errors, poles or "poles"), (placed.degrees, sites.degrees))
+        x_low, y_low, x_high, y_high = town.bounds
+        out = ((placed.xyz[:, :2] < (x_low, y_low)) | (placed.xyz[:, :2] > (x_high, y_high))).any(axis=1)
+        notes.append(f"{errors}: {out.sum()} of {len(placed.xyz)} lie outside {town.name}" if out.any() else "")
     names, ranges, sensor_cost = (None,), np.array([range_m], np.float64), np.zeros(1)
     if sensors is not None:
         kinds = _read(sensors, SENSORS, SENSORS)
         names = tuple(map(str, _identify(kinds["name"].to_pylist(), sensors, "sensors", "name")))
         sensor_cost = _costs(kinds, sensors)
         ranges = numbers(kinds, ("range_m",), sensors)[:, 0]
-    kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["error"] * mistakes.num_rows
+    kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["point"] * mistakes.num_rows
     return Given(
-        errors=numbers(mistakes, AXES, errors),
+        errors=placed.xyz,
         weight=_weigh(mistakes, errors, class_weights),
         kind=np.array(kind, dtype=np.str_),
-        ids=ids,
-        poles=numbers(sites, AXES, poles),
-        pole_cost=pole_cost,
+        ids=sites.ids,
+        poles=sites.xyz,
+        pole_cost=np.zeros(len(sites.ids)) if sites.cost is None else sites.cost,
         names=names,
         ranges_m=ranges,
         sensor_cost=sensor_cost,
-        priced=sensors is not None or "cost" in sites.column_names,
+        priced=sensors is not None or sites.cost is not None,
+        notes=tuple(note for note in notes if note),
     )
+
+
+def find_sites(town: Town | None, every_m: float | None = None) -> Sites:
+    """Return candidate sites of a town every `every_m` [m] along its streets.
+
+    Without `every_m` they are its poles and, numbered after these, sites every `EVERY_M` along the streets that have
+    none. Raises `InputError` without a town, for distances not from NEAREST_M to FARTHEST_M, and where there are none.
+    """
+    if town is None:
+        raise InputError("--poles: give a table of candidate sites, or --town, whose poles and streets have some")
+    if every_m is not None and not NEAREST_M <= every_m <= FARTHEST_M:
+        raise InputError(f"--every {every_m:g}: must be from {NEAREST_M:g} to {FARTHEST_M:g} m")
+    spacing, known = every_m or EVERY_M, town.poles.id.tolist()
+    drawn = draw_sites(town, spacing, bare=every_m is None and bool(known))
+    sites = f"{plural(len(drawn), 'site')} every {spacing:g} m along"
+    if every_m is None and known:
+        note = f"candidates: the {plural(len(known), 'pole')} of {town.name}"
+        if len(drawn):
+            bare_km = measure_streets(town, bare=True) / 1000
+            note += f", and {sites} {bare_km:.1f} km of its streets that have none"
+        ids = (*known, *range(max(known) + 1, max(known) + 1 + len(drawn)))
+        return Sites(ids, np.concatenate((town.poles.position, drawn)), None, note)
+    if not len(drawn):
+        raise InputError(f"--town {town.name}: has no street with room for sites every {spacing:g} m; give --poles")
+    note = f"candidates: {sites} the streets of {town.name}"
+    note += "" if every_m is not None else ", which has no poles of its own"
+    return Sites(tuple(range(1, len(drawn) + 1)), drawn, None, note)
+
+
+def _read_sites(path: Path, town: Town | None) -> Sites:
+    found = read_places(path, "pole", (*POLES, "name"), town, MOUNT_M)
+    own = next((name for name in NAMES if name in found.table.column_names), None)
+    if own is None and not found.note:
+        raise InputError(f"{path}: column 'id' is missing; found {', '.join(found.table.column_names)}")
+    rows = found.table.num_rows
+    ids = tuple(range(1, rows + 1)) if own is None else _identify(found.table[own].to_pylist(), path, "poles", own)
+    cost = _costs(found.table, path) if "cost" in found.table.column_names else None
+    return Sites(ids, found.xyz, cost, found.note, found.degrees)
 
 
 def read_world(data: Path | None, town: str | None) -> tuple[Town | None, list[Trace]]:

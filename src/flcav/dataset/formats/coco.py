@@ -1,7 +1,6 @@
 """Export to COCO: `images/<split>` and `annotations/<labels>_<split>.json`, separate for signs and actors.
 
-Actors have instance masks in COCO's compressed run-length encoding (RLE); signs have bounding boxes only. Lin et al.,
-"Microsoft COCO", ECCV 2014.
+Instance masks are in COCO's compressed run-length encoding (RLE). Lin et al., "Microsoft COCO", ECCV 2014.
 """
 
 import json
@@ -27,8 +26,9 @@ from flcav.dataset.formats.writing import (
 from flcav.dataset.payloads import encode_png
 from flcav.dataset.rectangles import CLASSES, select_rectangles
 from flcav.dataset.store import Dataset
+from flcav.geometry import Array
 from flcav.interface.progress import Report
-from flcav.sensors.frame import Frame
+from flcav.sensors.frame import SEMANTICS, Frame
 
 
 def export_coco(dataset: Dataset, out: Path, options: ExportOptions, progress: Report) -> Exported:
@@ -81,6 +81,20 @@ def encode_run_lengths(mask: NDArray[np.bool_]) -> dict[str, Json]:
     return {"size": list(mask.shape), "counts": encoded["counts"].decode("ascii")}
 
 
+def mask_sign(semantic: NDArray[np.uint8], box: Array, pixels: int) -> NDArray[np.bool_]:
+    """Return the mask (H, W) of a sign: the pixels of signs and lights in its visible `box` (4,) [px].
+
+    Where these are not as many as its visible `pixels`, since another sign shows in the box, it is the whole box. The
+    box is left, top, right, bottom from the image's corner; `semantic` (H, W) is the image of classes.
+    """
+    left, top, right, bottom = box.astype(int)
+    mask = np.zeros(semantic.shape, np.bool_)
+    inside = semantic[top:bottom, left:right]
+    own = (inside == SEMANTICS["traffic_sign"]) | (inside == SEMANTICS["traffic_light"])
+    mask[top:bottom, left:right] = own if own.sum() == pixels else True
+    return mask
+
+
 def _empty(labels: str) -> Table:
     kind = {"signs": "sign", "actors": "actor"}[labels]
     categories: list[dict[str, Json]] = [
@@ -105,7 +119,8 @@ def _image(frame: Frame, camera: str, file_name: str, number: int) -> dict[str, 
 
 def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> list[dict[str, Json]]:
     rectangles = select_rectangles(frame, camera, labels, min_pixels)
-    instance = frame.images[camera].instance
+    image = frame.images[camera]
+    assert image.semantic is not None
     annotations = []
     for label, box, pixels, row in zip(rectangles.label, rectangles.box, rectangles.pixels, rectangles.row):
         left, top, right, bottom = box.tolist()
@@ -116,11 +131,11 @@ def _annotations(frame: Frame, camera: str, labels: str, min_pixels: int) -> lis
             "iscrowd": 0,
         }
         if labels == "actors":
-            about["segmentation"] = encode_run_lengths(instance == row + 1)
+            about["segmentation"] = encode_run_lengths(image.instance == row + 1)
             about["track"] = str(frame.annotations.track[row])
             about["occlusion"] = float(frame.annotations.views[camera].occlusion[row])
         else:
-            about["segmentation"] = []
+            about["segmentation"] = encode_run_lengths(mask_sign(image.semantic, box, int(pixels)))
             about["distance_m"] = float(frame.annotations.signs[camera].distance_m[row])
         annotations.append(about)
     return annotations

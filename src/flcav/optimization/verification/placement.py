@@ -101,12 +101,15 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
         )
         claims["whether it is optimal"] = placed["optimal"] == (upper <= float(value))
         trusted += [SEARCH.format(upper)] * (not proven)
-        return judge_claims(float(value), [cost], most, claims, trusted)
+        beyond = value + _unit(decimals)
+        excluded = float(beyond) if upper <= float(value) < float(f"{most:.9g}") and most < beyond else None
+        return judge_claims(float(value), [cost], most, claims, trusted, excluded)
     target = exact(asked.cover) * sum(decimals, Fraction(0))
     stated_least = inf if least is None else least
     by_dual = max(float((target - spare) / max(price, NOTHING)) if target > spare else 0.0, 0.0)
     fewest = max(by_dual, float(target / max(densest, NOTHING)))
-    proven = _at_most(stated_least, fewest) or fewest > cost - _unit(exact(each) for row in prices for each in row)
+    below = cost - _unit(exact(each) for row in prices for each in row)
+    proven = _at_most(stated_least, fewest) or fewest > below
     claims["the share"] = value >= target
     claims["the dual's bound"] = _at_most(proof["bound"], by_dual)
     claims["the bound on the cost"] = _at_most(stated_least, float(cost)) and (
@@ -115,7 +118,9 @@ def verify_placement(asked: PlacementProblem, placed_json: str, least: float | N
     claims["whether it is optimal"] = placed["optimal"] == (stated_least >= placed["cost"])
     claims["the upper bound"] = upper >= float(value)
     trusted += [SEARCH.format(stated_least)] * (not proven) + [UPPER.format(upper)] * (not _at_most(most, upper))
-    return judge_claims(float(cost), [cost], min(fewest, float(cost)), claims, trusted)
+    whole = stated_least >= placed["cost"] and float(f"{fewest:.9g}") < float(cost) and fewest > below
+    excluded = float(below) if whole else None
+    return judge_claims(float(cost), [cost], min(fewest, float(cost)), claims, trusted, excluded)
 
 
 def _sum_up(values: Iterable[float]) -> Fraction:

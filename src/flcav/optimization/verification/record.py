@@ -17,12 +17,20 @@ class Verification:
     gap: float | None  # between the two, relative to the smaller one
     faults: tuple[str, ...]  # what is stated and does not hold; none: the certificate holds
     trusted: tuple[str, ...]  # what the certificate relies on in addition to the dual
+    excluded: float | None = None  # next better sum of weights, or costs: ruled out by the bound; None: no gap, or open
 
     def lines(self, *, counted: bool = False) -> list[str]:
         """Return the verification in words; `counted`: the cost is a number of sensors."""
         proof = "there is no bound for this objective: nothing is proven"
         if self.bound is not None:
             proof = f"its dual alone proves {self.bound:.9g}, a gap of {100 * (self.gap or 0.0):.3g} %"
+        if self.bound is not None and self.excluded is not None:
+            more = self.excluded > self.objective
+            sums, limit = ("weights above", "least") if more else ("costs below", "most")
+            proof = (
+                f"its dual alone proves {self.bound:.9g}; sums of the {sums} {self.objective:.9g} are at {limit} "
+                f"{self.excluded:.9g}, so that nothing better exists"
+            )
         cost = " and ".join(f"{each:.9g}" for each in self.cost)
         spent = f"with {cost} of the sensors" if counted else f"at the cost {cost}"
         return [
@@ -33,7 +41,12 @@ class Verification:
 
 
 def judge_claims(
-    objective: float, cost: Iterable[Fraction], bound: float | None, claims: Mapping[str, bool], trusted: Sequence[str]
+    objective: float,
+    cost: Iterable[Fraction],
+    bound: float | None,
+    claims: Mapping[str, bool],
+    trusted: Sequence[str],
+    excluded: float | None = None,
 ) -> Verification:
     """Return the verification whose faults are the `claims` that do not hold."""
     gap = None
@@ -42,7 +55,7 @@ def judge_claims(
         least = min(abs(objective), abs(bound))
         gap = apart / least if least > 0 else float(apart > 0)
     faults = tuple(claim for claim, holds in claims.items() if not holds)
-    return Verification(objective, tuple(map(float, cost)), bound, gap, faults, tuple(trusted))
+    return Verification(objective, tuple(map(float, cost)), bound, gap, faults, tuple(trusted), excluded)
 
 
 def exact(number: float | Fraction) -> Fraction:

@@ -11,18 +11,27 @@ from flcav.report.pictures import clouds, maps
 from flcav.statistics.estimates import Estimate
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
+TALLEST = 2.0  # height of a map in widths: a higher one is drawn narrower
 ACROSS = 2  # entries of a map's key in a line
 EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
 @style.styled
 def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
-    """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles."""
+    """Return the map of a town with candidate poles, registered errors, and the range of the chosen poles.
+
+    It has a title, coordinates, a scale bar, and the names of the streets that have one.
+    """
     x_low, y_low, x_high, y_high = scene.town.bounds
     bar = 0.9 if scene.heat else 0.0  # [inch] beside the map
-    figure = style.canvas(width_in + bar, width_in * (y_high - y_low) / (x_high - x_low) + 0.8)
+    beside = 0.9 + bar  # coordinates on both sides
+    high = width_in * min((y_high - y_low) / (x_high - x_low), TALLEST)
+    figure = style.canvas(width_in + beside, high + 1.7)
     axes = figure.add_subplot()
     maps.draw_errors(axes, scene)
+    maps.draw_street_names(axes, scene)
+    maps.draw_coordinates(axes, scene.town)
+    axes.set_title(scene.title, fontweight="bold")
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=ACROSS)
     return figure
 

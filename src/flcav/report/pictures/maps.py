@@ -1,7 +1,7 @@
 """The map of a town with registered errors, candidate poles and the chosen ones."""
 
 import textwrap
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -12,13 +12,16 @@ from matplotlib.collections import PatchCollection, PolyCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.patches import Circle
 from matplotlib.ticker import MaxNLocator
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter
+from shapely.geometry import LineString, Point
 
 from flcav.geometry import Boxes
 from flcav.report import style
+from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.line_of_sight import Viewshed
 from flcav.world.map.town import Town
+from flcav.world.sites import list_street_names
 
 Array = NDArray[np.float64]
 
@@ -45,6 +48,10 @@ LINE_EM = 0.52  # width of a character of the lines below a map, in ems
 CELL_M = 2.0  # of the map of the errors' density
 BLUR_M = 12.0  # standard deviation of its smoothing: half of a crossing
 HEAT = LinearSegmentedColormap.from_list("heat", ["#fff3e0", "#f6b26b", "#c0392b"])
+BARS_M = (10, 20, 50, 100, 200, 500, 1000, 2000)  # lengths of scale bars
+TURNED = 1e-3  # of a map's axes against east and north, above which its frame has no latitudes
+ROOM = 0.75  # of a name's length that a street has at least: the name may reach into its junctions
+DENSE = 120  # errors: more than these are drawn smaller
 DENSEST, MOST_VISIBLE = "densest traffic", "most visible objects"  # what the poles of conventional rules have
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
@@ -65,6 +72,8 @@ class ErrorMap:
     zones: Mapping[str, float] = field(default_factory=dict)  # errors per hectare within `zone_m` of a pole, by its id
     zone_m: float = 0.0
     heat: bool = False  # whether to show the density of the errors
+    title: str = ""  # above the map
+    noun: str = "error"  # what a place is called: "error", or "point" of the user's own
 
 
 def poles_of(town: Town) -> dict[str, Array]:
@@ -85,7 +94,64 @@ def draw_town(axes: Axes, town: Town) -> None:
     houses = Boxes.from_array(np.c_[x, y, height / 2, length, width, height, yaw], "building")
     outlines = houses.corners()[:, :4, :2]
     axes.add_collection(PolyCollection(list(outlines), facecolor=style.BUILDING, linewidth=0))
-    style.scale_bar(axes, 50)
+    style.scale_bar(axes, max(length for length in BARS_M if length <= max((x_high - x_low) / 6, BARS_M[0])))
+
+
+def draw_coordinates(axes: Axes, town: Town) -> None:
+    """Draw the coordinates of the world frame [m] below and to the left of a map, latitude and longitude opposite.
+
+    The latter are left out where the axes of the town's geo-reference are turned.
+    """
+    for axis, side in ((axes.xaxis, "bottom"), (axes.yaxis, "left")):
+        axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(lambda value, _: f"{value:g} m".replace("-", "\N{MINUS SIGN}"))
+        axis.set_tick_params(length=3, width=0.6)
+        axes.spines[side].set_visible(True)
+    (along, turned), (back, ahead) = town.geo.x_axis, town.geo.y_axis
+    if max(abs(turned), abs(back)) > TURNED or min(along, ahead) <= 0:
+        return
+    x_low, y_low, x_high, y_high = town.bounds
+    (south, west, _), (north, east, _) = convert_to_geodetic(
+        town.geo, np.array(((x_low, y_low, 0.0), (x_high, y_high, 0.0)))
+    ).tolist()
+    above = axes.secondary_xaxis("top", functions=_map_linearly((x_low, x_high), (west, east)))
+    right = axes.secondary_yaxis("right", functions=_map_linearly((y_low, y_high), (south, north)))
+    for owner, axis, side, signs in ((above, above.xaxis, "top", "EW"), (right, right.yaxis, "right", "NS")):
+        axis.set_major_locator(MaxNLocator(4, steps=[1, 2, 5, 10]))
+        axis.set_major_formatter(lambda value, _, signs=signs: f"{abs(value):.7g}° {signs[int(value < 0)]}")
+        axis.set_tick_params(length=3, width=0.6)
+        owner.spines[side].set_visible(True)
+
+
+def _map_linearly(
+    one: tuple[float, float], other: tuple[float, float]
+) -> tuple[Callable[[ArrayLike], ArrayLike], Callable[[ArrayLike], ArrayLike]]:
+    """Return the linear function that maps the ends of one interval to those of the other, and its inverse."""
+    slope = (other[1] - other[0]) / (one[1] - one[0])
+    return (
+        lambda value: other[0] + (np.asarray(value) - one[0]) * slope,
+        lambda value: one[0] + (np.asarray(value) - other[0]) / slope,
+    )
+
+
+def draw_street_names(axes: Axes, scene: ErrorMap) -> None:
+    """Write the names of the town's streets along them, once each, where there is room and no sensor."""
+    figure = axes.figure.get_figure(root=True)
+    metres_per_pt = (scene.town.bounds[2] - scene.town.bounds[0]) / (72 * figure.get_figwidth())
+    taken = [scene.poles[number][:2] for number in scene.chosen]
+    for name, lines in list_street_names(scene.town).items():
+        wide_m = LINE_EM * style.SMALL * len(name) * metres_per_pt
+        rooms = [line for line in map(LineString, lines) if line.length >= ROOM * wide_m]
+        free = [min((line.distance(Point(at)) for at in taken), default=0.0) for line in rooms]
+        if not rooms:
+            continue
+        line = rooms[int(np.argmax(free))]
+        middle, ahead = (line.interpolate(line.length / 2 + step) for step in (0.0, 1.0))
+        turn = np.degrees(np.arctan2(ahead.y - middle.y, ahead.x - middle.x))
+        upright = (turn + 90) % 180 - 90
+        look: dict[str, Any] = {"fontsize": style.SMALL, "fontstyle": "italic", "color": style.MUTED}
+        at = {"ha": "center", "va": "center", "rotation": upright, "rotation_mode": "anchor", "zorder": 4.5}
+        axes.text(middle.x, middle.y, name, path_effects=HALO, clip_on=True, **look, **at)
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
@@ -141,12 +207,15 @@ def _plot_errors(axes: Axes, scene: ErrorMap) -> None:
     own_kinds = [kind for kind in dict.fromkeys(scene.kind.tolist()) if kind not in KINDS]
     looks = KINDS | {kind: (kind, OTHERS[i % len(OTHERS)]) for i, kind in enumerate(own_kinds)}
     rest = "" if scene.covered is None else ", uncovered"
+    crowd = {"markersize": 3.5} if len(scene.errors) > DENSE else {}
     states = ((rest, ~covered, {}), (", covered", covered, {"color": style.BLUE}))
     for state, chosen, colour in states:
         for kind, (label, look) in looks.items():
             if (own := (scene.kind == kind) & chosen).any():
                 name = f"{label}{state} ({own.sum()})"
-                axes.plot(*scene.errors[own, :2].T, linestyle="none", label=name, zorder=5.5, **{**look, **colour})
+                axes.plot(
+                    *scene.errors[own, :2].T, linestyle="none", label=name, zorder=5.5, **{**look, **colour, **crowd}
+                )
 
 
 def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
@@ -159,14 +228,23 @@ def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
         face, ink, label = (style.BLUE, "white", "sensor") if chosen else ("white", style.INK, "candidate pole")
         look: dict[str, Any] = {
             "color": face,
-            "markeredgecolor": style.INK,
-            "zorder": 4 if small else 5,
+            "markeredgecolor": "white" if chosen else style.INK,
+            "zorder": 4 if small else 8 if chosen else 5,
             "linestyle": "none",
         }
-        shape, size = "s" if number in ruled else "o", 4 if small else 13
+        shape, size = "s" if number in ruled else "o", 4 if small else 14 if chosen else 13
         axes.plot(x, y, shape, markersize=size, **look)
         if not small:
-            axes.text(x, y, number, ha="center", va="center_baseline", fontsize=style.SMALL, color=ink, zorder=6)
+            axes.text(
+                x,
+                y,
+                number,
+                ha="center",
+                va="center_baseline",
+                fontsize=style.SMALL,
+                color=ink,
+                zorder=9 if chosen else 6,
+            )
         for name, sign in ((label, "o"), *((("of a conventional rule", "s"),) if shape == "s" else ())):
             if name not in known:
                 axes.plot([], [], sign, markersize=7, label=name, **look)
@@ -185,5 +263,5 @@ def draw_density(axes: Axes, scene: ErrorMap) -> None:
     levels = MaxNLocator(6).tick_values(0.0, float(per_hectare.max()))[1:]  # the least dense zone is left blank
     zones = axes.contourf(x, y, per_hectare, levels, cmap=HEAT, alpha=0.5, zorder=1.2, extend="neither")
     bar = axes.figure.colorbar(zones, ax=axes, shrink=0.6, pad=0.02, aspect=25)
-    bar.set_label("errors per hectare", color=style.MUTED)
+    bar.set_label(f"{scene.noun}s per hectare", color=style.MUTED)
     bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]

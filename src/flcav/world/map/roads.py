@@ -3,11 +3,13 @@
 Format: https://sumo.dlr.de/docs/Networks/SUMO_Road_Networks.html
 """
 
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Container, Iterable, Iterator
+from collections.abc import Callable, Container, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
+from xml.sax.saxutils import quoteattr
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,6 +45,7 @@ class Edge:
     end: str  # id of the junction it leads to; empty inside a junction
     type: str  # street type of the town's parameters
     lanes: tuple[Lane, ...]  # from the kerb to the middle of the road
+    name: str = ""  # of the street; empty where the net has none
 
     def lanes_of(self, kind: str) -> tuple[Lane, ...]:
         """Return the lanes of a kind, from the kerb to the middle."""
@@ -158,7 +161,8 @@ def _edge(row: ElementTree.Element) -> Edge:
         )
         for lane in row.iterfind("lane")
     )
-    return Edge(row.attrib["id"], function, row.get("from", ""), row.get("to", ""), row.get("type", ""), lanes)
+    ends = (row.get("from", ""), row.get("to", ""))
+    return Edge(row.attrib["id"], function, *ends, row.get("type", ""), lanes, row.get("name", ""))
 
 
 def _lane_kind(function: str, lane: ElementTree.Element) -> LaneKind:
@@ -182,6 +186,20 @@ def _number(text: str) -> float:
     if not abs(value) <= FARTHEST_M:
         raise ValueError(f"{shorten(text)} is no place in a town")
     return value
+
+
+EDGE = re.compile(r'(<edge id="([^":]+)"(?: from="[^"]*")?(?: to="[^"]*")?)')
+
+
+def name_streets(net: Path, name_of: Callable[[str], str]) -> None:
+    """Write into a net file the names of streets: `name_of` an edge's id, "" where it has none."""
+
+    def add(found: re.Match[str]) -> str:
+        name = name_of(found[2])
+        return f"{found[0]} name={quoteattr(name)}" if name else found[0]
+
+    text = net.read_text(encoding="utf-8")
+    net.write_text(EDGE.sub(add, text), encoding="utf-8")
 
 
 SHORTEST_M = 20.0  # length of lane above which a route may begin on it

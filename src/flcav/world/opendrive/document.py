@@ -1,6 +1,7 @@
 """Reading of an OpenDRIVE file and its attributes other than geometry: geo-reference, road types, limits, stops."""
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,6 +13,8 @@ from flcav.world.opendrive.standard import check_standard
 FASTEST = 100.0  # highest speed limit that is believed [m/s]
 STOP_SIGN = "206"  # type of a <signal>: its number in the German catalogue of signs, as in CARLA's maps
 TO_METRES_PER_SECOND = {"m/s": 1.0, "km/h": 1 / 3.6, "mph": 0.44704}
+NUMBERED = re.compile(r"(road|unnamed|r)?[\s_-]*\d*", re.IGNORECASE)  # names that are none
+LONGEST = 60  # characters of a street's name
 OPEN_ROADS = ("rural", "motorway", "highway")  # types of roads outside towns
 
 
@@ -21,6 +24,7 @@ class RoadType:
 
     kind: str  # type of the first <type>: town, rural, motorway, ...; "unknown" without one
     speed: float | None  # speed limit of the first <type>, else of the first speed-limit sign [m/s]; None without both
+    name: str = ""  # of the street; empty where it has none, or only a number
 
 
 @dataclass(frozen=True)
@@ -110,15 +114,16 @@ def _offset(row: ElementTree.Element | None) -> MapOffset:
 def _road(row: ElementTree.Element) -> RoadType:
     limits = [limit for signal in row.iterfind("signals/signal") if (limit := read_limit(signal)) is not None]
     signed = limits[0] if limits else None
-    first = row.find("type")
+    first, name = row.find("type"), " ".join(row.get("name", "").split())
+    name = name if name.isprintable() and len(name) <= LONGEST and not NUMBERED.fullmatch(name) else ""
     if first is None:
-        return RoadType("unknown", signed)
+        return RoadType("unknown", signed, name)
     limit = first.find("speed")
     try:
         speed = float(limit.get("max", "")) * TO_METRES_PER_SECOND[limit.get("unit", "m/s")] if limit is not None else 0
     except (ValueError, KeyError):
         speed = 0.0  # "no limit", "undefined"
-    return RoadType(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else signed)
+    return RoadType(first.get("type", "unknown"), speed if 0 < speed <= FASTEST else signed, name)
 
 
 def _stops(row: ElementTree.Element) -> list[str]:

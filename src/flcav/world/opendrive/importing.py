@@ -19,7 +19,7 @@ from flcav.machine.locks import only_writer
 from flcav.storage.files import find_existing, flush_tree
 from flcav.world.map.parameters import GeoReference, MapSource
 from flcav.world.map.relief import Deck, Relief
-from flcav.world.map.roads import RoadNet
+from flcav.world.map.roads import RoadNet, name_streets
 from flcav.world.map.town import HEIGHTS, Town, check_town_name, load_town
 from flcav.world.opendrive.document import describe_map, read_map
 from flcav.world.opendrive.furnishing import furnish, take_objects
@@ -29,7 +29,7 @@ from flcav.world.opendrive.mending import mend_map, mend_roads
 from flcav.world.opendrive.netconvert import join_parts, name_safely, split_map
 from flcav.world.opendrive.objects.crossings import find_crosswalks
 from flcav.world.opendrive.objects.places import note_taken
-from flcav.world.opendrive.streets import read_made_net, rewrite_streets
+from flcav.world.opendrive.streets import find_road, read_made_net, rewrite_streets
 
 WIDEST_M = 5e5  # largest coordinate of a street in the town's frame
 GAPS_M = 5000.0  # largest total length of the gaps between linked roads that streets span, both directions together
@@ -107,6 +107,7 @@ def _import(xodr: Path, out: Path) -> ImportedTown:
         crossed = join_parts(
             prefix, folder / "town.net.xml", xodr, left_hand=document.left_hand, crosswalks=crosswalks.found
         )
+        name_streets(folder / "town.net.xml", lambda edge: find_road(edge, document).name)
         roads_m = sum(float(road.attrib["length"]) for road in root.iterfind("road"))
         net = _read_joined(folder / "town.net.xml", xodr, roads_m)
         nowhere = Counter({"no street between two sidewalks there": len(crosswalks.found) - crossed})

@@ -63,7 +63,7 @@ def rewrite_streets(prefix: Path, document: Document, origin: Path) -> MapChange
     index_of: dict[str, dict[int, int]] = {}  # edge -> index of a lane with traffic in the map -> in the town
     added = False
     for row in rows:
-        road = _road(row.attrib["id"], document)
+        road = find_road(row.attrib["id"], document)
         lanes = _lanes(row, road, add)
         if not any(lane.kind == "driving" for lane in lanes):
             edges.getroot().remove(row)
@@ -108,7 +108,7 @@ def _write_widths(rows: list[ElementTree.Element], net: RoadNet) -> None:
             ElementTree.SubElement(row, "lane", {**lane, "index": str(i), "width": f"{exact:.2f}"})
 
 
-def _road(edge: str, document: Document) -> RoadType:
+def find_road(edge: str, document: Document) -> RoadType:
     """Return the road of an edge, whose id in netconvert is the road's with a sign in front and a section behind.
 
     A closed road is cut into "1#0", "1#1".
