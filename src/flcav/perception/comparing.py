@@ -65,8 +65,8 @@ def compare(
     configs = [each.config for each in networks]
     frames = _choose_common(dataset, [choose_frames(*own, dataset, agents) for own in zip(tasks, configs, strict=True)])
     asked, told = _share_targets(tasks, configs)
-    outcomes = [_test(*own, dataset, frames, asked, progress) for own in zip(tasks, networks, strict=True)]
-    return compare_outcomes(tasks[0], *outcomes, len(frames), told)
+    before, after = (_test(*own, dataset, frames, asked, progress) for own in zip(tasks, networks, strict=True))
+    return compare_outcomes(tasks[0], before, after, len(frames), told)
 
 
 def read_task(weights: Sequence[Path]) -> str:
