@@ -113,6 +113,8 @@ def _plan(
     beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
     yield _as_json(plan, shares, more) | beside_it
     yield _table(plan)
+    if any(task.accuracy_low is not None for task in plan.tasks):
+        yield Text("In brackets: the band of the predicted accuracy.")
     yield from map(Text, _describe(asked, plan, more))
     if shares:
         yield _table_vehicles(shares)
@@ -136,6 +138,10 @@ def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> 
 def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
     """Return the plan as a JSON value: links by name, without empty optional fields."""
     values = dataclasses.asdict(plan)
+    for task in values["tasks"]:
+        for name in ("accuracy_low", "accuracy_high"):
+            if task[name] is None:
+                del task[name]
     values["tasks"] = [_given(task, "upper_error", "members", "called") for task in values["tasks"]]
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
@@ -185,14 +191,13 @@ def _describe_baseline(beside: "Baseline", plan: "Allocation") -> str:
 def _table(plan: "Allocation | Baseline") -> "Table":
     from rich.table import Table
 
-    table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))
+    table = Table("task", *("samples", "edge rounds", "cloud rounds", "accuracy", "wireless MB", "wireline MB"))
     for task in plan.tasks:
         counts = (str(task.samples), str(task.edge_rounds), str(task.cloud_rounds))
-        upper = "" if task.upper_error is None else f" (up to {task.upper_error:{SHOWN}})"
-        error = f"{task.predicted_error:{SHOWN}}{upper}"
-        table.add_row(task.name, *counts, error, f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
+        sent = (f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
+        table.add_row(task.name, *counts, task.describe_accuracy(), *sent)
         for member in task.members:
-            table.add_row(f"  {member.name}", "", "", "", f"{member.predicted_error:{SHOWN}}", "", "")
+            table.add_row(f"  {member.name}", "", "", "", f"{max(1 - member.predicted_error, 0):.2f}", "", "")
     return table
 
 
