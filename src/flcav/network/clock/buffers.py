@@ -41,6 +41,8 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
     The clock begins at 0 s. A vehicle that is not in a scene is absent in it. Raises `InputError` where all scenes
     have one instant, or other units.
     """
+    if scenes[0].measured_bps is not None:
+        scenes = scenes[:1]  # measured rates repeat by themselves
     names = tuple(dict.fromkeys(name for links in scenes for name in links.vehicle))
     first, spans = scenes[0], [float(links.time_s[-1] - links.time_s[0]) for links in scenes]
     if not sum(spans):
@@ -59,7 +61,8 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
         states.append(state)
         losses.append(loss)
     joined = (np.concatenate(each) for each in (distances, states, losses))
-    return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined), sum(spans)
+    measured = None if first.measured_bps is None else first.measured_bps[:-1]
+    return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined, measured), sum(spans)
 
 
 class BufferClock(ClientPhases):
