@@ -2,17 +2,17 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 from flcav.config import InputError
 
 PERCENT = re.compile(r"_?(percentage|percent|pct)")
-Columns = Mapping[str, Sequence[Any]]  # by name
+Cell = str | float | None
+Columns = Mapping[str, Sequence[Cell]]  # by name
 
 
 def find_columns(
     columns: Columns, names: Mapping[str, Sequence[str]], origin: str
-) -> tuple[dict[str, Sequence[Any]], tuple[str, ...]]:
+) -> tuple[dict[str, Sequence[Cell]], tuple[str, ...]]:
     """Return a table with its columns renamed to the keys of `names`, and a sentence on each that had another name.
 
     names: other names of a column, in lower case, with underscores for whatever is neither a letter nor a digit: so
@@ -27,7 +27,8 @@ def find_columns(
     for title in columns:
         plain = _plain(title)
         found.setdefault(of.get(plain) or of.get(PERCENT.sub("", plain).strip("_")) or title, []).append(title)
-    renamed, told = {}, []
+    renamed: dict[str, Sequence[Cell]] = {}
+    told = []
     for name, titles in found.items():
         if name in titles:  # further columns that could be this one are others
             renamed |= {title: columns[title] for title in titles}
@@ -47,5 +48,5 @@ def _plain(title: str) -> str:
     return re.sub(r"[^a-z0-9]+", "_", title.replace("%", " percent ").lower()).strip("_")
 
 
-def _share(value: Any) -> Any:
+def _share(value: Cell) -> Cell:
     return value / 100 if isinstance(value, int | float) else value

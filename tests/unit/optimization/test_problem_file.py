@@ -200,6 +200,8 @@ def test_a_plan_has_the_band_of_its_accuracy_and_says_what_its_history_lacks() -
     (task,) = plan.tasks
     assert task.samples == 75
     low, high = (float(edge[0]) for edge in band.between(np.array([[75.0, 0, 0]])))
+    assert task.accuracy_low is not None
+    assert task.accuracy_high is not None
     assert task.accuracy_low == pytest.approx(1 - high, abs=0.01)
     assert task.accuracy_high == pytest.approx(1 - low, abs=0.01)
     assert task.accuracy_low < 1 - task.predicted_error < task.accuracy_high

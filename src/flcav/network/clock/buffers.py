@@ -60,9 +60,10 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
         distances.append(distance)
         states.append(state)
         losses.append(loss)
-    joined = (np.concatenate(each) for each in (distances, states, losses))
+    distance, state, loss = (np.concatenate(each) for each in (distances, states, losses))
     measured = None if first.measured_bps is None else first.measured_bps[:-1]
-    return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined, measured), sum(spans)
+    clock = np.concatenate(times)
+    return RadioLinks(first.radio, clock, names, first.unit, distance, state, loss, measured), sum(spans)
 
 
 class BufferClock(ClientPhases):

@@ -118,6 +118,12 @@ def link_measured(measured: Throughput, radio: Radio, vehicles: Sequence[str], r
     """Return the measured wireless links of vehicles, "cav0" of the `region`, to one unit, repeated for `REPEATED_S`.
 
     Nobody shares a band: a rate is what was measured. Raises `InputError` for a vehicle that was not measured.
+
+    Args:
+        measured: rates of the vehicles.
+        radio: settings that the links are given, and that nothing is computed from.
+        vehicles: names of the vehicles, without their region.
+        region: their region; "": the names in the table are theirs.
     """
     prefix = f"{region}/" if region else ""
     own = [measured.find(prefix + name) for name in vehicles]
