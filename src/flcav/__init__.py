@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from flcav.geometry import Boxes
     from flcav.network import Ledger, StagePlan, price
     from flcav.optimization import Problem, allocate, fit, load_problem, place
-    from flcav.perception import TASKS, evaluate, infer, register_errors, task_named, train
+    from flcav.perception import TASKS, compare, evaluate, infer, register_errors, task_named, train
     from flcav.runs import RunRecipe, load_run_recipe, run
     from flcav.sensors import Frame
     from flcav.sources import Recipe, load_recipe
@@ -35,6 +35,7 @@ PLACES = {
     "record": "flcav.dataset",
     "validate": "flcav.dataset",
     "TASKS": "flcav.perception",
+    "compare": "flcav.perception",
     "evaluate": "flcav.perception",
     "infer": "flcav.perception",
     "register_errors": "flcav.perception",

@@ -1,12 +1,16 @@
 """`flcav radio` and `flcav rounds`: rates of a recording's vehicles by radio, and federated rounds over it."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import check_all_finite, check_finite, check_png
 from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
+
+if TYPE_CHECKING:
+    from flcav.network.clock.rounds import NetworkSettings
 
 POLES = typer.Option(
     [],
@@ -18,6 +22,17 @@ NETWORK = typer.Option(
     None, "--network", help="YAML of the network's settings: radio, wireline, rounds; see docs/network.md."
 )
 SEED = typer.Option(0, "--seed", min=0, help="Seed of shadowing and of the losses by vehicles.")
+
+
+def read_radio_settings(path: Path | None) -> "NetworkSettings":
+    """Return the settings of a network in a YAML file, None: the defaults; raises `InputError` for measured rates."""
+    from flcav.config import InputError, read_config
+    from flcav.network.clock.rounds import NetworkSettings
+
+    settings = NetworkSettings() if path is None else read_config(NetworkSettings, path)
+    if settings.throughput is not None:
+        raise InputError(f"{path}: throughput: measured rates are for `flcav run`, `rounds` and `allocate`, not here")
+    return settings
 
 
 @answer_json
@@ -38,16 +53,14 @@ def radio(
     """
     from dataclasses import asdict
 
-    from flcav.config import read_config
     from flcav.dataset.store import Dataset
-    from flcav.network.clock.rounds import NetworkSettings
     from flcav.network.radio.budget import PathState
     from flcav.network.radio.recorded import cover_town, link_scene, summarise_links
     from flcav.storage.files import check_writable, write_bytes
 
     if map_ is not None:
         check_writable(map_.parent)
-    settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)
+    settings = read_radio_settings(network)
     recorded = link_scene(Dataset.open(folder), settings.radio, pole, scene, seed)
     links, found = recorded.links, summarise_links(recorded.links)
     if map_ is not None:
@@ -138,7 +151,14 @@ def rounds(
         if path is not None:
             check_writable(path.parent)
     settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)
-    links = link_scene(Dataset.open(folder), settings.radio, pole, scene, seed).links
+    if settings.throughput is None:
+        links = link_scene(Dataset.open(folder), settings.radio, pole, scene, seed).links
+    else:
+        from flcav.network.radio.measured import link_measured, load_throughput
+
+        assert network is not None
+        measured = load_throughput(network.parent / settings.throughput)
+        links = link_measured(measured, settings.radio, tuple(measured.rates["wireless"]))
     down = round(model_mb * BYTES_PER_MB)
     up = down if update_mb is None else round(update_mb * BYTES_PER_MB)
     work = {

@@ -85,7 +85,7 @@ def evaluate(
     task: str = typer.Argument(metavar="TASK", help=f"What was learned: {ANY_TASK}."),
     data: Path = typer.Option(..., "--data", help="Dataset folder; objects: or one in KITTI's layout."),
     weights: Path | None = typer.Option(
-        None, "--weights", help="Weights that flcav train wrote; by default those of the package."
+        None, "--weights", help="Weights that flcav train wrote; packaged, the default: those of the package."
     ),
     device: Device = typer.Option(Device.auto, "--device", help="Where it runs; auto: a GPU where there is one."),
     tracks: bool = typer.Option(False, "--tracks", help="objects: also MOTA, AMOTA and id switches of their tracks."),
@@ -137,7 +137,7 @@ def infer(
         help="Point clouds of KITTI, nuScenes, PCD (objects) or PNG, JPEG and WebP files, folders of them, or datasets."
     ),
     weights: Path | None = typer.Option(
-        None, "--weights", help="Weights that flcav train wrote; by default those of the package."
+        None, "--weights", help="Weights that flcav train wrote; packaged, the default: those of the package."
     ),
     threshold: float | None = typer.Option(
         None,
@@ -203,7 +203,7 @@ def errors(
     data: Path = typer.Option(..., "--data", help="Dataset folder: where the network drives."),
     out: Path = typer.Option(..., "--out", help="The table to write: .csv or .parquet."),
     weights: Path | None = typer.Option(
-        None, "--weights", help="Weights that flcav train wrote; by default those of the package."
+        None, "--weights", help="Weights that flcav train wrote; packaged, the default: those of the package."
     ),
     threshold: float | None = typer.Option(
         None,

@@ -142,17 +142,23 @@ def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str
 
 @answer_json
 def compare(
-    first: Path = typer.Argument(help="Folder of a run, of one seed or several; with --data, a file of weights."),
-    second: Path = typer.Argument(help="Folder of another, with the same test frames; or a file of weights."),
+    first: Path = typer.Argument(
+        help="Folder of a run, of one seed or several; with --data, a file of weights, or packaged: the package's."
+    ),
+    second: Path = typer.Argument(help="Folder of another, with the same test frames; or weights, as the first."),
     data: Path | None = typer.Option(None, "--data", help="Dataset that two networks are compared on."),
-    task: str | None = typer.Option(None, "--task", help="Task of the networks, if not that of the first one's card."),
+    task: list[str] = typer.Option(
+        [],
+        "--task",
+        help="Task of the networks, if not that of a card; module:NAME for one of your own; given twice, that of each.",
+    ),
     agents: str | None = AGENTS,
 ) -> Answer:
     """Compare two runs, or two networks on a dataset: differences, second minus first, on the same frames."""
     if data is not None:
         yield from _compare_networks(first, second, data, task, agents)
         return
-    for option, value in (("--task", task), ("--agents", agents)):
+    for option, value in (("--task", task or None), ("--agents", agents)):
         if value is not None:
             raise InputError(f"{option}: only two networks have one, and without --data two runs are compared")
     from flcav.runs.comparing import compare as compare_runs
@@ -169,15 +175,16 @@ def compare(
         )
 
 
-def _compare_networks(first: Path, second: Path, data: Path, task: str | None, agents: str | None) -> Answer:
+def _compare_networks(first: Path, second: Path, data: Path, task: list[str], agents: str | None) -> Answer:
     from flcav.interface.progress import show_progress
-    from flcav.perception.networks import compare_networks
-    from flcav.perception.weights import read_card
+    from flcav.perception.comparing import compare, read_task
 
     if odd := next((path for path in (first, second) if path.is_dir()), None):
         raise InputError(f"{odd}: a folder; with --data two files of weights are compared")
+    if len(task) > 2:
+        raise InputError(f"--task: given {len(task)} times, and two networks have at most one each")
     with show_progress(f"compare on {data}") as report:
-        asked = task or read_card(first).task
-        found = compare_networks(asked, data, first, second, agents=agents, progress=report)
+        named = task or [read_task((first, second))]
+        found = compare((named[0], named[-1]), data, first, second, agents=agents, progress=report)
     yield found.as_json()
     yield from found.lines()

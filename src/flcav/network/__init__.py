@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from flcav.network.plan import MessageSizes, StagePlan, price
     from flcav.network.radio.budget import Radio
     from flcav.network.radio.links import RadioLinks, Wireline, link_vehicles
+    from flcav.network.radio.measured import Throughput, link_measured, load_throughput
     from flcav.network.radio.recorded import Coverage, RecordedScene, cover_town, link_scene
 
 PLACES = {
@@ -31,6 +32,9 @@ PLACES = {
     "Radio": "flcav.network.radio.budget",
     "RadioLinks": "flcav.network.radio.links",
     "link_vehicles": "flcav.network.radio.links",
+    "Throughput": "flcav.network.radio.measured",
+    "link_measured": "flcav.network.radio.measured",
+    "load_throughput": "flcav.network.radio.measured",
     "RecordedScene": "flcav.network.radio.recorded",
     "link_scene": "flcav.network.radio.recorded",
     "Coverage": "flcav.network.radio.recorded",

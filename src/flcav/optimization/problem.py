@@ -110,6 +110,7 @@ class AllocationTask(Quantities):
     limits: Limits
     curve: Curve
     upper: Curve | None = None  # the upper band of `curve`, for robust plans
+    lower: Annotated[Curve | None, LEFT_OUT] = None  # its lower band: with the upper, that of the predicted accuracy
     measured: Measured = Measured()
     performance_without: Fraction | None = None  # of the whole system when this task is left out
 

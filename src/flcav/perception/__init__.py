@@ -6,13 +6,13 @@ from flcav.interface.fields import lazy_names
 
 if TYPE_CHECKING:
     from flcav.perception.client import TaskClient
+    from flcav.perception.comparing import compare
     from flcav.perception.errors import PerceptionError, Registry, load_errors, save_errors
     from flcav.perception.marks import Bars, CloudBoxes, Paths, PictureBoxes
     from flcav.perception.networks import (
         Evaluation,
         Inference,
         TrainedNetwork,
-        compare_networks,
         evaluate,
         infer,
         register_errors,
@@ -37,7 +37,7 @@ PLACES = {
     "Evaluation": "flcav.perception.networks",
     "Inference": "flcav.perception.networks",
     "TrainedNetwork": "flcav.perception.networks",
-    "compare_networks": "flcav.perception.networks",
+    "compare": "flcav.perception.comparing",
     "evaluate": "flcav.perception.networks",
     "infer": "flcav.perception.networks",
     "register_errors": "flcav.perception.networks",

@@ -1,8 +1,8 @@
 """Training, evaluation and inference of a task's networks, and registration of their mistakes.
 
 In all functions a task is a `Task` or its name on the command line (`flcav.perception.tasks`), data are a dataset or
-its folder, and a network is one in memory, a file of weights, or None for the task's weights in the package. They
-compute on one thread unless `threads` says otherwise: another number changes the last bits of weights.
+its folder, and a network is one in memory, a file of weights, or "packaged" (None) for the task's weights in the package.
+They compute on one thread unless `threads` says otherwise: another number changes the last bits of weights.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -26,12 +26,11 @@ from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.objects.truth import narrow_range
-from flcav.perception.outcomes import NetworkComparison, as_measurable, compare_outcomes
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
 from flcav.perception.tasks import TASKS, task_named
 from flcav.perception.tracking import evaluate_tracks, group_sequences
 from flcav.perception.training.run import WEIGHTS, TrainingRequest, train_network
-from flcav.perception.weights import Card, find_recorded_lidar, find_shipped, join_lidars, load_network, read_card
+from flcav.perception.weights import Card, find_recorded_lidar, find_weights, join_lidars, load_network, read_card
 
 Named = str | Task
 Data = Dataset | Path | str
@@ -185,48 +184,6 @@ def evaluate(
     return Evaluation(learned.name, evaluated.score, chosen, evaluated.as_json(), tuple(evaluated.lines()))
 
 
-def compare_networks(
-    task: Named,
-    data: Data,
-    first: Weights,
-    second: Weights,
-    *,
-    agents: str | None = None,
-    device: str = "auto",
-    threads: int = 1,
-    progress: Report = print_progress,
-) -> NetworkComparison:
-    """Compare two networks on the same recorded frames, paired over scenes: the second minus the first.
-
-    Raises `InputError` where task, data, weights, device or agents are unusable, where the networks use different
-    frames, or these hold nothing to find.
-
-    Args:
-        task: a name of `TASKS`, `module:NAME`, or the task itself.
-        data: dataset or its folder.
-        first: the network or its file of weights; None: that of the package.
-        second: the network that is compared with it, likewise.
-        agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
-        device: "auto", "cpu" or "cuda".
-        threads: number of CPU threads.
-        progress: callback for the frames done so far and in total.
-
-    >>> from flcav.perception import compare_networks
-    >>> same = compare_networks("weather", "data", None, None)  # the network of the package, with itself
-    >>> same.difference.mean, same.verdict
-    (0.0, 'undecided')
-    """
-    use_threads(threads)
-    learned = resolve_task(task)
-    dataset = open_data(data)
-    tested = [resolve_network(learned, network, device) for network in (first, second)]
-    chosen = [choose_frames(learned, network.config, dataset, agents).frames for network in tested]
-    if chosen[0] != chosen[1]:
-        raise InputError(f"{dataset.folder}: the networks use different frames of it, so that none are paired")
-    before, after = (as_measurable(learned).outcomes(network, dataset, chosen[0], progress) for network in tested)
-    return compare_outcomes(learned, before, after, len(chosen[0]))
-
-
 def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:
     tested = resolve_network(task, network, device)
     evaluated = evaluate_kitti(tested, folder, progress)
@@ -346,7 +303,7 @@ def resolve_network(task: Task[ConfigT, NetworkT, SampleT], network: Weights, de
     """
     if isinstance(network, nn.Module):
         return cast(NetworkT, network)  # the caller answers for its type
-    return load_network(task, Path(network or find_shipped(task))).to(select_device(device))
+    return load_network(task, find_weights(task, network)).to(select_device(device))
 
 
 def _turned(task: Task, network: Any, around: bool) -> Any:
@@ -361,7 +318,7 @@ def _check_around(task: Task, around: bool) -> None:
 
 def find_trained_lidar(task: Task, network: Weights) -> KnownLidar:
     """Return the LiDARs that a network was trained with, as far as its card says."""
-    card = None if isinstance(network, nn.Module) else _find_card(Path(network or find_shipped(task)))
+    card = None if isinstance(network, nn.Module) else _find_card(find_weights(task, network))
     if card is None:
         return KnownLidar()
     return join_lidars([find_recorded_lidar(entry.recipe, entry.agents) for entry in card.data])
@@ -391,7 +348,7 @@ def origin_of(task: Task, weights: Path | None) -> Origin:
 
     Raises `InputError` for None if the task has no weights in the package.
     """
-    path = weights or find_shipped(task)
+    path = find_weights(task, weights)
     card = _find_card(path)
     return Origin(None, None, str(path)) if card is None else Origin(card.network, card.seed, str(path))
 

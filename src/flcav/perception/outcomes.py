@@ -10,7 +10,7 @@ import zlib
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Annotated, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,7 +28,7 @@ from flcav.statistics.seeds import SharedScenes
 from flcav.statistics.streams import stream
 from flcav.statistics.verdicts import verdict
 from flcav.storage.files import atomic_path
-from flcav.storage.records import Record
+from flcav.storage.records import WHERE_TRUE, Record
 
 SCENE = "scene"
 Times = Ints  # (n, N) how often each of N units is drawn in each of n bootstrap samples
@@ -88,6 +88,33 @@ class Measurable(Protocol):
 
     def numbers(self, outcomes: Outcomes) -> Mapping[str, float | None]:
         """Return further numbers by name; None where one is undefined."""
+        ...
+
+
+@runtime_checkable
+class SharesTargets(Protocol):
+    """A `Measurable` task whose networks may look for different things: two are compared on what both look for."""
+
+    def describe_targets(self, config: Any) -> str:
+        """Return what a network of `config` looks for, in words that are the same for networks of the same targets."""
+        ...
+
+    def share_targets(self, configs: Sequence[Any]) -> Any:
+        """Return a configuration of what networks of all `configs` look for; raises `InputError` where that is nothing.
+
+        `outcomes` takes it as `asked`: other targets are then left out, and what the network found of them.
+        """
+        ...
+
+    def outcomes(
+        self,
+        network: nn.Module,
+        data: Dataset,
+        frames: Sequence[int],
+        progress: Report = ignore_progress,
+        asked: Any = None,
+    ) -> Outcomes:
+        """Return the outcomes of `network` on the frames, as `Measurable`; with `asked` of these targets alone."""
         ...
 
 
@@ -209,6 +236,7 @@ class NetworkComparison(Record):
     second: float
     difference: Estimate  # with its interval over scenes (95 %, bootstrap); without one for a single scene
     verdict: str  # of the claim that the second network is better on such frames
+    targets: Annotated[str, WHERE_TRUE] = ""  # of both networks, in words, where theirs differ
 
     def lines(self) -> list[str]:
         """Return the comparison in words."""
@@ -218,12 +246,15 @@ class NetworkComparison(Record):
         both = f"{self.measure} of {self.task}: {self.first:.3f} -> {self.second:.3f}, {change.mean:+.3f}"
         return [
             f"{both} ({interval}) over {over}: {self.verdict}",
+            *([f"on what both look for: {self.targets}"] if self.targets else ()),
             "of these two networks; other trainings of the same settings differ besides",
         ]
 
 
-def compare_outcomes(task: Task, first: Outcomes, second: Outcomes, frames: int) -> NetworkComparison:
-    """Return the comparison of two networks, given their outcomes.
+def compare_outcomes(
+    task: Task, first: Outcomes, second: Outcomes, frames: int, targets: str = ""
+) -> NetworkComparison:
+    """Return the comparison of two networks given their outcomes; `targets` as in `NetworkComparison`.
 
     Raises `InputError` where their targets differ, or there are none.
     """
@@ -240,7 +271,7 @@ def compare_outcomes(task: Task, first: Outcomes, second: Outcomes, frames: int)
         raise InputError(f"the {plural(frames, 'frame')} hold nothing to find for '{task.name}'")
     change, scenes = Estimate(*difference(task, first, second)), len(np.unique(first.scene))
     decided = verdict(change.low, change.high)
-    return NetworkComparison(task.name, measurable.measure_name, frames, scenes, before, after, change, decided)
+    return NetworkComparison(task.name, measurable.measure_name, frames, scenes, before, after, change, decided, targets)
 
 
 def share_test_scenes(

@@ -214,6 +214,7 @@ def _nested(value: Any) -> str:
 
 PREFIX = "flcav."
 LARGEST = 1e9  # largest absolute value of a weight; larger ones overflow in a few layers
+PACKAGED = "packaged"  # names the weights of a task that come with the package, in place of a file
 SHIPPED = "shipped/weights.safetensors"  # relative to the folder of a task's module
 KINDS = (torch.float32, torch.float64, torch.float16, torch.bfloat16, torch.int64)  # of numbers in a file
 COUNTER = "num_batches_tracked"  # buffer of batch normalisation, unused with a fixed momentum
@@ -229,6 +230,24 @@ def find_shipped(task: Task, name: str = SHIPPED) -> Path:
     if not path.is_file():
         raise InputError(f"--weights is missing: no weights of '{task.family}' come with the package, train some first")
     return path
+
+
+def find_weights(task: Task, named: Path | str | None) -> Path:
+    """Return the file of weights `named`; of None and of `PACKAGED` the task's own in the package (`find_shipped`)."""
+    return find_shipped(task) if named is None or str(named) == PACKAGED else Path(named)
+
+
+def read_family(path: Path | str) -> str | None:
+    """Return the family of networks that a file of weights is of; None where it does not say.
+
+    Raises `DamagedFile` for what is no safetensors file.
+    """
+    return _find_family(_opened(Path(path))[0])
+
+
+def _find_family(metadata: Mapping[str, str]) -> str | None:
+    found = (name.removeprefix(PREFIX) for name in metadata if name.startswith(PREFIX) and name != CARD_KEY)
+    return next(found, None)
 
 
 def config_key(task: Task) -> str:
@@ -341,9 +360,12 @@ def _read(task: Task[ConfigT, NetworkT, SampleT], path: Path) -> tuple[ConfigT, 
     metadata, tensors = _opened(path)
     key = config_key(task)
     if key not in metadata:
-        found = [name.removeprefix(PREFIX) for name in metadata if name.startswith(PREFIX) and name != CARD_KEY]
-        said = f"of '{found[0]}'" if found else f"no '{key}' in the file's metadata"
-        raise InputError(f"{path}: weights of another network ({said}); '{task.name}' takes those of '{task.family}'")
+        found = _find_family(metadata)
+        said = f"no '{key}' in the file's metadata" if found is None else f"of '{found}'"
+        raise InputError(
+            f"{path}: weights of another network ({said}); '{task.name}' takes those of '{task.family}', "
+            "and a network of your own has a task of your own, named module:NAME"
+        )
     try:
         return _adapter(task).validate_json(metadata[key]), tensors
     except ValidationError as error:

@@ -2,11 +2,14 @@
 
 Round n of a region is driven in one of the scenes of its training data, in turn, from the scene's first instant. The
 roadside units are on the poles of its sensors; a plan, which is made before these are placed, has one unit, on the pole
-with most traffic.
+with most traffic. With measured throughput (`flcav.network.radio.measured`) there are no scenes and no units: the
+rounds of a stage follow one another on the clock of the measurement, which repeats.
 """
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,11 +21,13 @@ from flcav.federation.selection import Selection
 from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_round
 from flcav.network.radio.links import RadioLinks
+from flcav.network.radio.measured import link_measured, load_throughput
 from flcav.network.radio.recorded import link_scene
 from flcav.runs.frames import Frames
 from flcav.runs.poles import find_sites, read_traces
-from flcav.runs.recipe import CLOUD
+from flcav.runs.recipe import CLOUD, find_path
 from flcav.runs.results.plans import Placed
+from flcav.storage.files import sha256
 from flcav.world.map.census import measure_traffic_density
 
 CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
@@ -68,11 +73,41 @@ def link_scenes(split: Frames, placed: Placed, settings: NetworkSettings, most: 
     Without chosen poles, the unit is on the pole with most traffic. Raises `InputError` where there is no pole, and as
     `link_scene`.
     """
+    scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))[:most]
+    if settings.throughput is not None:
+        return [_link_measured(placed.region, split, settings)] * len(scenes)
     if not placed.poles:
         raise InputError(f"federation.network: '{placed.region}' has no poles for roadside units")
-    scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))[:most]
     poles = placed.chosen or (placed.densest,)
     return [link_scene(split.data, settings.radio, poles, scene, seed).links for scene in scenes]
+
+
+def _link_measured(region: str, split: Frames, settings: NetworkSettings) -> RadioLinks:
+    """Return the measured links of the vehicles of a split."""
+    assert settings.throughput is not None
+    vehicles = list(dict.fromkeys(split.data.keys[i].agent for i in split.vehicles))
+    measured = load_throughput(settings.throughput, settings.throughput_sha256)
+    return link_measured(measured, settings.radio, vehicles, region)
+
+
+def fix_throughput(settings: NetworkSettings, beside: Path) -> NetworkSettings:
+    """Return settings with the file of measured rates found and its SHA-256 noted, and the wireline as measured.
+
+    The wireline has the lowest mean rate of its measured ones, if there are any. Raises `InputError` where the file is
+    missing, or holds no rates.
+    """
+    if settings.throughput is None:
+        return settings
+    path = find_path(settings.throughput, beside)
+    if path is None:
+        raise InputError(f"federation.network.throughput: there is no file {settings.throughput!r} in {beside}")
+    measured = load_throughput(path.absolute(), settings.throughput_sha256)
+    update: dict[str, Any] = {"throughput": str(path.absolute()), "throughput_sha256": sha256(path)}
+    if wired := [measured.mean_mbps(name, "wireline") for name in measured.rates["wireline"]]:
+        if min(wired) == 0:
+            raise InputError(f"{path}: a wireline without any throughput")
+        update["wireline"] = settings.wireline.model_copy(update={"rate_mbps": min(wired)})
+    return settings.model_copy(update=update)
 
 
 def drive_rounds(
@@ -95,17 +130,19 @@ def drive_rounds(
     records, joins, now = [], dict.fromkeys(fleet.clients, ()), 0.0
     for number, seed in enumerate(seeds, start=1):
         links = scenes[(earlier + number - 1) % len(scenes)]
-        present = {name for name, here in zip(links.vehicle, links.present[0].tolist(), strict=True) if here}
+        begins = float(links.time_s[0]) + (now % links.period_s if links.period_s else 0.0)
+        instant = int(np.searchsorted(links.time_s, begins, side="right")) - 1
+        present = {name for name, here in zip(links.vehicle, links.present[instant].tolist(), strict=True) if here}
         chosen = rules.selection.choose(fleet.clients, number, seed, earlier)
         outages |= {(number, each): Outage(AWAY) for each in chosen if fleet.work(each).client not in present}
         there = [each for each in chosen if (number, each) not in outages]
         if rules.selection.predicts:
-            slow = _find_slow(fleet, links, there, number, rules.selection.deadline_s or 0.0)
+            slow = _find_slow(fleet, links, there, number, rules.selection.deadline_s or 0.0, begins)
             outages |= {(number, each): Outage(TOO_SLOW) for each in slow}
             there = [each for each in there if each not in slow]
             joins |= {each: (*joins[each], number) for each in there}
-        timings = _time(fleet, links, there, number, settings.rounds)
-        shift = now - float(links.time_s[0])
+        timings = _time(fleet, links, there, number, settings.rounds, begins)
+        shift = now - begins
         for client, timing in timings.items():
             if timing.dropped:
                 outages[number, client] = Outage(timing.dropped, timing.uploaded_bytes)
@@ -118,17 +155,19 @@ def drive_rounds(
 
 
 def _time(
-    fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, rules: RoundRules
+    fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, rules: RoundRules, begins: float
 ) -> dict[str, ClientTiming]:
     if not clients:
         return {}
     work = [fleet.work(each) for each in clients]
-    return dict(zip(clients, time_round(links, work, number, float(links.time_s[0]), rules), strict=True))
+    return dict(zip(clients, time_round(links, work, number, begins, rules), strict=True))
 
 
-def _find_slow(fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, deadline_s: float) -> set[str]:
+def _find_slow(
+    fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, deadline_s: float, begins: float
+) -> set[str]:
     """Return the clients whose update is not predicted to arrive within `deadline_s` [s] of the round's start."""
-    timings = _time(fleet, links, clients, number, PATIENT)
+    timings = _time(fleet, links, clients, number, PATIENT, begins)
     return {name for name, t in timings.items() if t.dropped or t.end_s - t.start_s > deadline_s}
 
 
@@ -170,6 +209,8 @@ def link_drive(
     Traffic counts within `range_m` [m]. Of `recorded` data the poles are those that it was recorded from. Raises
     `InputError` where there is none, and as `link_scene`.
     """
+    if settings.throughput is not None:
+        return [_link_measured(region, drive, settings)]
     sites = find_sites(drive, drive if recorded else None)
     if not len(sites.number):
         raise InputError(f"federation.network: '{region}' has no poles for roadside units")
@@ -186,6 +227,10 @@ def measure_uplinks(
 
     Each vehicle has the whole band; where it is not in the town, its rate is 0. See `link_drive`.
     """
+    if settings.throughput is not None:
+        measured = load_throughput(settings.throughput, settings.throughput_sha256)
+        vehicles = dict.fromkeys(f"{region}/{drive.data.keys[i].agent}" for i in drive.vehicles)
+        return {name: measured.mean_mbps(name) for name in vehicles}
     rates = dict[str, list[float]]()
     for links in link_drive(region, drive, settings, range_m, seed, recorded=drive.data.town() is None):
         for vehicle, mean in zip(links.vehicle, links.rate_bps[:, :, 0].mean(axis=0) / 1e6, strict=True):

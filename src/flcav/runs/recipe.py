@@ -177,7 +177,7 @@ class TaskRecipe(Config):
 
     network: str | None = None  # name of a network configuration; default: the task's first
     weights: str | None = (
-        None  # file of weights of this network, from which training goes on; shipped: those of the package
+        None  # file of weights of this network, from which training goes on; packaged, or shipped: those of the package
     )
     weight: Positive = 1.0  # weight of the task's error in the plan's objective
     labels: str | None = None  # kind of labels in stages II and III; default: the task's first

@@ -68,3 +68,45 @@ def test_rows_without_a_name_and_columns_of_one_name_are_refused(
     path.write_text(f"{header}samples,edge_rounds,cloud_rounds,accuracy\n{row},10,0,0,0.3\n")
     with pytest.raises(InputError, match=said):
         load_history(path)
+
+
+NAMED = "N,FL rounds,Test accuracy (%)\n10,0,42\n20,0,55\n40,0,63\n80,0,70\n80,2,74\n80,4,75.5\n"
+
+
+def test_columns_are_read_by_the_names_that_people_give_them_and_told(tmp_path: Path) -> None:
+    (tmp_path / "mine.csv").write_text(NAMED)
+    found = load_history(tmp_path / "mine.csv")
+    plain = "samples,edge_rounds,cloud_rounds,accuracy\n"
+    rows = "10,0,0,.42\n20,0,0,.55\n40,0,0,.63\n80,0,0,.7\n80,2,0,.74\n80,4,0,.755\n"
+    (tmp_path / "plain.csv").write_text(plain + rows)
+    expected = load_history(tmp_path / "plain.csv")
+    assert found.resources.tolist() == expected.resources.tolist()
+    assert found.accuracy == pytest.approx(expected.accuracy)
+    assert expected.warnings == ()
+    assert found.warnings == (
+        "column 'N' is read as samples",
+        "column 'FL rounds' is read as edge_rounds",
+        "column 'Test accuracy (%)' is read as accuracy, divided by 100",
+        "no cloud_rounds in the table: 0 in every row, and the curve says nothing of them",
+    )
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("samples,loss", "column 'accuracy' is missing; .* of whose numbers one is enough; .*; found samples, loss"),
+        ("epoch,accuracy", "column 'samples' is missing; .*; found epoch, accuracy"),
+        ("stage,accuracy", "column 'resource' is missing"),
+        ("samples,val_acc,test_acc", "columns 'val_acc' and 'test_acc' are both accuracy: call the one that counts ac"),
+    ],
+)
+def test_a_table_without_what_a_history_needs_is_refused(header: str, said: str) -> None:
+    columns = {name: [0.5] for name in header.split(",")}
+    with pytest.raises(InputError, match=said):
+        parse_histories(columns, "history", "task")
+
+
+def test_a_column_of_its_own_name_counts_and_the_others_are_left() -> None:
+    columns = {"samples": [10], "frames": [99], "error": [0.4], "AP": [0.3], "weight": [2]}
+    found = parse_histories(columns, "history", "task")["task"]
+    assert (found.resources.tolist(), found.accuracy.tolist()) == ([[10, 0, 0]], [0.6])

@@ -8,7 +8,7 @@ import pytest
 import yaml
 
 from flcav.cli.main import run
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.optimization.allocation.allocate import allocate
 from flcav.optimization.allocation.problem_file import (
     FittedFields,
@@ -16,9 +16,12 @@ from flcav.optimization.allocation.problem_file import (
     format_problem,
     insert_curves,
 )
+from flcav.optimization.curves.bands import bootstrap_bands, fit_lower_curve, fit_upper_curve
 from flcav.optimization.curves.curves import Additive, Decay, Effective
-from flcav.optimization.curves.fitting import fit_additive
+from flcav.optimization.curves.fitting import fit, fit_additive
+from flcav.optimization.curves.history import parse_histories
 from flcav.optimization.graph import load_problem
+from flcav.optimization.problem import Problem
 
 RECIPES = Path(__file__).parents[3] / "recipes"
 CURVE = Additive(floor=0.01, pretrain=Decay(a=0.7123456789, b=0.25), edge=Decay(a=2e-5, b=0.5, x0=1))
@@ -177,3 +180,32 @@ def test_a_problem_that_cannot_take_the_curves_stays_as_it_is(
         out, err = capsys.readouterr()
         assert (stopped.value.code, out, err.count("\n")) == (2, "", 1)
         assert (tmp_path / name).read_text() == text
+
+
+def test_a_plan_has_the_band_of_its_accuracy_and_says_what_its_history_lacks() -> None:
+    samples = np.array([10.0, 20, 40, 80, 160, 320])
+    columns = {"samples": samples.tolist(), "accuracy": [0.42, 0.55, 0.63, 0.70, 0.74, 0.78]}
+    history = parse_histories(columns, "curve.csv", "curve")["curve"]
+    found = fit(history)
+    band = bootstrap_bands(found)
+    assert band is not None
+    own = collect_fitted_fields(found, history.resources, fit_upper_curve(found, band), fit_lower_curve(found, band))
+    text = format_problem({"curve": own}, 1, "curve.csv").replace(
+        "wireless: , wireline: ", "wireless: 300, wireline: 90"
+    )
+    for field, value in (("sample_mb", "1.2"), ("model_mb", "3"), ("edge_groups", "[3, 3]")):
+        text = text.replace(f"{field}:", f"{field}: {value}")
+    problem = parse_config(Problem, yaml.safe_load(text), "problem")
+    plan = allocate(problem)
+    (task,) = plan.tasks
+    assert task.samples == 75
+    low, high = (float(edge[0]) for edge in band.between(np.array([[75.0, 0, 0]])))
+    assert task.accuracy_low is not None
+    assert task.accuracy_high is not None
+    assert task.accuracy_low == pytest.approx(1 - high, abs=0.01)
+    assert task.accuracy_high == pytest.approx(1 - low, abs=0.01)
+    assert task.accuracy_low < 1 - task.predicted_error < task.accuracy_high
+    assert task.describe_accuracy() == f"{1 - task.predicted_error:.2f} ({1 - high:.2f} to {1 - low:.2f})"
+    assert plan.warnings == (
+        "task 'curve': 0 edge rounds, as the history of its curve has none: what they bring is not known",
+    )

@@ -44,6 +44,12 @@ PROGRESS = "YAML: what is spent and observed so far; the plan goes on from there
 VERIFY = typer.Option(
     False, "--verify", help="Recompute costs, objective and bound with no code of the solver; exit 1 if one is wrong."
 )
+THROUGHPUT = typer.Option(
+    None,
+    "--throughput",
+    help="CSV of measured rates, in place of uplink_mbps: vehicle, time_s, mbps, and optionally link, wireless or "
+    "wireline.",
+)
 OUT = typer.Option(None, "--out", help="Write a page about the plan (HTML): where megabytes go, why.")
 
 
@@ -52,11 +58,12 @@ def allocate(
     problem: Path = PROBLEM,
     baseline: BaselineName | None = BASELINE,
     progress: Path | None = typer.Option(None, "--progress", help=f"{PROGRESS} As `flcav replan`."),
+    throughput: Path | None = THROUGHPUT,
     out: Path | None = OUT,
     verify: bool = VERIFY,
 ) -> Answer:
     """Split both uplink budgets over tasks and training stages to minimise the weighted error."""
-    return _plan(problem, progress, baseline, out, verify)
+    return _plan(problem, progress, baseline, throughput, out, verify)
 
 
 @answer_json
@@ -64,6 +71,7 @@ def replan(
     problem: Path = PROBLEM,
     progress: Path = typer.Argument(..., help=PROGRESS),
     baseline: BaselineName | None = BASELINE,
+    throughput: Path | None = THROUGHPUT,
     out: Path | None = OUT,
     verify: bool = VERIFY,
 ) -> Answer:
@@ -72,11 +80,16 @@ def replan(
     Finished stages stay as they are, learning curves are scaled to pass through the accuracies reached, and what was
     not spent goes back to the budgets.
     """
-    return _plan(problem, progress, baseline, out, verify)
+    return _plan(problem, progress, baseline, throughput, out, verify)
 
 
 def _plan(
-    problem: Path, progress: Path | None, baseline: BaselineName | None, out: Path | None, verify: bool
+    problem: Path,
+    progress: Path | None,
+    baseline: BaselineName | None,
+    throughput: Path | None,
+    out: Path | None,
+    verify: bool,
 ) -> Answer:
     from rich.text import Text
 
@@ -91,7 +104,15 @@ def _plan(
     from flcav.sources.recipe import find_recipe
 
     problem = find_recipe(problem)
-    asked = load_problem(problem)
+    asked, told = load_problem(problem), ()
+    if throughput is not None:
+        from flcav.network.radio.measured import load_throughput
+        from flcav.optimization.allocation.uploads import measure_links
+
+        measured = load_throughput(throughput)
+        asked = measure_links(asked, measured)
+        means = ", ".join(f"{name} {measured.mean_mbps(name):.3g}" for name in measured.rates["wireless"])
+        told = (*measured.taken, f"{throughput}: mean wireless Mbit/s: {means}")
     if progress is not None:
         asked = condition_problem(asked, read_config(PlanState, progress))
     try:
@@ -113,7 +134,9 @@ def _plan(
     beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
     yield _as_json(plan, shares, more) | beside_it
     yield _table(plan)
-    yield from map(Text, _describe(asked, plan, more))
+    if any(task.accuracy_low is not None for task in plan.tasks):
+        yield Text("In brackets: the band of the predicted accuracy.")
+    yield from map(Text, (*_describe(asked, plan, more), *told))
     if shares:
         yield _table_vehicles(shares)
     if beside is not None:
@@ -136,6 +159,10 @@ def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> 
 def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
     """Return the plan as a JSON value: links by name, without empty optional fields."""
     values = dataclasses.asdict(plan)
+    for task in values["tasks"]:
+        for name in ("accuracy_low", "accuracy_high"):
+            if task[name] is None:
+                del task[name]
     values["tasks"] = [_given(task, "upper_error", "members", "called") for task in values["tasks"]]
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
@@ -185,23 +212,22 @@ def _describe_baseline(beside: "Baseline", plan: "Allocation") -> str:
 def _table(plan: "Allocation | Baseline") -> "Table":
     from rich.table import Table
 
-    table = Table("task", *("samples", "edge rounds", "cloud rounds", "error", "wireless MB", "wireline MB"))
+    table = Table("task", *("samples", "edge rounds", "cloud rounds", "accuracy", "wireless MB", "wireline MB"))
     for task in plan.tasks:
         counts = (str(task.samples), str(task.edge_rounds), str(task.cloud_rounds))
-        upper = "" if task.upper_error is None else f" (up to {task.upper_error:{SHOWN}})"
-        error = f"{task.predicted_error:{SHOWN}}{upper}"
-        table.add_row(task.name, *counts, error, f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
+        sent = (f"{task.wireless_mb:.1f}", f"{task.wireline_mb:.1f}")
+        table.add_row(task.name, *counts, task.describe_accuracy(), *sent)
         for member in task.members:
-            table.add_row(f"  {member.name}", "", "", "", f"{member.predicted_error:{SHOWN}}", "", "")
+            table.add_row(f"  {member.name}", "", "", "", f"{max(1 - member.predicted_error, 0):.2f}", "", "")
     return table
 
 
 def _table_vehicles(shares: "Shares") -> "Table":
     from rich.table import Table
 
-    table = Table("task", "vehicle", "samples", "rounds joined", "wireless MB")
+    table = Table("task", "vehicle", "samples", "rounds joined", "wireless MB", "busy s")
     for task, own in shares.items():
         for share in own:
-            cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}")
+            cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}", f"{share.busy_s:.1f}")
             table.add_row(task, share.vehicle, *cells)
     return table

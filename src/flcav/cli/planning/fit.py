@@ -43,7 +43,8 @@ ROUNDS = {  # by model: the letters of its formula
 def fit(
     history: Path = typer.Argument(
         ..., help="CSV: task, stage (pretrain, edge, cloud), resource, accuracy[, weight]; or [task,] samples, "
-        "edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]. error = 1 - accuracy may stand for accuracy."
+        "edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed], of whose numbers one is enough, in columns as "
+        "people name them. error = 1 - accuracy may stand for accuracy."
     ),
     problem: Path | None = typer.Option(
         None, "--problem", help="YAML: put the curves into this problem for `flcav allocate`; where there is no such "
@@ -86,7 +87,7 @@ def fit(
     from flcav.config import InputError
     from flcav.optimization.allocation.problem_file import collect_fitted_fields
     from flcav.optimization.curves import fitting
-    from flcav.optimization.curves.bands import bootstrap_bands, fit_upper_curve
+    from flcav.optimization.curves.bands import bootstrap_bands, fit_lower_curve, fit_upper_curve
     from flcav.optimization.curves.held_out import hold_out_runs
     from flcav.optimization.curves.history import parse_histories
 
@@ -111,7 +112,8 @@ def fit(
         own = _answer(task, found, band, upper, points, asked, k)
         answers.append(own if checked is None else own | {"held_out": dataclasses.asdict(checked)})
         shown.append(found)
-        found_of[task] = collect_fitted_fields(found, points.resources, upper)
+        lower = None if band is None else fit_lower_curve(found, band)
+        found_of[task] = collect_fitted_fields(found, points.resources, upper, lower)
     if problem is not None:
         _write(problem, held, found_of, k, history.name)
     yield {"curves": answers}

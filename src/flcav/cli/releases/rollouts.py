@@ -4,6 +4,7 @@ from pathlib import Path
 
 import typer
 
+from flcav.cli.network import read_radio_settings
 from flcav.cli.options import check_finite
 from flcav.cli.releases.candidates import (
     CANDIDATE,
@@ -159,16 +160,14 @@ def deliver(
     """Simulate who gets a release when, over the radio of a recording, and price the downlink in a ledger."""
     from dataclasses import asdict
 
-    from flcav.config import read_config
     from flcav.dataset.store import Dataset
-    from flcav.network.clock.rounds import NetworkSettings
     from flcav.network.ledger import Ledger, LinkMegabytes
     from flcav.network.radio.recorded import link_scene
     from flcav.releases.candidate import WEIGHTS
     from flcav.releases.rollout.simulated_fleet import deliver_release
 
     described = describe_candidate(candidate)
-    settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)
+    settings = read_radio_settings(network)
     links = link_scene(Dataset.open(data), settings.radio, pole, scene, seed).links
     ledger = Ledger(LinkMegabytes(0, 0))
     size = sum((candidate / name).stat().st_size for name in (WEIGHTS, "candidate.json"))
@@ -199,16 +198,14 @@ def rehearse(
 
     Vehicles download over the radio of their drives and install as real ones do; shadow runs decide on each share.
     """
-    from flcav.config import read_config
     from flcav.interface.progress import show_progress
     from flcav.machine.threads import use_threads
-    from flcav.network.clock.rounds import NetworkSettings
     from flcav.network.ledger import Ledger, LinkMegabytes
     from flcav.releases.rollout.rehearsal import rehearse as rehearse_release
     from flcav.storage.files import write_json
 
     use_threads(1)
-    settings = NetworkSettings() if network is None else read_config(NetworkSettings, network)
+    settings = read_radio_settings(network)
     ledger = Ledger(LinkMegabytes(0, 0))
     with show_progress("rehearse") as report:
         found = rehearse_release(

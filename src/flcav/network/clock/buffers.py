@@ -41,6 +41,8 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
     The clock starts at 0 s. A vehicle that is not in a scene is absent in it. Raises `InputError` where every scene has
     a single instant, or the roadside units differ.
     """
+    if scenes[0].measured_bps is not None:
+        scenes = scenes[:1]  # measured rates repeat by themselves
     names = tuple(dict.fromkeys(name for links in scenes for name in links.vehicle))
     first = scenes[0]
     spans = [float(links.time_s[-1] - links.time_s[0]) for links in scenes]
@@ -60,8 +62,10 @@ def chain_links(scenes: Sequence[RadioLinks]) -> tuple[RadioLinks, float]:
         distances.append(distance)
         states.append(state)
         losses.append(loss)
-    joined = (np.concatenate(parts) for parts in (distances, states, losses))
-    return RadioLinks(first.radio, np.concatenate(times), names, first.unit, *joined), sum(spans)
+    distance, state, loss = (np.concatenate(parts) for parts in (distances, states, losses))
+    measured = None if first.measured_bps is None else first.measured_bps[:-1]
+    clock = np.concatenate(times)
+    return RadioLinks(first.radio, clock, names, first.unit, distance, state, loss, measured), sum(spans)
 
 
 class BufferClock(ClientPhases):

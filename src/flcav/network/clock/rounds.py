@@ -6,6 +6,7 @@ the transferred bytes are the exact integral of the rates over time.
 
 from collections.abc import Mapping, Sequence
 from enum import IntEnum
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -15,6 +16,7 @@ from flcav.config import Config, InputError
 from flcav.network.clock.records import ClientTiming, ClientWork, RoundTiming
 from flcav.network.radio.budget import Radio, shared_rates_bps
 from flcav.network.radio.links import RadioLinks, Wireline
+from flcav.storage.records import LEFT_OUT
 
 LEFT_TOWN = "left the town"
 NO_COVERAGE = "out of coverage"
@@ -38,6 +40,12 @@ class NetworkSettings(Config):
     radio: Radio = Radio()
     wireline: Wireline = Wireline()
     rounds: RoundRules = RoundRules()
+    throughput: Annotated[str | None, LEFT_OUT] = (
+        None  # CSV of measured rates in place of the radio: vehicle, time_s, mbps, and optionally link
+    )
+    throughput_sha256: Annotated[str | None, LEFT_OUT] = (
+        None  # of that file; a run fills it in, and takes no other file from then on
+    )
 
 
 class Phase(IntEnum):
@@ -96,7 +104,10 @@ class ClientPhases:
     def _advance(self, active: Mask) -> None:
         """Advance the active clients, at least one, to the next event, and end the phases that are complete."""
         transfers = active & (self.phase != Phase.COMPUTE)
-        rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
+        if (measured := self.links.measured_bps) is not None:
+            rates = np.where(transfers, measured[self.instant, self.column], 0.0)
+        else:
+            rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
         speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s; for computing, seconds per second
         self.stalled_since[~(transfers & (speed == 0))] = np.inf
         self.stalled_since[transfers & (speed == 0) & np.isinf(self.stalled_since)] = self.time_s

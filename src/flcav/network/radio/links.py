@@ -37,6 +37,8 @@ class RadioLinks:
     distance_m: Array  # (T, V, U) between the antennas; NaN where the vehicle is absent
     state: NDArray[np.int8]  # (T, V, U) `PathState`; -1 where the vehicle is absent
     loss_db: Array  # (T, V, U) path loss, blockage and shadowing; infinite where the vehicle is absent
+    measured_bps: Array | None = None  # (T, V) measured rates, in place of those of the radio; None: there are none
+    period_s: float | None = None  # after which measured rates repeat
 
     @property
     def present(self) -> Mask:
@@ -50,7 +52,12 @@ class RadioLinks:
 
     @property
     def rate_bps(self) -> Array:
-        """Return the rates (T, V, U) [bit/s] of vehicles that have a unit's whole band, without interference."""
+        """Return the rates (T, V, U) [bit/s] of vehicles that have a unit's whole band, without interference.
+
+        Measured rates are what they are.
+        """
+        if self.measured_bps is not None:
+            return self.measured_bps[:, :, None]
         return lone_rate_bps(self.received_dbm, self.radio)
 
 

@@ -5,7 +5,7 @@ error (`solvers.fairness`), or the area of the accuracy polygon (`solvers.area`)
 first two have a proven lower bound. Source: Wang et al., IEEE Network 37(3), 2023, solved exactly.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -51,6 +51,17 @@ class TaskAllocation:
     upper_error: float | None = None  # of robust plans: predicted by the upper band
     members: tuple[LearnerError, ...] = ()  # of a cluster
     called: int | None = None  # vehicles of each edge server in the rounds of stage II; None: all
+    accuracy_low: float | None = None  # predicted by the upper band of the error; None where the task has none
+    accuracy_high: float | None = None  # predicted by its lower band
+
+    def describe_accuracy(self) -> str:
+        """Return the predicted accuracy with its band, as far as that is known; the error has two digits in it."""
+        decimals = 2 + (self.predicted_error < 0.1) + (self.predicted_error < 0.01)
+        told, *band = (
+            "" if each is None else f"{each:.{decimals}f}"
+            for each in (max(1 - self.predicted_error, 0.0), self.accuracy_low, self.accuracy_high)
+        )
+        return told + (f" ({' to '.join(filter(None, band))}{' or more' * (not band[1])})" if band[0] else "")
 
 
 @dataclass(frozen=True)
@@ -132,7 +143,7 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
         marginal_error_per_gb=LinkMegabytes(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
         busy_s=_busy_s(resolved, tasks),
         note=NO_CERTIFICATE if lower is None else None,
-        warnings=(*_idle_horizon(problem), *_beyond(problem, tasks)),
+        warnings=(*_idle_horizon(problem), *_beyond(problem, tasks), *_unmeasured(problem, tasks)),
         certificate=tuple(plan.dual for plan in solved if plan.dual is not None),
     )
 
@@ -188,12 +199,18 @@ def _task_plan(problem: Problem, task: AllocationTask, row: Array) -> TaskAlloca
     def error(curve: Curve) -> float:
         return float(curve.error(samples, edge_rounds, cloud_rounds, problem.edge_rounds_per_cloud_round))
 
+    def accuracy(curve: Curve | None, bound: Callable[[float, float], float]) -> float | None:
+        """Return the accuracy by a band's edge, which the predicted one is not beyond."""
+        return None if curve is None else max(bound(1 - error(curve), 1 - error(task.curve)), 0.0)
+
     members = [LearnerError(each.name, error(each.curve)) for each in task.learners]
     return TaskAllocation(
         *(task.name, samples, edge_rounds, cloud_rounds, error(task.curve), cost.wireless_mb, cost.wireline_mb),
         upper_error=error(task.upper) if problem.robust and task.upper is not None else None,
         members=tuple(members) if isinstance(task.curve, SharedCurve) else (),
         called=None if task.called is None else task.called[1],
+        accuracy_low=accuracy(task.upper, min),
+        accuracy_high=accuracy(task.lower, max),
     )
 
 
@@ -238,6 +255,19 @@ def _beyond(problem: Problem, plans: tuple[TaskAllocation, ...]) -> tuple[str, .
         for name in ("samples", "edge_rounds", "cloud_rounds")
         if (most := getattr(task.measured, name)) is not None and getattr(plan, name) > most
     )
+
+
+def _unmeasured(problem: Problem, plans: tuple[TaskAllocation, ...]) -> tuple[str, ...]:
+    """Return a warning for each task with 0 edge rounds whose curve has a history in which they do not vary."""
+    told = []
+    for task, plan in zip(problem.tasks, plans):
+        known = task.measured.model_dump(exclude_none=True)
+        if known and "edge_rounds" not in known and plan.edge_rounds == 0:
+            why = "has none" if task.limits.edge_rounds[1] == 0 else "has none, or always as many"
+            told.append(
+                f"task {task.name!r}: 0 edge rounds, as the history of its curve {why}: what they bring is not known"
+            )
+    return tuple(told)
 
 
 def _weighted(problem: Problem, made: Instance, gap: float, _clocks: Sequence[Clock]) -> _Best:

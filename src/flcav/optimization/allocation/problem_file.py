@@ -30,6 +30,8 @@ STEPS = {  # the quantities that cost uplink megabytes
 CURVE = "A learning curve per task says how much error each of them takes away."
 TERMS = {
     "error": "1 minus a task's accuracy, as its curve predicts it.",
+    "band": "of a predicted accuracy: between the curves fitted to both edges of the bootstrap band, which `flcav fit` "
+    "gives a level of 90 % unless told otherwise.",
     "weighted error": "the errors of all tasks, each times its weight, added up: their mean only where the weights sum "
     "to 1.",
     "largest error": "the error of the task that errs most.",
@@ -68,14 +70,17 @@ class FittedFields:
     upper: OwnCurve | None  # of the upper band; None: too few points for one
     limits: Mapping[str, list[int]]  # least and most of each quantity in the history
     measured: Mapping[str, float]  # most of each quantity that varies in the history
+    lower: OwnCurve | None = None  # of the lower band; None: too few points for one
 
 
-def collect_fitted_fields(fit: CurveFit, resources: Array, upper: OwnCurve | None) -> FittedFields:
-    """Return the fields of a task from its `fit`, its `upper` band and the `resources` (n, 3) of its history."""
+def collect_fitted_fields(
+    fit: CurveFit, resources: Array, upper: OwnCurve | None, lower: OwnCurve | None = None
+) -> FittedFields:
+    """Return the fields of a task from its `fit`, its bands and the `resources` (n, 3) of its history."""
     least = np.ceil(resources.min(axis=0)).astype(int).tolist()
     most = np.floor(resources.max(axis=0)).astype(int).tolist()
     limits = {name: [low, max(low, high)] for name, low, high in zip(QUANTITIES, least, most, strict=True)}
-    return FittedFields(fit.curve, upper, limits, fit.measured)
+    return FittedFields(fit.curve, upper, limits, fit.measured, lower)
 
 
 def format_problem(tasks: Mapping[str, FittedFields], k: int, history: str) -> str:
@@ -140,6 +145,7 @@ def _fields(fitted: FittedFields) -> dict[str, Any]:
         "limits": dict(fitted.limits),
         "curve": _written(fitted.curve),
         "upper": None if fitted.upper is None else _written(fitted.upper),
+        "lower": None if fitted.lower is None else _written(fitted.lower),
         "measured": _rounded(fitted.measured),
     }
 

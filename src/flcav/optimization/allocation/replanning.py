@@ -102,8 +102,8 @@ def _continued(problem: Problem, task: AllocationTask, spent: TaskState) -> Allo
                 f"{predicted:g} there, which cannot be scaled to it"
             )
         factor = max(1 - spent.accuracy, LEAST_ERROR) / predicted
-        update["curve"] = _scaled(task.curve, factor)
-        update["upper"] = None if task.upper is None else _scaled(task.upper, factor)
+        known = {name: getattr(task, name) for name in ("curve", "upper", "lower")}
+        update |= {name: None if curve is None else _scaled(curve, factor) for name, curve in known.items()}
     return task.model_copy(update=update)
 
 

@@ -1,14 +1,34 @@
-"""Division of stage I's samples over the vehicles: by what they hold, or by what their uplinks carry."""
+"""Division of stage I's samples over the vehicles: by what they hold, or by what their uplinks carry; measured uplinks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from flcav.config import parse_config
+from flcav.network.radio.measured import Throughput
 from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.allocation.vehicles import split_plan
 from flcav.optimization.curves.curves import Additive
 from flcav.optimization.problem import AllocationTask, Budgets, Limits, Problem, Uplink
 
 LEAST_MBPS = 1e-3  # rate of a vehicle that is never in coverage: it uploads last
+
+
+def measure_links(problem: Problem, measured: Throughput) -> Problem:
+    """Return the problem with the uplinks of its vehicles as measured: the mean of each rate over time.
+
+    Vehicles that a task does not name are all of the measured ones, in their order. Wirelines that were not measured
+    stay. Raises `InputError` where a vehicle was not measured, or their number is not that of the edge groups.
+    """
+    tasks = []
+    for task in problem.tasks:
+        links = {}
+        for name in task.vehicles or tuple(measured.rates["wireless"]):
+            before = None if task.uplink_mbps is None else task.uplink_mbps[name].wireline
+            known = {name, name.rpartition("/")[2]} & {*measured.rates["wireline"]}
+            wired = max(measured.mean_mbps(name, "wireline"), LEAST_MBPS) if known else before
+            links[name] = Uplink(wireless=max(measured.mean_mbps(name), LEAST_MBPS), wireline=wired)
+        tasks.append({**task.model_dump(), "uplink_mbps": {name: each.model_dump() for name, each in links.items()}})
+    return parse_config(Problem, {**problem.model_dump(), "tasks": tasks}, measured.path)
 
 
 @dataclass(frozen=True)

@@ -74,6 +74,19 @@ def fit_upper_curve(fit: CurveFit, found: Bands) -> OwnCurve:
     return curve.model_copy(update={"floor": curve.floor + lift})
 
 
+def fit_lower_curve(fit: CurveFit, found: Bands) -> OwnCurve:
+    """Return a curve of the fit's form that is not above the lower band at the measured resources, unless at floor 0.
+
+    It is fitted to the band, then its floor is lowered, at most to 0.
+    """
+    fitted = fit.fitted
+    assert fitted is not None
+    low, _ = found.between(fitted.resources)
+    curve = fitted.form.curve(refit(fitted, low))
+    drop = float(np.max(np.maximum(curve.error(*fitted.resources.T, k=found.k) - low, 0.0)))
+    return curve.model_copy(update={"floor": max(curve.floor - drop, 0.0)})
+
+
 def tabulate_bands(fit: CurveFit, found: Bands | None, resources: Array, k: int) -> list[dict[str, float | None]]:
     """Return the curve with its bands at every row of `resources` (n, 3), as one dictionary per row.
 

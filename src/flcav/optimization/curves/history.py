@@ -6,7 +6,9 @@ Tables of two forms are read:
   so its other resources are the largest of each earlier stage, and 0 of each later one.
 - Joint: `[task,] samples, edge_rounds, cloud_rounds, accuracy[, weight][, run][, seed]`, as flcav's runs write it.
 
-Either may have `error`, which is 1 - accuracy, in place of `accuracy`. A row that equals an earlier one in every column
+Either may have `error`, which is 1 - accuracy, in place of `accuracy`. Columns may have other names that people give
+them (`NAMES`), in any case, and percentages are taken. Of the three numbers of a joint table one is enough: the others
+are then 0. Whatever is taken so is told in the history's `warnings`. A row that equals an earlier one in every column
 was logged twice, and is no second measurement: it is left out. Rows of the same resources with another accuracy, run or
 seed stay.
 """
@@ -25,12 +27,37 @@ from flcav.geometry.arrays import Array
 from flcav.interface.notebook import Displayed
 from flcav.interface.wording import describe_number, hint_share
 from flcav.optimization.curves.curves import STAGES
+from flcav.storage.columns import find_columns
 from flcav.storage.records import read_csv
 
 Table = Mapping[str, Sequence[str | float | None]]  # columns by name
 
 LONG = ("task", "stage", "resource", "accuracy")
 JOINT = ("samples", "edge_rounds", "cloud_rounds", "accuracy")
+NAMES: Mapping[str, Sequence[str]] = {  # other names of a column, as `find_columns` reads them
+    "task": ("task_name",),
+    "stage": ("phase",),
+    "resource": ("resources", "amount"),
+    "samples": (
+        *("sample", "n", "n_samples", "num_samples", "number_of_samples", "nr_of_samples", "no_of_samples", "size"),
+        *("train_samples", "training_samples", "samples_uploaded", "uploaded_samples", "labelled_samples"),
+        *("labeled_samples", "train_size", "training_size", "training_set_size", "dataset_size", "data_size"),
+        *("images", "training_images", "train_images", "frames", "examples", "num_examples"),
+    ),
+    "edge_rounds": (
+        *("edge_round", "edge", "edge_fl_rounds", "rounds", "round", "n_rounds", "num_rounds", "number_of_rounds"),
+        *("fl_rounds", "fl_round", "communication_rounds", "communication_round", "comm_rounds", "server_round"),
+    ),
+    "cloud_rounds": ("cloud_round", "cloud", "cloud_fl_rounds", "global_rounds", "global_round"),
+    "accuracy": (
+        *("acc", "test_accuracy", "test_acc", "val_accuracy", "val_acc", "validation_accuracy", "mean_accuracy"),
+        *("top1", "top_1", "score", "ap", "ap50", "map", "map50", "map_50", "miou", "iou", "f1", "f1_score"),
+    ),
+    "error": ("err", "error_rate", "test_error", "val_error", "validation_error"),
+    "weight": ("weights",),
+    "run": ("run_id", "run_name"),
+    "seed": ("random_seed",),
+}
 LEAST, MOST = 1e-9, 1e9  # allowed size of a number other than 0
 ARTICLE = resources.files("flcav.optimization") / "data" / "article_history.csv"
 ROUNDED = 1.01e-3  # largest deviation from 1 of accuracy + error, both rounded to three digits
@@ -46,19 +73,21 @@ class History(Displayed):
     runs: tuple[str, ...] = ()  # (n,) run of each point; empty where the history does not name runs
     seeds: tuple[str, ...] = ()  # (n,) seed of each point's run; runs of one seed share frames
     repeats: int = 0  # rows of the table that are left out, as they equal an earlier one in every column
+    taken: tuple[str, ...] = ()  # how columns of other names were read, and missing ones filled, a sentence each
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """A sentence on the rows that are left out; empty where there are none."""
+        """Return how the table was read where it says less or otherwise, and which rows are left out, a sentence each."""
         if not self.repeats:
-            return ()
+            return self.taken
         rows = "1 row repeats" if self.repeats == 1 else f"{self.repeats} rows repeat"
-        return (f"{rows} an earlier one in every column and count{'s' * (self.repeats == 1)} once",)
+        return (*self.taken, f"{rows} an earlier one in every column and count{'s' * (self.repeats == 1)} once")
 
     def select(self, chosen: NDArray[np.bool_]) -> "History":
         """Return the points that are true in `chosen` (n,)."""
         runs, seeds = (tuple(name for name, taken in zip(names, chosen) if taken) for names in (self.runs, self.seeds))
-        return History(self.resources[chosen], self.accuracy[chosen], self.weight[chosen], runs, seeds)
+        own = self.resources[chosen], self.accuracy[chosen], self.weight[chosen]
+        return History(*own, runs, seeds, taken=self.taken)
 
 
 def load_history(path: Path | str) -> History:
@@ -83,14 +112,24 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
     `unnamed` is the task's name in a table without a column `task`. Raises `InputError` naming `origin`, the row (from
     1), the field and the value where a column is missing or a value is invalid.
     """
+    given = {"error": "accuracy", "accuracy": "error"}  # the one stands for the other, and no third column does
+    others = {other for name, other in given.items() if name in columns and other not in columns}
+    columns, taken = find_columns(columns, {key: names for key, names in NAMES.items() if key not in others}, origin)
     columns = _with_accuracy(columns, origin)
     joint = "stage" not in columns
-    for name in JOINT if joint else LONG:
+    counts = [name for name in JOINT[:3] if name in columns]
+    for name in (*(() if counts else JOINT[:1]), "accuracy") if joint else LONG[1:]:
         if name not in columns:
             raise InputError(
-                f"{origin}: column '{name}' is missing; a history has {', '.join(LONG)}, or {', '.join(JOINT)}; "
-                "error may stand for accuracy"
+                f"{origin}: column '{name}' is missing; a history has {', '.join(LONG)}, or {', '.join(JOINT)}, of "
+                f"whose numbers one is enough; error may stand for accuracy; found {', '.join(columns) or 'none'}"
             )
+    if joint and (absent := [name for name in JOINT[:3] if name not in counts]):
+        columns = {**columns, **{name: [0.0] * len(columns["accuracy"]) for name in absent}}
+        taken = (
+            *taken,
+            f"no {' and no '.join(absent)} in the table: 0 in every row, and the curve says nothing of them",
+        )
     accuracy = _numbers(columns, "accuracy", origin, most=1.0)
     weight = _numbers(columns, "weight", origin) if "weight" in columns else np.ones(len(accuracy))
     amounts = np.column_stack([_numbers(columns, name, origin) for name in (JOINT[:3] if joint else ("resource",))])
@@ -113,7 +152,7 @@ def parse_histories(columns: Table, origin: str, unnamed: str) -> dict[str, Hist
         runs, seeds = (
             tuple(str(columns[name][row]) for row in rows) if name in columns else () for name in ("run", "seed")
         )
-        histories[task] = History(spent, accuracy[rows], weight[rows], runs, seeds, len(logged) - len(rows))
+        histories[task] = History(spent, accuracy[rows], weight[rows], runs, seeds, len(logged) - len(rows), taken)
     return histories
 
 

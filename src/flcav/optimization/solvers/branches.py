@@ -68,7 +68,7 @@ def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> Alloca
             )
         return curve
 
-    update = {"called": (least, most), "curve": share(task.curve), "upper": share(task.upper)}
+    update = {"called": (least, most), **{name: share(getattr(task, name)) for name in ("curve", "upper", "lower")}}
     return task.model_copy(update=update)
 
 

@@ -33,9 +33,17 @@ from flcav.perception.metrics import (
 )
 from flcav.perception.metrics.operating_point import DISTANCES_M, FoundAtDistance, count_by_distance, describe_counts
 from flcav.perception.metrics.tracks import TracksEvaluation
-from flcav.perception.objects.model import Second
+from flcav.perception.objects.model import Second, SecondConfig
 from flcav.perception.objects.predict import OVERLAP, Reliability, detect_frames
-from flcav.perception.objects.truth import QUARTERS, FrameTruth, TargetCriteria, select_class, select_sides
+from flcav.perception.objects.truth import (
+    QUARTERS,
+    FrameTruth,
+    TargetCriteria,
+    describe_range,
+    select_class,
+    select_sides,
+    share_range,
+)
 from flcav.perception.ops.boxes import Kind
 from flcav.perception.outcomes import Measure, Outcomes, Times, Values
 from flcav.perception.task import Evaluated
@@ -285,17 +293,30 @@ class ObjectsOutcomes:
     measure_name = "AP50"
     redraws = REDRAWS
 
+    def describe_targets(self, config: SecondConfig) -> str:
+        """Return the classes and the range of a network in words."""
+        return describe_range(config)
+
+    def share_targets(self, configs: Sequence[SecondConfig]) -> SecondConfig:
+        """Return a configuration with the classes and the range of all `configs`; raises as `share_range` does."""
+        return share_range(configs)
+
     def outcomes(
-        self, network: Second, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+        self,
+        network: Second,
+        data: Dataset,
+        frames: Sequence[int],
+        progress: Report = ignore_progress,
+        asked: SecondConfig | None = None,
     ) -> Outcomes:
         """Return the matches of each class and kind of overlap (`KEPT`), by frame, and the number of hidden objects.
 
-        Raises `InputError` where there are no frames, or one has no LiDAR.
+        asked: the classes and the range that count (None: the network's own), see `detect_frames`. Raises `InputError`
+        where there are no frames, or one has no LiDAR.
         """
-        found, truths = detect_frames(
-            network, map(frame_reader(data, network.config.foreground), frames), total=len(frames), progress=progress
-        )
-        classes = network.config.classes
+        read = frame_reader(data, network.config.foreground)
+        found, truths = detect_frames(network, map(read, frames), asked, total=len(frames), progress=progress)
+        classes = (asked or network.config).classes
         if not truths:
             raise InputError("evaluation on 0 frames: at least one is wanted")
         hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]

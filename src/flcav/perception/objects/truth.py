@@ -213,6 +213,27 @@ def narrow_range(config: SecondConfig, text: str) -> SecondConfig:
     return replace(config, range_m=(0.0, -side, z0, ahead, side, z1))
 
 
+def share_range(configs: Sequence[SecondConfig]) -> SecondConfig:
+    """Return the first of `configs` with the classes and the range in bird's-eye view that all of them have.
+
+    Raises `InputError` where they have no class or no place in common.
+    """
+    first, bounds = configs[0], np.array([config.range_m for config in configs])
+    (x0, y0), (x1, y1) = bounds[:, :2].max(axis=0).tolist(), bounds[:, 3:5].min(axis=0).tolist()
+    anchors = [each for each in first.anchors if all(each.name in config.classes for config in configs)]
+    if not anchors or x1 <= x0 or y1 <= y0:
+        raise InputError(f"the networks look for nothing in common: {'; '.join(map(describe_range, configs))}")
+    low_z, high_z = first.range_m[2], first.range_m[5]
+    around = all(config.around for config in configs)
+    shared = (x0, y0, low_z, x1, y1, high_z)
+    return replace(first, anchors=tuple(anchors), range_m=shared, around=around, calibration=None)
+
+
+def describe_range(config: SecondConfig) -> str:
+    """Return the classes and the range of a network of `config` in words."""
+    return f"{', '.join(sorted(config.classes))}, {_extent(config.range_m, around=config.around)}"
+
+
 @dataclass(frozen=True)
 class TargetCriteria:
     """Criteria that make an object a target, and the confidence level of intervals."""
@@ -225,7 +246,7 @@ class TargetCriteria:
     def lines(self) -> list[str]:
         """Return the criteria in words: a line on targets, a line on intervals."""
         return [
-            f"targets: centre {_extent(self.range_m)}{', or as far to another side' if self.around else ''}, "
+            f"targets: centre {_extent(self.range_m, around=bool(self.around))}, "
             f"{self.min_returns} LiDAR returns or more; "
             "others are neutral, and so are trucks and buses beside cars",
             f"intervals: {100 * self.confidence:g} %, over scenes",
@@ -237,7 +258,7 @@ def target_criteria(config: SecondConfig) -> TargetCriteria:
     return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE, config.around or None)
 
 
-def _extent(range_m: tuple[float, ...]) -> str:
+def _extent(range_m: tuple[float, ...], *, around: bool = False) -> str:
     x0, y0, _, x1, y1, _ = range_m
     sides = f"{y1:g} m to either side" if y0 == -y1 else f"{-y0:g} m to the right and {y1:g} m to the left"
-    return f"{x0:g} to {x1:g} m ahead and {sides}"
+    return f"{x0:g} to {x1:g} m ahead and {sides}{', or as far to another side' if around else ''}"

@@ -3,7 +3,7 @@
 import contextlib
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
 
@@ -11,6 +11,7 @@ import numpy as np
 from faster_coco_eval import COCO, COCOeval_faster
 
 from flcav.arrays import Array, Ints
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
@@ -201,15 +202,41 @@ class SignsOutcomes:
     measure_name = "mAP50"
     redraws = 200  # few, since each bootstrap sample matches all images again
 
+    def describe_targets(self, config: SignsConfig) -> str:
+        """Return the classes and the least size of a network's targets in words."""
+        return f"{config.labels}: {', '.join(sorted(config.classes))} of {config.smallest_px:g} px or more"
+
+    def share_targets(self, configs: Sequence[SignsConfig]) -> SignsConfig:
+        """Return the first configuration with the classes and sizes of all; raises `InputError` for none in common."""
+        classes = tuple(name for name in configs[0].classes if all(name in config.classes for config in configs))
+        if not classes or len({config.labels for config in configs}) > 1:
+            told = "; ".join(map(self.describe_targets, configs))
+            raise InputError(f"the networks look for nothing in common: {told}")
+        return replace(configs[0], classes=classes, smallest_px=max(config.smallest_px for config in configs))
+
     def outcomes(
-        self, network: SignDetector, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+        self,
+        network: SignDetector,
+        data: Dataset,
+        frames: Sequence[int],
+        progress: Report = ignore_progress,
+        asked: SignsConfig | None = None,
     ) -> Outcomes:
-        """Return detections and ground truth of the images, concatenated, with the counts per image."""
-        recorded = _last_asked_for(data, network.config, tuple(frames))
+        """Return detections and ground truth of each image, flattened, with the counts per image.
+
+        asked: a configuration of the classes and sizes that count; None: the network's own.
+        """
+        own = asked or network.config
+        config = replace(network.config, classes=own.classes, smallest_px=own.smallest_px)
+        recorded = _last_asked_for(data, config, tuple(frames))
+        number = np.array([[*own.classes, name].index(name) for name in network.config.classes])  # the last: no class
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
             truths.append(SignTruth(sample.boxes, sample.label, sample.ignore))
-            found.append(detect_in_picture(network, sample.picture, threshold=LOWEST_SCORE))
+            seen = detect_in_picture(network, sample.picture, threshold=LOWEST_SCORE)
+            label = number[seen.label]
+            kept = label < len(own.classes)
+            found.append(SignDetections(seen.box[kept], label[kept], seen.score[kept]))
             progress(done, len(recorded), "")
         arrays = {
             f"{FOUND}/box": _joined([one.box for one in found], 4),
@@ -221,8 +248,8 @@ class SignsOutcomes:
             f"{WANTED}/count": np.array([len(truth.box) for truth in truths]),
             f"{NEUTRAL}/box": _joined([truth.neutral for truth in truths], 4),
             f"{NEUTRAL}/count": np.array([len(truth.neutral) for truth in truths]),
-            CLASSES: np.array(network.config.classes),
-            SMALLEST: np.array(network.config.smallest_px),
+            CLASSES: np.array(config.classes),
+            SMALLEST: np.array(config.smallest_px),
         }
         return Outcomes(np.array([recorded.scene(number) for number in range(len(recorded))]), arrays)
 

@@ -4,7 +4,7 @@ Errors are kept per road user for intervals over scenes, and large final errors 
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -17,9 +17,10 @@ from flcav.interface.wording import plural
 from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.task import Evaluated
+from flcav.perception.trajectory.config import TrajectoryConfig
 from flcav.perception.trajectory.model import TrajectoryNetwork
 from flcav.perception.trajectory.predict import find_medoid, predict_paths
-from flcav.perception.trajectory.samples import Samples, samples_of
+from flcav.perception.trajectory.samples import SEEN_M, Samples, samples_of
 from flcav.perception.trajectory.tracks import constant_velocity
 from flcav.statistics.bootstrap import REDRAWS
 from flcav.storage.records import LEFT_OUT
@@ -206,12 +207,37 @@ class TrajectoryOutcomes:
     measure_name = "1 / (1 + FDE in m)"
     redraws = REDRAWS
 
+    def describe_targets(self, config: TrajectoryConfig) -> str:
+        """Return the road users of a network's forecasts, and the number of its modes, in words."""
+        whose = f"vehicles within {SEEN_M:g} m of the one with cameras" if config.cameras else "all vehicles"
+        return f"paths of {whose}, in {config.modes} modes"
+
+    def share_targets(self, configs: Sequence[TrajectoryConfig]) -> TrajectoryConfig:
+        """Return the first configuration with the fewest modes, and with cameras where any network has them."""
+        cameras = next((config.cameras for config in configs if config.cameras), None)
+        return replace(configs[0], modes=min(config.modes for config in configs), cameras=cameras)
+
     def outcomes(
-        self, network: TrajectoryNetwork, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+        self,
+        network: TrajectoryNetwork,
+        data: Dataset,
+        frames: Sequence[int],
+        progress: Report = ignore_progress,
+        asked: TrajectoryConfig | None = None,
     ) -> Outcomes:
-        """Return the displacement errors of each sample [m], see `compute_errors`."""
-        samples = samples_of(data, network.config, frames)
+        """Return the displacement errors of each sample [m], see `compute_errors`.
+
+        asked: a configuration by whose samples the network is tested, with as many of its likeliest modes; None: its
+        own.
+        """
+        own, wanted = network.config, asked or network.config
+        samples = samples_of(data, replace(own, cameras=wanted.cameras and (own.cameras or wanted.cameras)), frames)
+        samples = Samples(data, samples.columns, own.cameras)
         paths, probabilities = predict_paths(network, samples, progress)
+        if wanted.modes < own.modes:
+            likeliest = np.argsort(-probabilities, axis=1, kind="stable")[:, : wanted.modes]
+            paths = np.take_along_axis(paths, likeliest[:, :, None, None], axis=1)
+            probabilities = np.take_along_axis(probabilities, likeliest, axis=1)
         columns = samples.columns
         future = columns.future.astype(np.float64)
         errors = compute_errors(paths, probabilities, future, constant_velocity(columns.past))

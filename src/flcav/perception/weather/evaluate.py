@@ -4,7 +4,7 @@ Metrics are accuracy, recall per class, and the confusion matrix.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from flcav.arrays import Ints, Mask
+from flcav.config import InputError
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
@@ -22,7 +23,7 @@ from flcav.perception.marks import Bars
 from flcav.perception.metrics import interval_words
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.task import Evaluated, Finding, Result
-from flcav.perception.weather.model import Classifier
+from flcav.perception.weather.model import Classifier, LeNetConfig
 from flcav.perception.weather.samples import Sample, label_pictures, reduce_picture, stack_pictures
 from flcav.statistics.bootstrap import REDRAWS, bootstrap_over_scenes
 from flcav.statistics.estimates import CONFIDENCE
@@ -175,12 +176,35 @@ class WeatherOutcomes:
     measure_name = "accuracy"
     redraws = REDRAWS
 
+    def describe_targets(self, config: LeNetConfig) -> str:
+        """Return the classes of a network in words."""
+        return f"pictures of {', '.join(sorted(config.classes))}"
+
+    def share_targets(self, configs: Sequence[LeNetConfig]) -> LeNetConfig:
+        """Return the first configuration with the classes that all have; raises `InputError` for none in common."""
+        classes = tuple(name for name in configs[0].classes if all(name in config.classes for config in configs))
+        if not classes:
+            told = "; ".join(map(self.describe_targets, configs))
+            raise InputError(f"the networks look for nothing in common: {told}")
+        return replace(configs[0], classes=classes)
+
     def outcomes(
-        self, network: Classifier, data: Dataset, frames: Sequence[int], progress: Report = ignore_progress
+        self,
+        network: Classifier,
+        data: Dataset,
+        frames: Sequence[int],
+        progress: Report = ignore_progress,
+        asked: LeNetConfig | None = None,
     ) -> Outcomes:
-        """Return the true class ("truth") and the predicted class ("named") of each image, as indices."""
-        samples = label_pictures(data, network.config.classes, frames)
-        named = predict_probabilities(network, [sample.picture for sample in samples], progress).argmax(1)
+        """Return the true class ("truth") and the predicted class ("named") of each image, as indices.
+
+        asked: a configuration of the classes whose images count (None: the network's own); another class that is
+        predicted has the number of these classes as its index.
+        """
+        classes = (asked or network.config).classes
+        samples = label_pictures(data, classes, frames)
+        number = np.array([[*classes, name].index(name) for name in network.config.classes])
+        named = number[predict_probabilities(network, [sample.picture for sample in samples], progress).argmax(1)]
         truth = np.array([sample.label for sample in samples])
         return Outcomes(np.array([sample.scene for sample in samples]), {"truth": truth, "named": named})
 

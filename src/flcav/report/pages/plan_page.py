@@ -58,7 +58,7 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
         for link in LINKS
     }
     tasks = [
-        {**asdict(row), "weight": task.weight, "vehicles": sum(task.edge_groups)}
+        {**asdict(row), "accuracy": row.describe_accuracy(), "weight": task.weight, "vehicles": sum(task.edge_groups)}
         for task, row in zip(resolve_problem(problem).tasks, plan.tasks, strict=True)
     ]
     values = {
@@ -91,7 +91,11 @@ def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
     terms = {"error": TERMS["error"], measure: explain_objective(problem, plan.objective), "budget": TERMS["budget"]}
     terms[saved] = TERMS["saved"]
-    used = ["up to"] * problem.robust + ["proven"] * (plan.lower_bound is not None)
+    used = (
+        ["band"] * any(row.accuracy_low is not None for row in plan.tasks)
+        + ["up to"] * problem.robust
+        + ["proven"] * (plan.lower_bound is not None)
+    )
     return terms | {name: TERMS[name] for name in used}
 
 

@@ -9,9 +9,11 @@ from flcav.dataset.layout import navigation_path, read_manifest
 from flcav.federation.strategies import sends_outputs
 from flcav.fusion.average import ESTIMATED, NavigationErrors
 from flcav.fusion.distillation import Distillation
+from flcav.network.clock.rounds import NetworkSettings
 from flcav.perception.client import check_network
 from flcav.perception.tasks import task_named
 from flcav.runs.arms import Names, Setting, name_repeat, resolve_settings
+from flcav.runs.driving import fix_throughput
 from flcav.runs.frames import count_training_frames
 from flcav.runs.label_sources import LABEL_SOURCES, choose_labels
 from flcav.runs.labels.tracks import WINDOW_EVERY_S, WINDOW_S
@@ -44,7 +46,8 @@ class Outline:
     """
 
     def __init__(self, recipe: RunRecipe, beside: Path) -> None:
-        self.recipe, self.beside = recipe, beside.absolute()
+        self.beside = beside.absolute()
+        self.recipe = recipe = _fix_throughput(recipe, self.beside)
         for task, own in recipe.tasks.items():
             check_network(task_named(task), own.network)
         self.starts = {task: find_start(task_named(task), own, self.beside) for task, own in recipe.tasks.items()}
@@ -220,3 +223,19 @@ class Outline:
     def _count_frames(self, region: str) -> dict[str, int]:
         own = self.recipe.regions[region]
         return count_training_frames(self.find_data(own, EDGE), self.recipe.seed, isinstance(own.data, Mapping))
+
+
+def _fix_throughput(recipe: RunRecipe, beside: Path) -> RunRecipe:
+    """Return the recipe with the files of measured rates of the run and its arms found, see `fix_throughput`."""
+
+    def fix(network: NetworkSettings | None) -> NetworkSettings | None:
+        return network and fix_throughput(network, beside)
+
+    arms = dict(recipe.arms)
+    for name, arm in arms.items():
+        if arm.federation.get("network"):
+            own = fix(NetworkSettings.model_validate(arm.federation["network"]))
+            federation = {**arm.federation, "network": own and own.model_dump(mode="json")}
+            arms[name] = arm.model_copy(update={"federation": federation})
+    federation = recipe.federation.model_copy(update={"network": fix(recipe.federation.network)})
+    return recipe.model_copy(update={"federation": federation, "arms": arms})

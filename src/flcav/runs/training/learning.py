@@ -16,7 +16,7 @@ from flcav.federation.trainable import Weights, statistics_names
 from flcav.perception.client import OutputClient, SharedSamples, TaskClient
 from flcav.perception.outcomes import score_network
 from flcav.perception.task import Task, build_network, find_configuration
-from flcav.perception.weights import find_shipped, from_arrays, load_network, to_arrays
+from flcav.perception.weights import PACKAGED, find_shipped, from_arrays, load_network, to_arrays
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import TaskRecipe, Training, find_path
 from flcav.runs.results.saved import WEIGHTS
@@ -127,7 +127,7 @@ def _path(folder: Path, region: str) -> Path:
     return folder / f"statistics-{region}.safetensors"
 
 
-SHIPPED = "shipped"  # name of the weights that come with the package
+SHIPPED = ("shipped", PACKAGED)  # names of the weights that come with the package
 
 
 class StartingWeights(Config):
@@ -144,7 +144,7 @@ def find_start(task: Task, own: TaskRecipe, beside: Path) -> StartingWeights | N
     """
     if own.weights is None:
         return None
-    path = find_shipped(task) if own.weights == SHIPPED else find_path(own.weights, beside)
+    path = find_shipped(task) if own.weights in SHIPPED else find_path(own.weights, beside)
     if path is None:
         raise InputError(f"tasks.{task.name}.weights: there is no file {shorten(own.weights)} in {beside}")
     held, wanted = load_network(task, path), build_network(task, find_configuration(task, own.network), 0)
