@@ -1,8 +1,8 @@
 """Training, evaluation and inference of a task's networks, and registration of their mistakes.
 
 In all functions a task is a `Task` or its name on the command line (`flcav.perception.tasks`), data are a dataset or
-its folder, and a network is one in memory, a file of weights, or "packaged" (None) for the task's weights in the package.
-They compute on one thread unless `threads` says otherwise: another number changes the last bits of weights.
+its folder, and a network is one in memory, a file of weights, or "packaged" (None) for the task's weights in the
+package. They compute on one thread unless `threads` says otherwise: another number changes the last bits of weights.
 """
 
 from collections.abc import Iterator, Mapping, Sequence

@@ -271,7 +271,9 @@ def compare_outcomes(
         raise InputError(f"the {plural(frames, 'frame')} hold nothing to find for '{task.name}'")
     change, scenes = Estimate(*difference(task, first, second)), len(np.unique(first.scene))
     decided = verdict(change.low, change.high)
-    return NetworkComparison(task.name, measurable.measure_name, frames, scenes, before, after, change, decided, targets)
+    return NetworkComparison(
+        task.name, measurable.measure_name, frames, scenes, before, after, change, decided, targets
+    )
 
 
 def share_test_scenes(

@@ -95,9 +95,9 @@ def check_ending(path: Path) -> None:
 def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str = "") -> pa.Table:
     """Return the table in the CSV file at `path`, or in an open one called `origin`, the columns `texts` as text.
 
-    Only an empty cell is None; "NaN" is a number, "NA" is text. The file may be as spreadsheets write it: with semicolons
-    or tabs between the cells, decimal commas, in a Windows code page or UTF-16. Raises `InputError` where the file is
-    missing or not a table, or where two columns have the same name.
+    Only an empty cell is None; "NaN" is a number, "NA" is text. The file may be as spreadsheets write it: with
+    semicolons or tabs between the cells, decimal commas, in a Windows code page or UTF-16. Raises `InputError` where
+    the file is missing or not a table, or where two columns have the same name.
     """
     named = origin or str(path)
     written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])

@@ -12,7 +12,6 @@ from scipy.sparse import csr_array
 
 from flcav.cli.planning.places import AXES, NAMES, read_places
 from flcav.cli.tables import numbers, read_input_table
-from flcav.cli.tables import numbers, read_table
 from flcav.config import InputError, shorten
 from flcav.dataset.store import Dataset
 from flcav.interface.wording import plural

@@ -1,4 +1,4 @@
-"""Division of stage I's samples over the vehicles: by what they hold, or by what their uplinks carry; measured uplinks."""
+"""Division of stage I's samples over the vehicles, by what they hold or what their uplinks carry; measured uplinks."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

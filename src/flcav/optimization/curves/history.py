@@ -77,7 +77,7 @@ class History(Displayed):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Return how the table was read where it says less or otherwise, and which rows are left out, a sentence each."""
+        """Return a sentence on each column that was read by another name or filled, and on rows that are left out."""
         if not self.repeats:
             return self.taken
         rows = "1 row repeats" if self.repeats == 1 else f"{self.repeats} rows repeat"
