@@ -9,7 +9,7 @@ from flcav.federation.state import FAILED
 from flcav.network.ledger import LINKS
 from flcav.report.cloud_rounds import cloud_tables
 from flcav.runs.analysis.costs import list_home_costs
-from flcav.runs.analysis.findings import findings, name_stage
+from flcav.runs.analysis.findings import findings
 from flcav.runs.arms import resolve_settings
 from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
@@ -17,6 +17,7 @@ from flcav.runs.results.run import Run
 from flcav.runs.results.tests import RunFinding
 from flcav.runs.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
+from flcav.storage.records import select
 
 
 def tables(run: Run) -> dict[str, str]:
@@ -53,14 +54,14 @@ def judge_anew(run: Run) -> tuple[RunFinding, ...]:
 
 def _tests(run: Run) -> str:
     """Return each task's measure with its interval in every region, a column per arm and stage."""
-    columns = list(dict.fromkeys(name_stage(test.arm, test.stage) for test in run.tested))
+    columns = list(dict.fromkeys(test.network for test in run.tested))
     rows = []
     for task in run.recipe.tasks:
-        for region, own in run.recipe.regions.items():
-            tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
-            reached = {name_stage(test.arm, test.stage): test.estimate.describe() for test in tests}
+        for region, settings in run.recipe.regions.items():
+            tests = select(run.tested, task=task, region=region)
+            reached = {test.network: test.estimate.describe() for test in tests}
             one = tests[0].result
-            place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
+            place = [task, f"{region} ({settings.role})", one.measure, f"{one.frames} / {one.scenes}"]
             rows.append([*place, *(reached.get(column, "") for column in columns)])
     return format_table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
 
@@ -86,13 +87,10 @@ def _differences(run: Run) -> str:
 
 def _spread(run: Run) -> str:
     """Return how each measure and difference varies over the run's trainings on the same frames."""
-    found = {
-        f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}": (test.result.estimate.mean, *test.retrained)
-        for test in run.tested
-    } | {each.name: (each.over_scenes.mean, *each.retrained) for each in run.differences}
+    figures = {each.name: each.trainings for each in (*run.tested, *run.differences)}
     rows = [
         [name, f"{np.mean(values):.3f}", f"{np.std(values, ddof=1):.4f}", f"{min(values):.3f}", f"{max(values):.3f}"]
-        for name, values in found.items()
+        for name, values in figures.items()
         if len(values) > 1
     ]
     return format_table(("figure", "mean", "sd of retraining", "least", "most"), rows)
@@ -131,18 +129,18 @@ def _rounds(run: Run) -> str:
     """Return what became of each vehicle's rounds on the network: planned, combined, failed and why, their time."""
     main, rows = run.arms[MAIN], []
     for task, plan in main.plan.tasks.items():
-        stages = [stage for stage in main.stages if stage.task == task]
-        rounds = [each for stage in stages for each in stage.records or () if each.server != CLOUD]
+        records = [record for stage in select(main.stages, task=task) for record in stage.records or ()]
+        rounds = [record for record in records if record.server != CLOUD]
         asked = {*(plan.joins or ()), *(name for each in rounds for name in (*each.clients, *each.failed))}
         for name in sorted(asked):
             region, _, vehicle = name.partition("/")
-            own = [each for each in rounds if each.server == region]
-            joined = [each for each in own if name in each.clients or name in each.failed]
+            held = select(rounds, server=region)
+            joined = [each for each in held if name in each.clients or name in each.failed]
             lost = Counter(each.failed[name] for each in joined if name in each.failed)
             rows.append(
                 [
                     *(task, name, f"{run.recipe.speeds(region).get(vehicle, 1.0):g}"),
-                    len(own) if plan.joins is None else len(plan.joins[name]),
+                    len(held) if plan.joins is None else len(plan.joins[name]),
                     sum(name in each.clients for each in joined),
                     ", ".join(f"{times} {reason}" for reason, times in lost.items()),
                     f"{sum(each.seconds or 0.0 for each in joined):.1f}",

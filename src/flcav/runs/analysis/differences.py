@@ -8,11 +8,11 @@ import numpy as np
 
 from flcav.perception.outcomes import Outcomes, Values, difference, share_test_scenes
 from flcav.perception.tasks import task_named
-from flcav.runs.analysis.findings import is_joint, name_stage, pair_of
+from flcav.runs.analysis.findings import is_joint, pair_of
 from flcav.runs.arms import Setting, name_repeat
 from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.saved import OUTCOMES
-from flcav.runs.results.tests import Difference, RegionalTest, Test, Tested
+from flcav.runs.results.tests import Difference, RegionalTest, Test, Tested, name_stage
 from flcav.runs.spread import difference_key, test_key
 from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, Spread, average_estimates, measure_spread, widen, widen_share

@@ -21,9 +21,9 @@ import numpy as np
 
 from flcav.runs.arms import Setting
 from flcav.runs.label_sources import LABEL_SOURCES
-from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.runs.recipe import ALL, CLOUD, EDGE, ELSEWHERE, MAIN, RunRecipe
 from flcav.runs.results.run import ArmResult
-from flcav.runs.results.tests import Difference, RunFinding, Test
+from flcav.runs.results.tests import Difference, RunFinding, Test, name_stage
 from flcav.statistics.seeds import MeanOverSeeds, of_one_training
 from flcav.statistics.verdicts import (
     ESTIMATE,
@@ -139,20 +139,7 @@ def _question(each: Difference, recipe: RunRecipe, settings: Mapping[str, Settin
     return f"Does the run beat its arm '{each.before_arm}'?"
 
 
-WORDS = {
-    PRETRAIN: "pretrained",
-    EDGE: "edge FL",
-    MORE_EDGE: "further edge FL",
-    CLOUD: "edge + cloud FL",
-    CENTRAL: "central training",
-}
-
 TRAINED = ("plan", "labels", "distillation", "federation", "training", "central")  # settings besides the placement
-
-
-def name_stage(arm: str, stage: str) -> str:
-    """Return the name of an arm's stage in reports, such as "edge FL (densest)"."""
-    return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
 
 
 def findings(

@@ -4,10 +4,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.saved import Saved
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.records import LEFT_OUT
+
+WORDS = {  # for stages in reports
+    PRETRAIN: "pretrained",
+    EDGE: "edge FL",
+    MORE_EDGE: "further edge FL",
+    CLOUD: "edge + cloud FL",
+    CENTRAL: "central training",
+}
+
+
+def name_stage(arm: str, stage: str) -> str:
+    """Return the name of an arm's stage in reports, such as "edge FL (densest)"."""
+    return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
 
 
 @dataclass(frozen=True)
@@ -43,6 +57,16 @@ class Test:
     def key(self) -> tuple[str, str, str, str]:
         """Return arm, stage, region and task."""
         return self.arm, self.stage, self.region, self.task
+
+    @property
+    def network(self) -> str:
+        """Return the name of the network in reports, by its arm and stage."""
+        return name_stage(self.arm, self.stage)
+
+    @property
+    def name(self) -> str:
+        """Return the name of the test in reports."""
+        return f"{self.region}, {self.task}: {self.network}"
 
     @property
     def steps(self) -> tuple[str, ...]:
