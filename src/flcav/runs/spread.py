@@ -11,6 +11,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 from flcav.config import InputError
 from flcav.runs.results.run import Run
@@ -18,6 +19,7 @@ from flcav.runs.results.tests import Difference, Test
 from flcav.runs.tables import read_named_table
 from flcav.statistics.estimates import Spread, measure_spread, pool_spreads, widen, widen_share
 
+FigureT = TypeVar("FigureT", Test, Difference)
 Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before
 Spreads = Mapping[Key, Spread]
 
@@ -70,16 +72,13 @@ def list_figures(run: Run) -> dict[Key, Test | Difference]:
 def widen_anew(run: Run, spreads: Spreads) -> Run:
     """Return a run of one training with intervals by `spreads`, which may be newer than those of its results."""
 
-    def of_test(test: Test) -> Test:
-        spread = spreads.get(test_key(test.task, test.region, test.arm, test.stage))
-        alone = test.result.estimate
-        return replace(test, estimate=alone if spread is None else widen_share(alone, spread), spread=spread)
+    def anew(key: Key, figure: FigureT) -> FigureT:
+        spread, alone = spreads.get(key), figure.over_scenes
+        widened = alone if spread is None else (widen_share if isinstance(figure, Test) else widen)(alone, spread)
+        return replace(figure, estimate=widened, spread=spread)
 
-    def of_difference(each: Difference) -> Difference:
-        spread, alone = spreads.get(difference_key(each)), each.over_scenes
-        return replace(each, estimate=alone if spread is None else widen(alone, spread), spread=spread)
-
-    tested, differences = map(of_test, run.tested), map(of_difference, run.differences)
+    tested = [anew(test_key(each.task, each.region, each.arm, each.stage), each) for each in run.tested]
+    differences = [anew(difference_key(each), each) for each in run.differences]
     return replace(run, tested=tuple(tested), differences=tuple(differences))
 
 

@@ -9,7 +9,7 @@ from flcav.runs.provenance import Provenance
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.runs.results.plans import Placed, Plan, Pole, TaskPlan
 from flcav.runs.results.run import ArmResult, LinkUse, Run, Spent
-from flcav.runs.results.table import SCORE, Row, tabulate
+from flcav.runs.results.table import Row, tabulate
 from flcav.runs.results.tests import Difference, RunFinding, Test, Tested
 from flcav.runs.results.training import Pretrained, Validated
 from flcav.statistics.estimates import Estimate, Spread
@@ -87,11 +87,11 @@ def result_of(town: str, mean: float) -> Tested:
 
 def chart_rows() -> list[Row]:
     """Return the tested rows of a chart."""
-    return select(tabulate(run()), quantity="AP50", training=None, minus="")
+    return select(tabulate(run()), quantity="tested.estimate")
 
 
 def sent() -> list[Row]:
-    return select(tabulate(run()), quantity=["sent.wireless_mb", "sent.wireline_mb"])
+    return select(tabulate(run()), quantity=["arms.spent.wireless.mb", "arms.spent.wireline.mb"])
 
 
 def rounds() -> list[Row]:
@@ -109,7 +109,7 @@ def rounds() -> list[Row]:
 
 
 def _score(stage: str, number: int, town: str, score: float) -> Row:
-    return Row(stage=stage, round=number, region=town, quantity=SCORE, value=float(score))
+    return Row(stage=stage, round=number, region=town, quantity="watched.rounds.score", value=float(score))
 
 
 def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:

@@ -182,7 +182,7 @@ def test_bars_add_up_to_the_ledger_and_budgets_stand_where_they_are() -> None:
     bars = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
     for y, link in enumerate(BUDGETS):
         own = [bar for bar in bars if bar.get_y() < y < bar.get_y() + bar.get_height()]
-        total = sum(row.value for row in SENT if row.quantity == f"sent.{link}_mb")
+        total = sum(row.value for row in SENT if row.quantity == f"arms.spent.{link}.mb")
         assert sum(bar.get_width() for bar in own) == pytest.approx(total)
         assert max(bar.get_x() + bar.get_width() for bar in own) == pytest.approx(total)
     assert "215 of 230 MB" in {text.get_text() for text in axes.texts}

@@ -30,16 +30,15 @@ def test_no_two_rows_are_of_the_same_quantity_at_the_same_place(folder: Path) ->
 def test_every_test_and_difference_has_its_interval_and_trainings(folder: Path) -> None:
     raw = json.loads((folder / "results.json").read_text())
     rows = tabulate(Run.load(folder))
-    measures = {each["task"]: each["result"]["measure"] for each in raw["tested"]}
-    for each in (*raw["tested"], *raw["differences"]):
-        place = {name: each[name] for name in ("arm", "stage", "region", "task")}
-        minus = f"{each['before_arm']}/{each['before_stage']}" if "before_arm" in each else ""
-        found = select(rows, **place, minus=minus, quantity=measures[each["task"]])
-        whole, *trainings = found
-        assert [whole.value, whole.low, whole.high] == [each["estimate"][end] for end in ("mean", "low", "high")]
-        first = each["over_scenes"] if minus else each["result"]["estimate"]
-        assert [row.value for row in trainings] == [first["mean"], *each["retrained"]]
-        assert [row.training for row in found] == [None, *range(1, len(found))]
+    for kind in ("tested", "differences"):
+        for each in raw[kind]:
+            place = {name: each[name] for name in ("arm", "stage", "region", "task")}
+            place["minus"] = f"{each['before_arm']}/{each['before_stage']}" if kind == "differences" else ""
+            (whole,) = select(rows, **place, quantity=f"{kind}.estimate")
+            assert [whole.value, whole.low, whole.high] == [each["estimate"][end] for end in ("mean", "low", "high")]
+            assert whole.measure == (each["result"]["measure"] if kind == "tested" else "")
+            retrained = select(rows, **place, quantity=f"{kind}.retrained")
+            assert [(row.training, row.value) for row in retrained] == [*enumerate(each["retrained"], start=2)]
 
 
 def test_rounds_traffic_and_labels_are_rows(folder: Path) -> None:
@@ -48,20 +47,25 @@ def test_rounds_traffic_and_labels_are_rows(folder: Path) -> None:
     for arm, result in raw["arms"].items():
         for link, use in result["links"].items():
             kinds = ("budget_mb", "planned_mb", "used_mb")
-            found = [select(rows, arm=arm, quantity=f"budget.{link}.{kind}") for kind in kinds]
+            found = [select(rows, arm=arm, quantity=f"arms.links.{link}.{kind}") for kind in kinds]
             assert [(row.value, row.unit) for (row,) in found] == [(use[kind], "MB") for kind in kinds]
-            sent = sum(row.value for row in select(rows, arm=arm, quantity=f"sent.{link}_mb"))
+            sent = sum(row.value for row in select(rows, arm=arm, quantity=f"arms.spent.{link}.mb"))
             assert sent == pytest.approx(use["used_mb"])
+        trainings = len(result.get("retrained") or ()) // len(raw["recipe"]["tasks"])
+        assert {row.training for row in select(rows, arm=arm, quantity="arms.retrained.samples")} == {
+            *range(2, 2 + trainings)
+        }
         for stage in result["stages"]:
-            place = {"arm": arm, "stage": stage["stage"], "task": stage["task"], "training": 1}
+            place = {"arm": arm, "stage": stage["stage"], "task": stage["task"]}
             for record in stage.get("records") or ():
                 where = {**place, "server": record["server"], "round": record["round"]}
-                (up,) = select(rows, **where, quantity="round.uplink_mb")
-                assert up.value == pytest.approx(record["up_bytes"] / 1e6)
-                assert [row.value for row in select(rows, **where, quantity="round.loss")] == [record["loss"]]
+                found = [
+                    select(rows, **where, quantity=f"arms.stages.records.{name}") for name in ("clients", "up_bytes")
+                ]
+                assert [row.value for (row,) in found] == [len(record["clients"]), record["up_bytes"]]
             for labels in stage.get("labels") or ():
                 where = {**place, "region": stage["region"], "round": labels["round"]}
-                (right,) = select(rows, **where, quantity="labels.precision")
+                (right,) = select(rows, **where, quantity="arms.stages.labels.precision")
                 assert right.value == labels["precision"]
 
 
@@ -74,7 +78,8 @@ def test_results_csv_has_a_row_for_each(tmp_path: Path) -> None:
     assert len(read) == len(rows)
     for row, cells in zip(rows, read, strict=True):
         assert (cells["quantity"], cells["region"], float(cells["value"])) == (row.quantity, row.region, row.value)
-        assert cells["low"] == "" if row.low is None else float(cells["low"]) == row.low
+        assert (cells["low"] or None) == (None if row.low is None else cells["low"])
+        assert row.low is None or float(cells["low"]) == row.low
 
 
 def test_rows_are_selected_by_values_and_by_collections_of_them() -> None:

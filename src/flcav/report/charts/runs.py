@@ -1,6 +1,7 @@
 """Charts of runs: a measure after every round, megabytes by link, and a forest plot of arms."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import cycle
 
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
@@ -60,20 +61,26 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
     axes.grid(axis="y")
 
 
-def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str], height: float) -> None:
-    """Write each town's name beside the end (x, y) of its line, without overlaps within a stage."""
-    top = axes.get_ylim()[1]
-    for stage in dict.fromkeys(int(x) for x, _ in ends.values()):
-        own = {town: end for town, end in ends.items() if int(end[0]) == stage}
-        right = max(x for x, _ in own.values())
-        places = style.keep_apart([y for _, y in own.values()], height * top, top)
-        for town, place in zip(own, places, strict=True):
+def _name_ends(
+    axes: Axes,
+    ends: Mapping[str, tuple[float, float]],
+    colours: Mapping[str, str],
+    height: float,
+    column: Callable[[float], float] = int,
+) -> None:
+    """Write the name of each line beside its end (x, y), without overlaps within a column of x, such as a stage."""
+    low, top = axes.get_ylim()
+    for at in dict.fromkeys(column(x) for x, _ in ends.values()):
+        near = {name: end for name, end in ends.items() if column(end[0]) == at}
+        right = max(x for x, _ in near.values())
+        places = style.keep_apart([y for _, y in near.values()], height * (top - low), top)
+        for name, place in zip(near, places, strict=True):
             axes.annotate(
-                town,
+                name,
                 (right, place),
                 (9, 0),
                 textcoords="offset points",
-                color=colours[town],
+                color=colours[name],
                 va="center",
                 fontweight="bold",
             )
@@ -114,8 +121,7 @@ def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
 
 
 def _draw_interval(axes: Axes, x: float, reached: Estimate, colour: str) -> None:
-    if reached.low is not None and reached.high is not None:
-        axes.plot([x, x], [reached.low, reached.high], color=colour, marker="_", markersize=7)
+    style.interval(axes, x, reached, color=colour, marker="_", markersize=7)
     axes.plot(x, reached.mean, "o", color=colour, markersize=6, markeredgecolor="white")
 
 
@@ -125,10 +131,9 @@ def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]
     `rows` are those of `tabulate` about uplink, of all tasks.
     """
     stages = list(dict.fromkeys(row.stage for row in rows))
+    spent = {link: select(rows, quantity=f"arms.spent.{link}.mb") for link in budgets}
     sums = {
-        link: {
-            stage: sum(row.value for row in select(rows, stage=stage, quantity=f"sent.{link}_mb")) for stage in stages
-        }
+        link: {stage: sum(row.value for row in select(spent[link], stage=stage)) for stage in stages}
         for link in budgets
     }
     widest = max([*budgets.values(), *(mb for of_link in sums.values() for mb in of_link.values())])
@@ -151,31 +156,20 @@ def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]
 
 def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
     """Draw the measure of each arm of a task against its uplink [MB], with a line from pretraining."""
-    colours = (style.BLUE, *style.OTHER_COLOURS, style.VERMILLION)
+    palette = cycle((style.BLUE, *style.OTHER_COLOURS, style.VERMILLION))
+    colours = dict(zip((cost.arm for cost in costs), palette, strict=False))
     most = max(cost.uplink_mb for cost in costs)
     at: dict[str, float] = {}  # by arm; bars at the same megabytes stand side by side
-    for number, cost in enumerate(costs):
-        colour = colours[number % len(colours)]
+    for cost in costs:
+        colour = colours[cost.arm]
         near = [x for x in at.values() if abs(x - cost.uplink_mb) < most / 50]
         at[cost.arm] = x = cost.uplink_mb + len(near) * most / 60
         axes.plot([0, x], [cost.before, cost.after.mean], color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
         axes.plot(0, cost.before, "o", color=colour, markerfacecolor="white", markersize=6, clip_on=False)
         _draw_interval(axes, x, cost.after, colour)
     low, top = axes.get_ylim()
-    for x in sorted({round(each / most, 1) for each in at.values()}):
-        near = [(number, cost) for number, cost in enumerate(costs) if round(at[cost.arm] / most, 1) == x]
-        places = style.keep_apart([cost.after.mean for _, cost in near], LINE * (top - low), top)
-        right = max(at[cost.arm] for _, cost in near)
-        for (number, cost), place in zip(near, places, strict=True):
-            axes.annotate(
-                cost.arm,
-                (right, place),
-                (9, 0),
-                textcoords="offset points",
-                color=colours[number % len(colours)],
-                va="center",
-                fontweight="bold",
-            )
+    ends = {cost.arm: (at[cost.arm], cost.after.mean) for cost in costs}
+    _name_ends(axes, ends, colours, LINE, lambda x: round(x / most, 1))
     axes.set(ylabel=costs[0].measure, xlim=(0, 1.08 * most), ylim=(low, top))
     axes.grid(axis="y")
 
@@ -187,8 +181,7 @@ def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Esti
         colour = colours[number % len(colours)]
         axes.plot([x for x, _ in points], [ap.mean for _, ap in points], "o-", color=colour, label=name, markersize=4)
         for x, ap in points:
-            if ap.low is not None and ap.high is not None:
-                axes.plot([x, x], [ap.low, ap.high], color=colour, linewidth=0.8)
+            style.interval(axes, x, ap, color=colour, linewidth=0.8)
     axes.set(xlabel="wireless uplink [MB]", ylabel="AP50 (95 % interval)", xlim=(0, None))
     axes.legend(loc="lower right", frameon=False)
     axes.grid(axis="y")

@@ -1,6 +1,7 @@
 """The HTML page and the pictures of a run, from its results and the files of its steps."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -29,7 +30,7 @@ from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import ArmCost, Run
 from flcav.runs.results.saved import ERRORS
-from flcav.runs.results.table import SCORE, Row, tabulate
+from flcav.runs.results.table import Row, tabulate
 from flcav.runs.results.tests import WORDS, SweepComparison, SweepDetections
 from flcav.runs.results.training import TOGETHER
 from flcav.runs.running import WORK
@@ -70,23 +71,20 @@ def page(run: Run) -> dict[str, Any]:
     first = recipe.with_role("federate")[0]
     rounds = [(stage, record) for arm, stage, record in list_rounds(run) if arm == MAIN]
     return {
+        **vars(main),
+        **vars(run),
         "seed": recipe.seed,
         "retrained": recipe.retrainings,
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "first": first,
         "stages": select(run.tested, arm=MAIN, region=first),
-        "tests": run.tested,
         "gains": tell_gain(run),
-        "findings": run.findings,
-        "placed": main.placed,
         "plans": main.plans,
         "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
-        "links": main.links,
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
         "regional": [(arm, test) for arm, result in run.arms.items() for test in result.regional or ()],
-        "gap_closed": run.gap_closed,
         "rounds": rounds,
         "words": WORDS,
         "labels": [
@@ -95,31 +93,20 @@ def page(run: Run) -> dict[str, Any]:
             for stage in result.stages
             for labels in stage.labels or ()
         ],
-        "timelines": [
-            {"name": name, "arm": arm, "region": region} for name, (arm, region) in _list_timelines(run).items()
-        ],
+        "timelines": _list_timelines(run),
         "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
         "divergences": [(stage, record) for stage, record in rounds if record.divergence is not None],
         "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
         "together": TOGETHER,
         "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
-        "notes": [
-            (arm, name, stage.region, note)
-            for arm, result in run.arms.items()
-            for stage in result.stages
-            for name, note in stage.describe_rows().items()
-        ],
         "sections": run.list_sections(),
         "private": any(record.epsilon is not None for _, record in rounds),
         "timed": any(record.seconds is not None for _, record in rounds),
-        "differences": run.differences,
         "costs": _list_costs(run),
         "home": list_home_costs(run),
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
         "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
-        "elapsed_s": run.elapsed_s,
-        "provenance": run.provenance,
     }
 
 
@@ -141,7 +128,7 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     for section in run.list_sections():
         drawn |= load_named("chart", section.chart, {section.chart: section.chart}, DrawSection)(run)
     drawn["megabytes"] = figures.megabytes(
-        select(rows, arm=MAIN, quantity=[f"sent.{link}_mb" for link in main.links]),
+        select(rows, arm=MAIN, quantity=[f"arms.spent.{link}.mb" for link in main.links]),
         {link: use.budget_mb for link, use in main.links.items()},
     )
     if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
@@ -206,9 +193,11 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
 
 def _chart(run: Run, rows: Sequence[Row], task: str) -> tuple[list[Row], list[Row], str]:
     """Return the arguments of `figures.by_round` for a task."""
-    measure = next(test.result.measure for test in run.tested if test.task == task)
-    tested = select(rows, arm=MAIN, task=task, quantity=measure, training=None, minus="")
-    return select(rows, task=task, quantity=SCORE), tested, measure
+    starts = " + ".join(run.recipe.with_role("pretrain"))
+    validated = select(rows, task=task, quantity="pretrained.validated.score")
+    rounds = [replace(row, stage=PRETRAIN, region=starts) for row in validated]
+    tested = select(rows, arm=MAIN, task=task, quantity="tested.estimate")
+    return [*rounds, *select(rows, task=task, quantity="watched.rounds.score")], tested, tested[0].measure
 
 
 def _sweep(work: Path, names: Names, run: Run) -> clouds.ComparedSweep:

@@ -69,6 +69,16 @@ class Test:
         return f"{self.region}, {self.task}: {self.network}"
 
     @property
+    def measure(self) -> str:
+        """Return the name of what was measured."""
+        return self.result.measure
+
+    @property
+    def over_scenes(self) -> Estimate:
+        """Return the estimate of the first training; its interval is over scenes alone."""
+        return self.result.estimate
+
+    @property
     def steps(self) -> tuple[str, ...]:
         """Return the folders of the tests of all trainings whose outcomes are known, the first training's first."""
         return (self.step, *(self.retrained_steps or ()))
@@ -76,7 +86,7 @@ class Test:
     @property
     def trainings(self) -> tuple[float, ...]:
         """Return the measure of each training, the first training's first."""
-        return (self.result.estimate.mean, *self.retrained)
+        return (self.over_scenes.mean, *self.retrained)
 
 
 @dataclass(frozen=True)
@@ -107,6 +117,11 @@ class Difference:
     retrained: tuple[float, ...] = ()  # the difference in each retraining
     over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # as in `Test`
     regions: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose mean it is; None: `region` alone
+
+    @property
+    def minus(self) -> str:
+        """Return what is subtracted, as arm/stage."""
+        return f"{self.before_arm}/{self.before_stage}"
 
     @property
     def places(self) -> tuple[str, ...]:

@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from flcav.network.ledger import Ledger
+from flcav.network.ledger import BYTES_PER_MB, Ledger
 from flcav.perception.training.run import event_files
 from flcav.runs.recipe import CLOUD
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER
-from flcav.runs.results.table import list_scalars
 from flcav.runs.results.training import FederatedRound, StageResult
 from flcav.runs.training.checkpoints import LAST, Checkpoint
 from flcav.storage.records import write_any_table
@@ -102,4 +101,18 @@ def save_rounds(run: Run, out: Path) -> None:
     for name, records in curves.items():
         with event_files(out / EVENTS / name) as watch:
             for record in records:
-                watch(record.round, list_scalars(record))
+                watch(record.round, scalars(record))
+
+
+def scalars(record: FederatedRound) -> dict[str, float]:
+    """Return what is drawn of a round, by name."""
+    found = {
+        "loss": record.loss,
+        "clients": float(len(record.clients)),
+        "failed": float(len(record.failed)),
+        "uplink_mb": record.up_bytes / BYTES_PER_MB,
+        "downlink_mb": record.down_bytes / BYTES_PER_MB,
+        "epsilon": record.epsilon,
+        "seconds": record.seconds,
+    }
+    return {name: value for name, value in found.items() if value is not None}
