@@ -21,7 +21,7 @@ PERMUTATIONS = 50_000  # more than those of 8 trainings
 def cloud_tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: divergence and gain of each training of the run itself, and scores by statistics.
 
-    Only what the run's stage III measured: results of before have neither, and without retrainings there is no table.
+    Only what the run's stage III measured: older results have neither, and divergence needs retrainings.
     """
     found: dict[str, str] = {}
     kept = {task: own for task in run.recipe.tasks if (own := _trainings(run, task))}

@@ -24,8 +24,8 @@ def tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, labels, what cloud rounds
     do, rounds of vehicles on a network, spread of retraining.
 
-    Findings are judged anew, by the present table of the spread of retraining, so that results of before a change of
-    either are judged as others are.
+    Findings are judged again by the current rules and the current table of the spread of retraining, so that older
+    results are judged like newer ones.
     """
     if run.recipe.spread is not None and not run.recipe.retrainings:
         run = widen_anew(run, read_spreads(run.recipe.spread, Path()))
@@ -126,7 +126,7 @@ def _budgets(run: Run) -> str:
 
 
 def _rounds(run: Run) -> str:
-    """Return what became of each vehicle's rounds on the network: planned, combined, failed and why, their time."""
+    """Return each vehicle's rounds on the radio network: planned, combined, failed with reasons, and their time [s]."""
     main, rows = run.arms[MAIN], []
     for task, plan in main.plan.tasks.items():
         records = [record for stage in select(main.stages, task=task) for record in stage.records or ()]
@@ -160,14 +160,14 @@ LABELS = {  # heading -> field of `LabelQuality`
 
 
 def _labels(run: Run) -> str | None:
-    """Return how good the labels of edge FL are, before the first round and, where they are made anew, the last."""
+    """Return the quality of the labels of edge FL before the first round and, if they are renewed, before the last."""
     settings, rows, kinds = resolve_settings(run.recipe), [], []
     for name, arm in run.arms.items():
         for stage in arm.stages:
             own = stage.labels or ()
             for quality in dict.fromkeys((*own[:1], *own[-1:])):
                 counts = quality.round, quality.labels, quality.targets
-                known = quality.by_returns or ()  # results of before do not tell
+                known = quality.by_returns or ()  # missing in older results
                 kinds = kinds or [f"recall from {each.returns} returns" for each in known]
                 shares = [getattr(quality, field) for field in LABELS.values()]
                 shares += [each.found / each.targets if each.targets else None for each in known]
@@ -178,14 +178,8 @@ def _labels(run: Run) -> str | None:
 
 
 def _sensors(run: Run) -> str:
-    rows = [
-        [
-            each.region,
-            len(each.poles),
-            ", ".join(map(str, each.chosen)),
-            f"{each.covered} of {each.errors}",
-            each.densest,
-        ]
-        for each in run.arms[MAIN].placed
-    ]
+    rows = []
+    for each in run.arms[MAIN].placed:
+        chosen, covered = ", ".join(map(str, each.chosen)), f"{each.covered} of {each.errors}"
+        rows.append([each.region, len(each.poles), chosen, covered, each.densest])
     return format_table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)

@@ -3,7 +3,6 @@
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import TypedDict, Unpack
 
 from flcav.config import InputError
 from flcav.runs.analysis.collect import collect_results
@@ -23,18 +22,6 @@ from flcav.runs.training.records import save_rounds
 
 WORK, HISTORY, SPREAD = "work", "history.csv", "spread.csv"
 RESULTS = Run.file
-
-
-class HowToRun(TypedDict, total=False):
-    """Arguments of `run` about its execution."""
-
-    beside: Path | str | None
-    jobs: int
-    notify: Notify
-    stale: Stale
-    engine: str
-    runtime: str
-    fleet: Path | None
 
 
 def run(
@@ -105,7 +92,13 @@ def run_seeds(
     out: Path | str,
     *,
     seeds: int,
-    **how: Unpack[HowToRun],
+    beside: Path | str | None = None,
+    jobs: int = 1,
+    notify: Notify = print_steps,
+    stale: Stale = "refuse",
+    engine: str = "processes",
+    runtime: str = "embedded",
+    fleet: Path | None = None,
 ) -> tuple[tuple[Run, ...], Summary]:
     """Run or finish a recipe with `seeds` consecutive seeds, its own first; return all runs and their summary.
 
@@ -115,12 +108,19 @@ def run_seeds(
         recipe: of the runs, but for their seeds.
         out: folder of all runs.
         seeds: number of runs.
-        how: other arguments of `run`.
+        beside: folder that towns, datasets and histories are looked for in; None: the working directory.
+        jobs: number of workers, of one thread each.
+        notify: called with a step's name, its progress and a note.
+        stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
+        engine: processes of this machine, or ray: actors of a cluster.
+        runtime: where vehicles train: embedded, or flower: vehicles of a deployed fleet; the results are the same.
+        fleet: folder of the fleet that is up; None: one is brought up on this machine for each federation.
     """
     recipes = {
         f"seed{seed}": recipe.model_copy(update={"seed": seed}) for seed in range(recipe.seed, recipe.seed + seeds)
     }
-    runs = run_several(recipes, out, **how)
+    where = {"engine": engine, "runtime": runtime, "fleet": fleet}
+    runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, **where)
     summary = summarise(runs, [Path(out) / name / WORK for name in recipes])
     summary.save(out)
     return runs, summary

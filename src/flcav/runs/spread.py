@@ -44,9 +44,10 @@ def test_key(task: str, region: str, arm: str, stage: str) -> Key:
     return task, region, arm, stage, "", ""
 
 
-def difference_key(each: Difference) -> Key:
-    """Return the key of a difference."""
-    return each.task, each.region, each.arm, each.stage, each.before_arm, each.before_stage
+def figure_key(each: Test | Difference) -> Key:
+    """Return the key of a test's measure, or of a difference."""
+    before = (each.before_arm, each.before_stage) if isinstance(each, Difference) else ("", "")
+    return each.task, each.region, each.arm, each.stage, *before
 
 
 def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[SpreadRow]:
@@ -65,21 +66,18 @@ def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[Sprea
 
 def list_figures(run: Run) -> dict[Key, Test | Difference]:
     """Return the tests and differences of a run by key, in this order."""
-    tests = {test_key(each.task, each.region, each.arm, each.stage): each for each in run.tested}
-    return {**tests, **{difference_key(each): each for each in run.differences}}
+    return {figure_key(each): each for each in (*run.tested, *run.differences)}
 
 
 def widen_anew(run: Run, spreads: Spreads) -> Run:
     """Return a run of one training with intervals by `spreads`, which may be newer than those of its results."""
 
-    def anew(key: Key, figure: FigureT) -> FigureT:
-        spread, alone = spreads.get(key), figure.over_scenes
+    def anew(figure: FigureT) -> FigureT:
+        spread, alone = spreads.get(figure_key(figure)), figure.over_scenes
         widened = alone if spread is None else (widen_share if isinstance(figure, Test) else widen)(alone, spread)
         return replace(figure, estimate=widened, spread=spread)
 
-    tested = [anew(test_key(each.task, each.region, each.arm, each.stage), each) for each in run.tested]
-    differences = [anew(difference_key(each), each) for each in run.differences]
-    return replace(run, tested=tuple(tested), differences=tuple(differences))
+    return replace(run, tested=tuple(map(anew, run.tested)), differences=tuple(map(anew, run.differences)))
 
 
 def read_spreads(name: str, beside: Path) -> Spreads:

@@ -73,7 +73,7 @@ def test_names_of_arms_keep_apart(run: Run):
         replace(one, arm=name, wireless_mb=mb - 10, wireline_mb=10.0, after=Estimate(score, score - 0.1, score + 0.1))
         for name, mb, score in drawn
     ]
-    figure = figures.gains({"objects": rows})
+    figure = figures.gains(rows)
     assert style.png(figure)[:4] == b"\x89PNG"
     names = {text.get_text(): text.xy for text in figure.axes[0].texts if isinstance(text, Annotation)}
     assert names.keys() == {"main", "other", "third", "bare"}

@@ -10,6 +10,7 @@ from flcav.report.pictures import clouds, maps
 from flcav.runs.results.run import ArmCost
 from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
+from flcav.storage.records import select
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
 ACROSS = 2  # entries of a map's key in a line
@@ -62,11 +63,12 @@ def megabytes(rows: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
 
 
 @style.styled
-def gains(costs: Mapping[str, Sequence[ArmCost]]) -> Figure:
+def gains(costs: Sequence[ArmCost]) -> Figure:
     """Return a measure against the uplink of arms, a panel per task."""
-    figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(costs))
-    for axes, (task, rows) in zip(figure.subplots(len(costs), squeeze=False)[:, 0], costs.items(), strict=True):
-        runs.draw_gains(axes, rows)
+    tasks = dict.fromkeys(cost.task for cost in costs)
+    figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(tasks))
+    for axes, task in zip(figure.subplots(len(tasks), squeeze=False)[:, 0], tasks, strict=True):
+        runs.draw_gains(axes, select(costs, task=task))
         axes.set_title(task, fontweight="bold")
     figure.axes[-1].set_xlabel("uplink of stages II and III [MB]")
     return figure

@@ -87,7 +87,7 @@ def _name_ends(
 
 
 def _colour(town: str, towns: Iterable[str]) -> str:
-    """Return a town's own colour, or one of `style.OTHER_COLOURS`, in turn."""
+    """Return the colour of a town: of `style.TOWN_COLOURS`, or else one of `style.OTHER_COLOURS` in turn."""
     others = [name for name in dict.fromkeys(towns) if name not in style.TOWN_COLOURS]
     return style.TOWN_COLOURS.get(town) or style.OTHER_COLOURS[others.index(town) % len(style.OTHER_COLOURS)]
 
@@ -128,13 +128,13 @@ def _draw_interval(axes: Axes, x: float, reached: Estimate, colour: str) -> None
 def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]) -> None:
     """Draw a stacked bar of the uplink of each link, a part per stage, against a line at the link's budget [MB].
 
-    `rows` are those of `tabulate` about uplink, of all tasks.
+    `rows` are those of `tabulate` about an arm.
     """
-    stages = list(dict.fromkeys(row.stage for row in rows))
     spent = {link: select(rows, quantity=f"arms.spent.{link}.mb") for link in budgets}
+    stages = list(dict.fromkeys(row.stage for of_link in spent.values() for row in of_link))
     sums = {
-        link: {stage: sum(row.value for row in select(spent[link], stage=stage)) for stage in stages}
-        for link in budgets
+        link: {stage: sum(row.value for row in select(of_link, stage=stage)) for stage in stages}
+        for link, of_link in spent.items()
     }
     widest = max([*budgets.values(), *(mb for of_link in sums.values() for mb in of_link.values())])
     for y, (link, budget) in enumerate(budgets.items()):

@@ -69,12 +69,9 @@ def page(run: Run) -> dict[str, Any]:
     """Return the values of the page, for its template."""
     recipe, main = run.recipe, run.arms[MAIN]
     first = recipe.with_role("federate")[0]
-    rounds = [(stage, record) for arm, stage, record in list_rounds(run) if arm == MAIN]
     return {
         **vars(main),
         **vars(run),
-        "seed": recipe.seed,
-        "retrained": recipe.retrainings,
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "first": first,
@@ -85,7 +82,7 @@ def page(run: Run) -> dict[str, Any]:
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
         "regional": [(arm, test) for arm, result in run.arms.items() for test in result.regional or ()],
-        "rounds": rounds,
+        "rounds": [(stage, record) for arm, stage, record in list_rounds(run) if arm == MAIN],
         "words": WORDS,
         "labels": [
             (arm, stage.region, labels)
@@ -94,14 +91,10 @@ def page(run: Run) -> dict[str, Any]:
             for labels in stage.labels or ()
         ],
         "timelines": _list_timelines(run),
-        "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
-        "divergences": [(stage, record) for stage, record in rounds if record.divergence is not None],
-        "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
         "together": TOGETHER,
+        "seeded": SEEDED,
         "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
         "sections": run.list_sections(),
-        "private": any(record.epsilon is not None for _, record in rounds),
-        "timed": any(record.seconds is not None for _, record in rounds),
         "costs": _list_costs(run),
         "home": list_home_costs(run),
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
@@ -127,14 +120,10 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     drawn |= _timelines(run, work)
     for section in run.list_sections():
         drawn |= load_named("chart", section.chart, {section.chart: section.chart}, DrawSection)(run)
-    drawn["megabytes"] = figures.megabytes(
-        select(rows, arm=MAIN, quantity=[f"arms.spent.{link}.mb" for link in main.links]),
-        {link: use.budget_mb for link, use in main.links.items()},
-    )
+    budgets = {link: use.budget_mb for link, use in main.links.items()}
+    drawn["megabytes"] = figures.megabytes(select(rows, arm=MAIN), budgets)
     if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
-        drawn["gain"] = figures.gains(
-            {task: select(costs, task=task) for task in dict.fromkeys(each.task for each in costs)}
-        )
+        drawn["gain"] = figures.gains(costs)
     sweep = _sweep(work, run.steps, run) if (work / LOOK).is_dir() else None
     if sweep is not None:
         drawn["before_after"] = figures.before_after(sweep)

@@ -88,7 +88,7 @@ def tell_gain(run: Run) -> tuple[str, ...]:
 
 
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
-    """Return the costs of further measures than the tasks' own, of which `Difference` tells."""
+    """Return the costs at home by the tasks' further measures, such as AP70; `Difference` has the main measure."""
     return tuple(
         _cost(graph, work, (stage, region, task), name, measure)
         for stage, region, task in graph.tested(graph.settings[MAIN])
@@ -116,7 +116,7 @@ def _cost(graph: Graph, work: Path, tested: tuple[str, str, str], name: str, mea
 
 
 def list_home_costs(run: Run) -> list[HomeCost]:
-    """Return what federated learning costs in the towns of pretraining: of each task's own measure and of further ones.
+    """Return the cost of federated learning in the towns of pretraining, by each task's main and further measures.
 
     Results that were collected before further measures had intervals give those of the first training without one.
     """

@@ -80,7 +80,7 @@ def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds
 
 
 def save_origin(recipe: RunRecipe, task: str, runs: Sequence[Run], out: Path) -> None:
-    """Write the origin of the history that `runs` made, beside it in `out`."""
+    """Write the origin of the history that `runs` made to the folder `out`, where the history is."""
     plans = [run.arms["main"].plan.tasks[task] for run in runs]
     HistoryOrigin(
         task=task,

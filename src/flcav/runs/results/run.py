@@ -90,7 +90,7 @@ class ArmCost(Record):
 
 @dataclass(frozen=True)
 class _RunFigures(Saved):
-    """The figures of a run."""
+    """Fields of a run's results, without those of extras."""
 
     recipe: RunRecipe
     arms: Mapping[str, ArmResult]

@@ -39,7 +39,7 @@ class Tested(Saved):
 
 @dataclass(frozen=True)
 class Test:
-    """A test with the arm, stage, region and task that it is of."""
+    """Test of an arm's network after a stage, in a region, with its interval over scenes and trainings."""
 
     arm: str
     stage: str
@@ -125,7 +125,7 @@ class Difference:
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Return the regions that it is of."""
+        """Return the regions of the difference: several for a mean over regions."""
         return self.regions or (self.region,)
 
     @property
@@ -136,7 +136,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class HomeCost:
-    """The cost of federated learning in a town of pretraining: a measure there before it and after it, same frames."""
+    """Change of a measure in a town of pretraining by federated learning, on the same frames before and after."""
 
     region: str
     task: str
