@@ -46,8 +46,8 @@ def test_key(task: str, region: str, arm: str, stage: str) -> Key:
 
 def figure_key(each: Test | Difference) -> Key:
     """Return the key of a test's measure, or of a difference."""
-    before = (each.before_arm, each.before_stage) if isinstance(each, Difference) else ("", "")
-    return each.task, each.region, each.arm, each.stage, *before
+    arm, stage = (each.before_arm, each.before_stage) if isinstance(each, Difference) else ("", "")
+    return each.task, each.region, each.arm, each.stage, arm, stage
 
 
 def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[SpreadRow]:
