@@ -15,12 +15,12 @@ from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, use_demo_size
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.runs.analysis.findings import name_stage
 from flcav.runs.analysis.histories import gap_closed
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.runs.results.plans import Pole
 from flcav.runs.results.run import Run
+from flcav.runs.results.tests import name_stage
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, half_width, mean_over_seeds

@@ -7,11 +7,13 @@ verdicts on all differences are corrected together.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import Json
+from flcav.experiments.comparison import average_arms, compare_arms
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.report import style
 from flcav.report.charts import figures
@@ -23,7 +25,7 @@ from flcav.runs.results.training import LabelQuality
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
-from flcav.storage.records import Record
+from flcav.storage.records import Record, select
 
 TASK, TOWN = "objects", "grid"
 PRETRAINED, TRACKS, JOINED, DENSEST, ROAD, AVERAGE, IDEAL = (
@@ -86,19 +88,12 @@ class DistillationResult(Record):
 def compare_labels(recipe: RunRecipe, runs: Sequence[Run]) -> DistillationResult:
     """Return the results of the arms of `recipe`, from a run of each seed."""
     seeds = {str(run.recipe.seed): {name: _reached(run, *arm) for name, arm in ARMS.items()} for run in runs}
-    each = [*seeds.values()]
-
-    def gain(seed: Mapping[str, DistillationArm], after: str, before: str) -> float:
-        return seed[after].ap50 - seed[before].ap50
-
-    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, TRACKS, JOINED))) for seed in each]
+    ap50 = attrgetter("ap50")
+    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, TRACKS, JOINED))) for seed in seeds.values()]
     return DistillationResult(
         seeds=seeds,
-        ap50={name: mean_over_seeds([seed[name].ap50 for seed in each], share=True) for name in ARMS},
-        differences={
-            f"{after} - {before}": mean_over_seeds([gain(seed, after, before) for seed in each])
-            for after, before in COMPARED
-        },
+        ap50=average_arms(seeds, ARMS, ap50),
+        differences=compare_arms(seeds, COMPARED, ap50),
         closed=mean_over_seeds(shares),
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
@@ -111,9 +106,9 @@ def _reached(run: Run, arm: str, stage: str) -> DistillationArm:
     assert ap70 is not None  # the town has targets
     if stage == PRETRAIN:
         return DistillationArm(test.estimate.mean, ap70, 0.0, ())
-    labels = next(each.labels for each in run.arms[arm].stages if each.stage == stage and each.region == TOWN)
-    sent = sum(each.mb for each in run.arms[arm].spent if (each.stage, each.link) == (stage, "wireless"))
-    return DistillationArm(test.estimate.mean, ap70, sent, labels or ())
+    (trained,) = select(run.arms[arm].stages, stage=stage, region=TOWN)
+    sent = sum(spent.mb for spent in select(run.arms[arm].spent, stage=stage, link="wireless"))
+    return DistillationArm(test.estimate.mean, ap70, sent, trained.labels or ())
 
 
 def draw_labels(results: DistillationResult) -> bytes:

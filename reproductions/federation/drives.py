@@ -29,7 +29,7 @@ from flcav.perception.weights import to_arrays
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.statistics.bootstrap import share_scenes
-from flcav.statistics.seeds import OWN_SCENES, SharedScenes
+from flcav.statistics.seeds import OWN_SCENES, MeanOverSeeds, SharedScenes, mean_over_seeds
 from flcav.statistics.streams import derive_seed, stream
 from flcav.world.weather import WEATHER_CLASSES
 
@@ -122,6 +122,12 @@ def spread_over_scenes(pictures: Pictures, values: Sequence[NDArray[np.float64]]
         return OWN_SCENES
     measures = [lambda times, each=each: times @ each / np.maximum(times.sum(axis=1), 1) for each in values]
     return share_scenes(measures, [pictures.scenes] * len(values), rng=stream(0, "scenes"))
+
+
+def average_pictures(pictures: Pictures, values: Sequence[NDArray[np.float64]], *, share: bool) -> MeanOverSeeds:
+    """Return the mean over seeds and pictures; `values`: of each seed, the number (N,) of each picture."""
+    means = [float(each.mean()) for each in values]
+    return mean_over_seeds(means, share=share, shared=spread_over_scenes(pictures, values))
 
 
 def measure_losses(weights: Weights, pictures: Pictures) -> NDArray[np.float64]:

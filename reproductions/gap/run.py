@@ -9,11 +9,13 @@ together.
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
 
 from flcav.config import Json
+from flcav.experiments.comparison import average_arms, compare_arms, mean_difference, tabulate_seeds
 from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
 from flcav.interface.wording import plural
 from flcav.network.ledger import BYTES_PER_MB, Ledger
@@ -32,7 +34,7 @@ from flcav.runs.training.checkpoints import load_round_network
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
-from flcav.storage.records import Record
+from flcav.storage.records import Record, select
 
 FEDERATED: Mapping[str, str] = {"edge FL on tracks": MAIN, "edge FL on ground truth": "truth"}  # by name: arm
 IN_BYTES = "edge FL on ground truth, int8"
@@ -85,7 +87,7 @@ def trace_bytes(run: Run, work: Path, region: str) -> Curves:
     def in_bytes() -> Iterator[AtBytes]:
         for arm, stage in LONGER_ARMS:
             folder = work / run.steps.stage(arm, stage, region, task)
-            number = sum(each.rounds for each in run.arms[arm].stages if each.stage in (EDGE, stage))
+            number = sum(trained.rounds for trained in select(run.arms[arm].stages, stage=(EDGE, stage)))
             ap50 = run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean
             yield AtBytes(plural(number, "round"), Ledger.load(folder / LEDGER).used_mb("wireless"), ap50)
 
@@ -256,28 +258,22 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]
     """Return the results of the arms of `recipe`, from a run of each seed and its `curves` of accuracy by bytes."""
     seeds = {str(run.recipe.seed): {name: _reached(run, name, TOWN) for name in ARMS} for run in runs}
     home = {str(run.recipe.seed): {name: _reached(run, name, HOME) for name in AT_HOME} for run in runs}
-    each, at_home = [*seeds.values()], [*home.values()]
-
-    def mean(arm: str, field: str) -> MeanOverSeeds:
-        return mean_over_seeds([getattr(seed[arm], field) for seed in each], share=True)
 
     def closed(arm: str, field: str) -> MeanOverSeeds:
-        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in each]
+        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in seeds.values()]
         return mean_over_seeds([gap_closed(*values) for values in of])
 
-    def gain(seeds: Sequence[Mapping[str, GapArm]], after: str, before: str, field: str) -> MeanOverSeeds:
-        return mean_over_seeds([getattr(seed[after], field) - getattr(seed[before], field) for seed in seeds])
-
+    ap50, ap70 = attrgetter("ap50"), attrgetter("ap70")
     return GapResult(
         seeds=seeds,
         home=home,
-        ap50={arm: mean(arm, "ap50") for arm in ARMS},
-        ap70={arm: mean(arm, "ap70") for arm in ARMS},
+        ap50=average_arms(seeds, ARMS, ap50),
+        ap70=average_arms(seeds, ARMS, ap70),
         closed50={arm: closed(arm, "ap50") for arm in ARMS},
         closed70={arm: closed(arm, "ap70") for arm in ARMS},
-        differences={f"{after} - {before}": gain(each, after, before, "ap50") for after, before in COMPARED},
-        home50={arm: gain(at_home, arm, PRETRAINED, "ap50") for arm in AT_HOME[1:]},
-        home70={arm: gain(at_home, arm, PRETRAINED, "ap70") for arm in AT_HOME[1:]},
+        differences=compare_arms(seeds, COMPARED, ap50),
+        home50={arm: mean_difference(home, arm, PRETRAINED, ap50) for arm in AT_HOME[1:]},
+        home70={arm: mean_difference(home, arm, PRETRAINED, ap70) for arm in AT_HOME[1:]},
         megabytes=average_curves(curves),
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
@@ -289,7 +285,7 @@ def _reached(run: Run, name: str, town: str) -> GapArm:
     test = run.test(arm=arm, stage=stage, region=town, task=TASK)
     ap70 = test.numbers["AP70"]
     assert ap70 is not None  # the town has targets
-    stages = [each for each in run.arms[arm].stages if (each.stage, each.region) == (stage, TOWN)]
+    stages = select(run.arms[arm].stages, stage=stage, region=TOWN)
     labels = stages[0].labels if stages and stage == EDGE else None
     quality = (labels[0].precision, labels[0].recall) if labels else (None, None)
     return GapArm(test.estimate.mean, ap70, *quality)
@@ -313,7 +309,7 @@ def gap_tables(results: GapResult) -> dict[str, str]:
         "differences": tabulate_means("difference in AP50", results.differences),
         "home": _home(results),
         "megabytes": _megabytes(results),
-        "seeds": _seeds(results),
+        "seeds": tabulate_seeds("AP50, AP70", results.seeds, ARMS, lambda arm: f"{arm.ap50:.3f}, {arm.ap70:.3f}"),
     }
 
 
@@ -351,14 +347,6 @@ def _megabytes(results: GapResult) -> str:
         for point in points
     ]
     return format_table(("training", "after", "uplink MB", "AP50"), rows)
-
-
-def _seeds(results: GapResult) -> str:
-    def cell(arm: GapArm) -> str:
-        return f"{arm.ap50:.3f}, {arm.ap70:.3f}"
-
-    rows = [[name, *(cell(seed[name]) for seed in results.seeds.values())] for name in ARMS]
-    return format_table(("AP50, AP70", *(f"seed {seed}" for seed in results.seeds)), rows)
 
 
 def _mean(values: list[float | None]) -> str:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import Json
+from flcav.experiments.comparison import average_arms, mean_difference, tabulate_seeds
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.report import style
 from flcav.report.charts.lifelong import draw_conditions
@@ -19,10 +20,10 @@ from flcav.runs.extras.lifelong.settings import NOTHING, PLAIN, REPLAY
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import RunRecipe
 from flcav.runs.results.run import Run
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
-from flcav.storage.records import Record
+from flcav.storage.records import Record, select
 
 TASK, MEASURE = "objects", "AP50"
 ARMS = (REPLAY, PLAIN, NOTHING)
@@ -69,33 +70,29 @@ class LifelongResult(Record):
 
 def compare_lifelong(recipe: RunRecipe, runs: Sequence[Run]) -> LifelongResult:
     """Return the results of a run of each seed of `recipe`."""
-    seeds = {str(run.recipe.seed): {own.arm: own for own in run.lifelong or () if own.task == TASK} for run in runs}
-    each = [*seeds.values()]
-    conditions = each[0][NOTHING].conditions
-
-    def mean(arm: str, value: Callable[[LifelongArm], float], share: bool = False) -> MeanOverSeeds:
-        return mean_over_seeds([value(own[arm]) for own in each], share=share)
+    seeds = {str(run.recipe.seed): {own.arm: own for own in select(run.lifelong or (), task=TASK)} for run in runs}
+    conditions = next(iter(seeds.values()))[NOTHING].conditions
 
     def mean_tested(arm: str, row: int, column: int) -> MeanOverSeeds:
-        return mean(arm, lambda own: own.tested[row][column], share=True)
-
-    def difference(field: str, arm: str, other: str) -> MeanOverSeeds:
-        return mean_over_seeds([_MEASURES[field](own[arm]) - _MEASURES[field](own[other]) for own in each])
+        return average_arms(seeds, (arm,), lambda own: own.tested[row][column])[arm]
 
     return LifelongResult(
         conditions=conditions,
         seeds=seeds,
-        final={arm: mean(arm, _MEASURES[FINAL], share=True) for arm in ARMS},
-        backward={arm: mean(arm, _MEASURES[BACKWARD]) for arm in ARMS},
-        forward={arm: mean(arm, lambda own: own.forward) for arm in ARMS},
-        up_mb={arm: mean(arm, lambda own: own.up_bytes / 1e6) for arm in ARMS},
-        down_mb={arm: mean(arm, lambda own: own.down_bytes / 1e6) for arm in ARMS},
+        final=average_arms(seeds, ARMS, _MEASURES[FINAL]),
+        backward=average_arms(seeds, ARMS, _MEASURES[BACKWARD], share=False),
+        forward=average_arms(seeds, ARMS, lambda own: own.forward, share=False),
+        up_mb=average_arms(seeds, ARMS, lambda own: own.up_bytes / 1e6, share=False),
+        down_mb=average_arms(seeds, ARMS, lambda own: own.down_bytes / 1e6, share=False),
         tested={
             condition: {arm: tuple(mean_tested(arm, row, column) for row in range(len(conditions) + 1)) for arm in ARMS}
             for column, condition in enumerate(conditions)
         },
-        mended={arm: count_mended([own[arm] for own in each]) for arm in ARMS},
-        differences={f"{field}: {arm} - {other}": difference(field, arm, other) for field, arm, other in COMPARED},
+        mended={arm: count_mended([seed[arm] for seed in seeds.values()]) for arm in ARMS},
+        differences={
+            f"{field}: {arm} - {other}": mean_difference(seeds, arm, other, _MEASURES[field])
+            for field, arm, other in COMPARED
+        },
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
     )
@@ -127,8 +124,13 @@ def lifelong_tables(results: LifelongResult) -> dict[str, str]:
         "conditions": _conditions(results),
         "differences": tabulate_means("difference", results.differences),
         "rounds": _rounds(results),
-        "seeds": _seeds(results),
+        "seeds": tabulate_seeds(f"{FINAL}, {BACKWARD}", results.seeds, ARMS, tell_seed),
     }
+
+
+def tell_seed(arm: LifelongArm) -> str:
+    """Return the final mean and the backward transfer of an arm in a seed."""
+    return f"{arm.final:.3f}, {arm.backward:+.3f}"
 
 
 def _arms(results: LifelongResult) -> str:
@@ -167,13 +169,6 @@ def _rounds(results: LifelongResult) -> str:
                 rows.append([seed, arm, own.condition, f"{len(own.asked)}", f"{own.members}", f"{own.rounds}", *told])
     titles = ("asked", "members", "rounds", "before", "after", "reachable", "new network drives", "s until mended")
     return format_table(("seed", "arm", "condition", *titles), rows)
-
-
-def _seeds(results: LifelongResult) -> str:
-    rows = [
-        [arm, *(f"{own[arm].final:.3f}, {own[arm].backward:+.3f}" for own in results.seeds.values())] for arm in ARMS
-    ]
-    return format_table(("final mean AP50, backward transfer", *(f"seed {seed}" for seed in results.seeds)), rows)
 
 
 def _run(out: Path, options: Options) -> Outcome[LifelongResult]:

@@ -16,14 +16,8 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from flcav.dataset.store import Dataset
-from flcav.experiments.experiment import (
-    Differences,
-    Experiment,
-    Options,
-    Outcome,
-    describe_differences,
-    name_differences,
-)
+from flcav.experiments.comparison import Differences, describe_differences, tabulate_verdicts
+from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.links.in_process import update_bytes
 from flcav.federation.links.metered import Account, Outage
 from flcav.federation.loop import Schedule, federate
@@ -45,17 +39,16 @@ from flcav.report import style
 from flcav.reproductions.federation.drives import (
     Drives,
     Vehicle,
+    average_pictures,
     draw_head,
     find_right,
     record_drives,
-    spread_over_scenes,
 )
 from flcav.runs.driving import AWAY, Fleet
 from flcav.runs.extras.buffered.driving import BufferedFleet
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import Stragglers, draw_stragglers
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import judge_means
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
 from flcav.world.map.census import measure_traffic_density
@@ -172,11 +165,6 @@ class AsynchronyResult(Record):
     accuracy: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
     differences: Differences
     provenance: Provenance
-
-    @property
-    def claims(self) -> dict[str, MeanOverSeeds]:
-        """Return all differences by name, whose verdicts are corrected together."""
-        return name_differences(self.differences)
 
     def sentences(self) -> list[str]:
         """Return the differences in words."""
@@ -307,20 +295,19 @@ def summarise(
 ) -> AsynchronyResult:
     """Return the means over seeds, which share the test's scenes."""
 
-    def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
-        means = [float(each.mean()) for each in values]
-        return mean_over_seeds(means, share=share, shared=spread_over_scenes(drives.test, values))
-
     def difference(setting: str, measure: str, name: str) -> MeanOverSeeds:
         pairs = zip(right[setting, measure, name], right[setting, measure, WAITS], strict=True)
-        return mean([one - other for one, other in pairs], share=False)
+        return average_pictures(drives.test, [one - other for one, other in pairs], share=False)
 
     return AsynchronyResult(
         pictures=len(drives.test.scenes),
         scenes=len(set(drives.test.scenes)),
         stragglers=drawn,
         trajectories=found,
-        accuracy={s: {m: {n: mean(right[s, m, n], True) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
+        accuracy={
+            s: {m: {n: average_pictures(drives.test, right[s, m, n], share=True) for n in RIVALS} for m in MEASURES}
+            for s in SETTINGS
+        },
         differences={
             s: {m: {n: difference(s, m, n) for n in RIVALS if n != WAITS} for m in MEASURES} for s in SETTINGS
         },
@@ -330,7 +317,8 @@ def summarise(
 
 def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, differences."""
-    judged, accuracy, differences = judge_means(results.claims), [], []
+    accuracy: list[list[str]] = []
+    claims: dict[tuple[str, ...], MeanOverSeeds] = {}
     for setting in SETTINGS:
         of_setting = results.accuracy[setting]
         for rival in RIVALS:
@@ -343,10 +331,7 @@ def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
             rest = [means[0], took[0], means[1], took[1], f"{updates:.0f}", f"{stale:.2f}"]
             accuracy.append([setting, rival, *rest])
             for measure in MEASURES if rival != WAITS else ():
-                one, name = results.differences[setting][measure][rival], f"{setting}, {measure}: {rival}"
-                verdict = judged[name]
-                row = [setting, measure, rival, one.describe(sign=True), verdict.p_cell, verdict.verdict]
-                differences.append([*row, verdict.takes_cell])
+                claims[setting, measure, rival] = results.differences[setting][measure][rival]
     heads = (
         f"vehicles, {len(results.stragglers)} seeds",
         "rounds",
@@ -357,9 +342,8 @@ def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
         "updates by then",
         "their staleness",
     )
-    more = "if undecided: seeds that detect a difference of the observed size"
-    told = ("vehicles", "at", "rounds", "accuracy - that of waiting", "p, corrected", "claim that it is positive", more)
-    return {"accuracy": format_table(heads, accuracy), "differences": format_table(told, differences)}
+    compared = tabulate_verdicts(("vehicles", "at", "rounds"), "accuracy - that of waiting", claims)
+    return {"accuracy": format_table(heads, accuracy), "differences": compared}
 
 
 COLOURS = (style.INK, style.POINT, style.BLUE, style.GREEN, style.VERMILLION)

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.experiments.comparison import tabulate_verdicts
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.exchange import ClientFailed
 from flcav.federation.links.metered import Account
@@ -29,15 +30,14 @@ from flcav.reproductions.federation.drives import (
     CLASSES,
     Drives,
     Vehicle,
+    average_pictures,
     draw_head,
     find_right,
     record_drives,
-    spread_over_scenes,
 )
 from flcav.runs.provenance import Provenance, provenance
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.streams import stream
-from flcav.statistics.verdicts import Claim, judge
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
 
@@ -157,10 +157,6 @@ def summarise(
     """Return the means over seeds, which share the test's scenes."""
     scenes = drives.test.scenes
 
-    def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
-        means = [float(each.mean()) for each in values]
-        return mean_over_seeds(means, share=share, shared=spread_over_scenes(drives.test, values))
-
     floats = {key: [each.astype(float) for each in values] for key, values in right.items()}
     rows = tuple(
         FaultsSeed(
@@ -173,7 +169,9 @@ def summarise(
     robust = [name for name in STRATEGIES if name != "FedAvg"]
     gained = {
         lie: {
-            name: mean([one - other for one, other in zip(floats[lie, name], floats[lie, "FedAvg"])], share=False)
+            name: average_pictures(
+                drives.test, [one - other for one, other in zip(floats[lie, name], floats[lie, "FedAvg"])], share=False
+            )
             for name in robust
         }
         for lie in LIES
@@ -182,7 +180,10 @@ def summarise(
         pictures=len(scenes),
         scenes=len(set(scenes)),
         seeds=rows,
-        accuracy={lie: {name: mean(floats[lie, name], share=True) for name in STRATEGIES} for lie in LIES},
+        accuracy={
+            lie: {name: average_pictures(drives.test, floats[lie, name], share=True) for name in STRATEGIES}
+            for lie in LIES
+        },
         gained=gained,
         provenance=provenance(),
     )
@@ -191,16 +192,10 @@ def summarise(
 def fault_tables(results: FaultsResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, gained."""
     rows = [[lie, *(results.accuracy[lie][name].describe() for name in STRATEGIES)] for lie in LIES]
-    pairs = [(lie, name) for lie in LIES for name in STRATEGIES if name in results.gained[lie]]
-    judged = judge([Claim(results.gained[lie][name]) for lie, name in pairs])
-    gained = []
-    for (lie, name), one in zip(pairs, judged, strict=True):
-        found = results.gained[lie][name].describe(sign=True)
-        gained.append([lie, name, found, one.p_cell, one.verdict, one.takes_cell])
-    claim, seeds = "claim that it is positive", "if undecided: seeds that detect an effect of the observed size"
+    claims = {(lie, name): mean for lie in LIES for name in STRATEGIES if (mean := results.gained[lie].get(name))}
     return {
         "accuracy": format_table((f"attack by 3 of 10 clients, {len(results.seeds)} seeds", *STRATEGIES), rows),
-        "gained": format_table(("attack", "strategy", "accuracy - FedAvg's", "p, corrected", claim, seeds), gained),
+        "gained": tabulate_verdicts(("attack", "strategy"), "accuracy - FedAvg's", claims, "an effect"),
     }
 
 

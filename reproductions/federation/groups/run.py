@@ -15,14 +15,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from flcav.experiments.experiment import (
-    Differences,
-    Experiment,
-    Options,
-    Outcome,
-    describe_differences,
-    name_differences,
-)
+from flcav.experiments.comparison import Differences, describe_differences, tabulate_verdicts
+from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.links.metered import Account
 from flcav.federation.loop import EVERYBODY, Schedule, federate
 from flcav.federation.rules import Rules
@@ -35,10 +29,10 @@ from flcav.report import style
 from flcav.reproductions.federation.drives import (
     Drives,
     Vehicle,
+    average_pictures,
     find_right,
     measure_losses,
     record_drives,
-    spread_over_scenes,
 )
 from flcav.reproductions.federation.groups.vehicles import Fleet, make_offer, open_fleet
 from flcav.runs.extras.groups.choosing import choose_members, has_levelled, weigh_offers
@@ -47,7 +41,6 @@ from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import EDGE
 from flcav.runs.stages.rounds import RoundsOver
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import judge_means
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
 
@@ -90,11 +83,6 @@ class GroupsResult(Record):
     until_mb: Mapping[str, Mapping[str, MeanOverSeeds]]  # by setting and rival
     differences: Differences  # of accuracy; megabytes saved until `TARGET`
     provenance: Provenance
-
-    @property
-    def claims(self) -> dict[str, MeanOverSeeds]:
-        """Return all differences by name, whose verdicts are corrected together."""
-        return name_differences(self.differences)
 
     def sentences(self) -> list[str]:
         """Return the differences in words."""
@@ -227,17 +215,13 @@ def summarise(
 ) -> GroupsResult:
     """Return the means over seeds, which share the test's scenes."""
 
-    def mean(values: list[NDArray[np.float64]], share: bool) -> MeanOverSeeds:
-        means = [float(each.mean()) for each in values]
-        return mean_over_seeds(means, share=share, shared=spread_over_scenes(drives.test, values))
-
     def gain(setting: str, measure: str, rival: str) -> MeanOverSeeds:
         own = [seed[rival].gain_per_mb for seed in found[setting].values()]
         return mean_over_seeds([each[measure] for each in own if each is not None])
 
     def difference(setting: str, measure: str, rival: str) -> MeanOverSeeds:
         pairs = zip(right[setting, measure, rival], right[setting, measure, ROSTER], strict=True)
-        return mean([one - other for one, other in pairs], share=False)
+        return average_pictures(drives.test, [one - other for one, other in pairs], share=False)
 
     def until(setting: str, rival: str) -> list[float]:
         return [seed[rival].until_mb or 0.0 for seed in found[setting].values()]
@@ -251,7 +235,10 @@ def summarise(
         scenes=len(set(drives.test.scenes)),
         meet=meet,
         trajectories=found,
-        accuracy={s: {m: {n: mean(right[s, m, n], True) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
+        accuracy={
+            s: {m: {n: average_pictures(drives.test, right[s, m, n], share=True) for n in RIVALS} for m in MEASURES}
+            for s in SETTINGS
+        },
         gains={s: {m: {n: gain(s, m, n) for n in RIVALS} for m in MEASURES} for s in SETTINGS},
         until_mb={s: {n: mean_over_seeds(until(s, n)) for n in RIVALS} for s in SETTINGS},
         differences={
@@ -265,7 +252,8 @@ def summarise(
 
 def groups_tables(results: GroupsResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, groups, differences."""
-    judged, accuracy, groups, differences = judge_means(results.claims), [], [], []
+    accuracy, groups = list[list[str]](), list[list[str]]()
+    claims: dict[tuple[str, ...], MeanOverSeeds] = {}
     for setting in SETTINGS:
         seeds = results.trajectories[setting]
         for rival in RIVALS:
@@ -277,12 +265,7 @@ def groups_tables(results: GroupsResult) -> dict[str, str]:
             until = results.until_mb[setting][rival].describe()
             accuracy.append([setting, rival, *means, f"{rounds:.1f}", f"{sent:.2f}", gain, until])
             for measure in (*MEASURES, UNTIL) if rival != ROSTER else ():
-                one, verdict = (
-                    results.differences[setting][measure][rival],
-                    judged[f"{setting}, {measure}: {rival}"],
-                )
-                row = [setting, measure, rival, one.describe(sign=True), verdict.p_cell, verdict.verdict]
-                differences.append([*row, verdict.takes_cell])
+                claims[setting, measure, rival] = results.differences[setting][measure][rival]
         for seed, rivals in sorted(seeds.items(), key=lambda each: int(each[0])):
             group = rivals[RIVALS[1]]
             told = (", ".join(group.asked), ", ".join(group.members))
@@ -299,20 +282,11 @@ def groups_tables(results: GroupsResult) -> dict[str, str]:
         f"MB up until accuracy {TARGET}",
     )
     of_groups = ("vehicles", "seed", "met the new weathers", "asked", "came", "rounds", "requests and offers, kB")
-    more = "if undecided: seeds that detect a difference of the observed size"
-    told = (
-        "vehicles",
-        "at",
-        "rounds",
-        "accuracy - fixed roster's, or megabytes saved",
-        "p, corrected",
-        "claim that it is positive",
-        more,
-    )
+    compared = "accuracy - fixed roster's, or megabytes saved"
     return {
         "accuracy": format_table(heads, accuracy),
         "groups": format_table(of_groups, groups),
-        "differences": format_table(told, differences),
+        "differences": tabulate_verdicts(("vehicles", "at", "rounds"), compared, claims),
     }
 
 

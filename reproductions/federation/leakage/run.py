@@ -239,8 +239,7 @@ def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSee
     for (name, line), colour, end in zip(lines.items(), COLOURS, ends, strict=True):
         axes.plot(range(len(levels)), [each.mean for each in line], "o-", color=colour, markersize=4)
         for x, each in enumerate(line):
-            if each.low is not None and each.high is not None:
-                axes.plot([x, x], [each.low, each.high], color=colour, linewidth=1)
+            style.interval(axes, x, each, color=colour, linewidth=1)
         axes.annotate(name, (-0.15, end), color=colour, va="center", ha="right", fontsize=style.SMALL)
     axes.axhline(0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set_xticks(range(len(levels)), levels)

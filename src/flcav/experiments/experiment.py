@@ -21,14 +21,11 @@ from flcav.runs.recipe import RunRecipe, load_run_recipe
 from flcav.runs.results.run import Run
 from flcav.runs.running import WORK, run_seeds
 from flcav.sources.recipe import recipe_path
-from flcav.statistics.seeds import MeanOverSeeds
-from flcav.statistics.verdicts import judge_means
 from flcav.storage.records import from_json, to_json
 from flcav.world.opendrive.importing import import_town
 
 Results = TypeVar("Results")
 Resize = Callable[[RunRecipe], RunRecipe]
-Differences = Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
 
 RUN = ("jobs", "engine", "stale")  # options of experiments that run as steps
 STUDY = ("seeds", "scale", *RUN)  # options of experiments that run over seeds, as steps
@@ -171,22 +168,3 @@ def import_map(name: str, folder: Path) -> None:
     """Import recipes/maps/NAME.xodr as the town `folder`/NAME, unless that exists."""
     if not (folder / name).exists():
         import_town(recipe_path("runs/placement").parents[1] / "maps" / f"{name}.xodr", folder / name)
-
-
-def name_differences(differences: Differences) -> dict[str, MeanOverSeeds]:
-    """Return all differences by name, as one family of hypotheses."""
-    return {
-        f"{setting}, {measure}: {rival}": mean
-        for setting, of_setting in differences.items()
-        for measure, of_measure in of_setting.items()
-        for rival, mean in of_measure.items()
-    }
-
-
-def describe_differences(differences: Differences, reference: str) -> list[str]:
-    """Return the differences from the `reference` in words, with jointly corrected verdicts."""
-    claims = name_differences(differences)
-    judged = judge_means(claims)
-    return [
-        f"{name} - {reference}: {mean.describe(sign=True)}, {judged[name].describe()}" for name, mean in claims.items()
-    ]

@@ -1,6 +1,6 @@
 """Cloud rounds over retrainings: weight divergence of the regions, and what their mean gains over stage II."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 from scipy.stats import permutation_test, rankdata
@@ -11,6 +11,7 @@ from flcav.runs.results.run import Run
 from flcav.runs.results.training import FederatedRound, StageResult
 from flcav.statistics.streams import stream
 from flcav.storage.markdown import format_table
+from flcav.storage.records import select
 
 PARTS = ("whole", "learned", "statistics")  # of `Divergence`
 CORRELATION = "rank correlation with the mean gain"
@@ -20,10 +21,10 @@ PERMUTATIONS = 50_000  # more than those of 8 trainings
 def cloud_tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: divergence and gain of each training of the run itself, and scores by statistics.
 
-    Only what the run's stage III measured: results of before have neither, and without retrainings there is no table.
+    Only what the run's stage III measured: older results have neither, and divergence needs retrainings.
     """
     found: dict[str, str] = {}
-    kept = {task: own for task in run.recipe.tasks if (own := [*_trainings(run, task)])}
+    kept = {task: own for task in run.recipe.tasks if (own := _trainings(run, task))}
     if kept and run.recipe.retrainings and all(_span(stage) for own in kept.values() for stage in own):
         found["divergence"] = "\n\n".join(_divergence(run, task, own) for task, own in kept.items())
     if kept and all(stage.statistics for own in kept.values() for stage in own):
@@ -31,12 +32,10 @@ def cloud_tables(run: Run) -> dict[str, str]:
     return found
 
 
-def _trainings(run: Run, task: str) -> Iterator[StageResult]:
-    """Yield stage III of a task, of the run and of its retrainings; the run's first."""
+def _trainings(run: Run, task: str) -> list[StageResult]:
+    """Return stage III of a task, of the run and of its retrainings; the run's first."""
     main = run.arms[MAIN]
-    for stage in (*main.stages, *(main.retrained or ())):
-        if (stage.stage, stage.task) == (CLOUD, task):
-            yield stage
+    return select((*main.stages, *(main.retrained or ())), stage=CLOUD, task=task)
 
 
 def _span(stage: StageResult) -> RoundDivergence | None:
@@ -60,12 +59,8 @@ def span_divergence(records: Iterable[FederatedRound]) -> RoundDivergence | None
 
 def _gains(run: Run, task: str) -> Mapping[str, Sequence[float]]:
     """Return edge + cloud FL minus edge FL in each federating region, in each training."""
-    asked = (MAIN, CLOUD, MAIN, EDGE, task)
-    return {
-        each.region: (each.over_scenes.mean, *each.retrained)
-        for each in run.differences
-        if (each.arm, each.stage, each.before_arm, each.before_stage, each.task) == asked
-    }
+    compared = select(run.differences, arm=MAIN, stage=CLOUD, before_arm=MAIN, before_stage=EDGE, task=task)
+    return {each.region: each.trainings for each in compared}
 
 
 def format_divergence(

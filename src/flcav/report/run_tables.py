@@ -9,7 +9,7 @@ from flcav.federation.state import FAILED
 from flcav.network.ledger import LINKS
 from flcav.report.cloud_rounds import cloud_tables
 from flcav.runs.analysis.costs import list_home_costs
-from flcav.runs.analysis.findings import findings, name_stage
+from flcav.runs.analysis.findings import findings
 from flcav.runs.arms import resolve_settings
 from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
@@ -17,14 +17,15 @@ from flcav.runs.results.run import Run
 from flcav.runs.results.tests import RunFinding
 from flcav.runs.spread import read_spreads, widen_anew
 from flcav.storage.markdown import format_bullets, format_table
+from flcav.storage.records import select
 
 
 def tables(run: Run) -> dict[str, str]:
     """Return Markdown by name: findings (a list), tests, differences, plan, budgets, sensors, labels, what cloud rounds
     do, rounds of vehicles on a network, spread of retraining.
 
-    Findings are judged anew, by the present table of the spread of retraining, so that results of before a change of
-    either are judged as others are.
+    Findings are judged again by the current rules and the current table of the spread of retraining, so that older
+    results are judged like newer ones.
     """
     if run.recipe.spread is not None and not run.recipe.retrainings:
         run = widen_anew(run, read_spreads(run.recipe.spread, Path()))
@@ -53,14 +54,14 @@ def judge_anew(run: Run) -> tuple[RunFinding, ...]:
 
 def _tests(run: Run) -> str:
     """Return each task's measure with its interval in every region, a column per arm and stage."""
-    columns = list(dict.fromkeys(name_stage(test.arm, test.stage) for test in run.tested))
+    columns = list(dict.fromkeys(test.network for test in run.tested))
     rows = []
     for task in run.recipe.tasks:
-        for region, own in run.recipe.regions.items():
-            tests = [test for test in run.tested if (test.task, test.region) == (task, region)]
-            reached = {name_stage(test.arm, test.stage): test.estimate.describe() for test in tests}
+        for region, settings in run.recipe.regions.items():
+            tests = select(run.tested, task=task, region=region)
+            reached = {test.network: test.estimate.describe() for test in tests}
             one = tests[0].result
-            place = [task, f"{region} ({own.role})", one.measure, f"{one.frames} / {one.scenes}"]
+            place = [task, f"{region} ({settings.role})", one.measure, f"{one.frames} / {one.scenes}"]
             rows.append([*place, *(reached.get(column, "") for column in columns)])
     return format_table(("task", "region (role)", "measure", "frames / scenes", *columns), rows)
 
@@ -86,13 +87,10 @@ def _differences(run: Run) -> str:
 
 def _spread(run: Run) -> str:
     """Return how each measure and difference varies over the run's trainings on the same frames."""
-    found = {
-        f"{test.region}, {test.task}: {name_stage(test.arm, test.stage)}": (test.result.estimate.mean, *test.retrained)
-        for test in run.tested
-    } | {each.name: (each.over_scenes.mean, *each.retrained) for each in run.differences}
+    figures = {each.name: each.trainings for each in (*run.tested, *run.differences)}
     rows = [
         [name, f"{np.mean(values):.3f}", f"{np.std(values, ddof=1):.4f}", f"{min(values):.3f}", f"{max(values):.3f}"]
-        for name, values in found.items()
+        for name, values in figures.items()
         if len(values) > 1
     ]
     return format_table(("figure", "mean", "sd of retraining", "least", "most"), rows)
@@ -128,21 +126,21 @@ def _budgets(run: Run) -> str:
 
 
 def _rounds(run: Run) -> str:
-    """Return what became of each vehicle's rounds on the network: planned, combined, failed and why, their time."""
+    """Return each vehicle's rounds on the radio network: planned, combined, failed with reasons, and their time [s]."""
     main, rows = run.arms[MAIN], []
     for task, plan in main.plan.tasks.items():
-        stages = [stage for stage in main.stages if stage.task == task]
-        rounds = [each for stage in stages for each in stage.records or () if each.server != CLOUD]
+        records = [record for stage in select(main.stages, task=task) for record in stage.records or ()]
+        rounds = [record for record in records if record.server != CLOUD]
         asked = {*(plan.joins or ()), *(name for each in rounds for name in (*each.clients, *each.failed))}
         for name in sorted(asked):
             region, _, vehicle = name.partition("/")
-            own = [each for each in rounds if each.server == region]
-            joined = [each for each in own if name in each.clients or name in each.failed]
+            held = select(rounds, server=region)
+            joined = [each for each in held if name in each.clients or name in each.failed]
             lost = Counter(each.failed[name] for each in joined if name in each.failed)
             rows.append(
                 [
                     *(task, name, f"{run.recipe.speeds(region).get(vehicle, 1.0):g}"),
-                    len(own) if plan.joins is None else len(plan.joins[name]),
+                    len(held) if plan.joins is None else len(plan.joins[name]),
                     sum(name in each.clients for each in joined),
                     ", ".join(f"{times} {reason}" for reason, times in lost.items()),
                     f"{sum(each.seconds or 0.0 for each in joined):.1f}",
@@ -162,14 +160,14 @@ LABELS = {  # heading -> field of `LabelQuality`
 
 
 def _labels(run: Run) -> str | None:
-    """Return how good the labels of edge FL are, before the first round and, where they are made anew, the last."""
+    """Return the quality of the labels of edge FL before the first round and, if they are renewed, before the last."""
     settings, rows, kinds = resolve_settings(run.recipe), [], []
     for name, arm in run.arms.items():
         for stage in arm.stages:
             own = stage.labels or ()
             for quality in dict.fromkeys((*own[:1], *own[-1:])):
                 counts = quality.round, quality.labels, quality.targets
-                known = quality.by_returns or ()  # results of before do not tell
+                known = quality.by_returns or ()  # missing in older results
                 kinds = kinds or [f"recall from {each.returns} returns" for each in known]
                 shares = [getattr(quality, field) for field in LABELS.values()]
                 shares += [each.found / each.targets if each.targets else None for each in known]
@@ -180,14 +178,8 @@ def _labels(run: Run) -> str | None:
 
 
 def _sensors(run: Run) -> str:
-    rows = [
-        [
-            each.region,
-            len(each.poles),
-            ", ".join(map(str, each.chosen)),
-            f"{each.covered} of {each.errors}",
-            each.densest,
-        ]
-        for each in run.arms[MAIN].placed
-    ]
+    rows = []
+    for each in run.arms[MAIN].placed:
+        chosen, covered = ", ".join(map(str, each.chosen)), f"{each.covered} of {each.errors}"
+        rows.append([each.region, len(each.poles), chosen, covered, each.densest])
     return format_table(("region", "candidate poles", "chosen", "errors covered", "densest traffic"), rows)

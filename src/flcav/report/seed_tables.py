@@ -13,6 +13,7 @@ from flcav.runs.results.run import Run, Summary
 from flcav.runs.results.tests import Difference
 from flcav.statistics.estimates import Estimate
 from flcav.storage.markdown import format_table
+from flcav.storage.records import select
 
 
 def tables(runs: Sequence[Run], summary: Summary) -> dict[str, str]:
@@ -30,10 +31,9 @@ def _claims(summary: Summary) -> str:
 
 def _list_primary(run: Run) -> list[tuple[Difference, str]]:
     """Return the differences that a run's primary claims are of, each with its verdict; without any its first."""
-    own = [each for each in run.differences if each.arm == MAIN]
-    found = list(zip(own, judge_anew(run), strict=True))
-    primary = [(each, finding.verdict) for each, finding in found if finding.kind == "primary"]
-    return primary or [(each, finding.verdict) for each, finding in found[:1]]
+    judged = list(zip(select(run.differences, arm=MAIN), judge_anew(run), strict=True))
+    primary = [(each, finding.verdict) for each, finding in judged if finding.kind == "primary"]
+    return primary or [(each, finding.verdict) for each, finding in judged[:1]]
 
 
 def _seeds(runs: Sequence[Run]) -> str:
@@ -58,8 +58,7 @@ def _seeds(runs: Sequence[Run]) -> str:
 
 def _mean(run: Run, stage: str) -> float:
     """Return the mean of the measure over the run's trainings and the regions that federate."""
-    regions = run.recipe.with_role("federate")
-    tests = [test for test in run.tested if (test.arm, test.stage) == (MAIN, stage) and test.region in regions]
+    tests = select(run.tested, arm=MAIN, stage=stage, region=run.recipe.with_role("federate"))
     return float(np.mean([np.mean(test.trainings) for test in tests]))
 
 
@@ -75,7 +74,7 @@ def _labels(runs: Sequence[Run]) -> str:
     """Return the quality of the labels of the first round in each region: mean over seeds, least and most."""
     rows = []
     for region in runs[0].recipe.with_role("federate"):
-        stages = [stage for run in runs for stage in run.arms[MAIN].stages if stage.region == region and stage.labels]
+        stages = [stage for run in runs for stage in select(run.arms[MAIN].stages, region=region)]
         first = [stage.labels[0] for stage in stages if stage.labels]
         columns = ([getattr(quality, field) for quality in first] for field in LABELS.values())
         known = [[value for value in column if value is not None] for column in columns]

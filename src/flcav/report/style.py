@@ -12,6 +12,8 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
 
+from flcav.statistics.estimates import Estimate
+
 INK = "#222222"  # text, ground truth
 MUTED = "#6b6b6b"  # axes, notes
 RULE = "#c9c9c9"  # grid, borders
@@ -95,6 +97,12 @@ def key(owner: FigureBase | Axes, handles: Sequence[Artist], **changes: Any) -> 
     options: dict[str, Any] = {"loc": "outside lower center", "frameon": False, "handlelength": 1.2}
     spacing: dict[str, Any] = {"handletextpad": 0.5, "columnspacing": 1.4, "ncols": len(handles)}
     owner.legend(handles=handles, **{**options, **spacing, **changes})
+
+
+def interval(axes: Axes, x: float, estimate: Estimate, **look: Any) -> None:
+    """Draw the 95 % interval of an estimate as a vertical line at `x`, if there is one; `look`: options of `plot`."""
+    if estimate.low is not None and estimate.high is not None:
+        axes.plot([x, x], [estimate.low, estimate.high], **look)
 
 
 def keep_apart(heights: Sequence[float], gap: float, top: float) -> list[float]:

@@ -279,12 +279,12 @@ def continue_joins(
 
 
 def _further(spare_s: float, round_s: float) -> int:
-    """Return how many more rounds of `round_s` there is time for; below 0: how many fewer."""
+    """Return the number of further rounds of `round_s` [s] that fit in the time; negative: rounds too many."""
     return MOST if round_s == 0 else floor(min(spare_s / round_s, MOST) + ROUNDING)
 
 
 def _deal(left: Mapping[str, int], rounds: Sequence[int]) -> dict[str, tuple[int, ...]]:
-    """Return which of `rounds` each vehicle joins, of which it has so many `left`: each starts where the last ended."""
+    """Deal `rounds` to vehicles with so many `left` each, one vehicle starting where the last one ended."""
     dealt, start = {}, 0
     for name, many in left.items():
         count = min(max(many, 0), len(rounds))

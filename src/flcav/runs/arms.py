@@ -165,7 +165,7 @@ def find_calls(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:
 
 
 def _learns(recipe: RunRecipe, rule: PlanRule) -> bool:
-    """Return whether a plan by `rule` is the best one by learning curves; others divide the budgets by themselves."""
+    """Return whether a plan by `rule` is optimised by learning curves; other rules divide the budgets directly."""
     return rule == "joint" and any(task.history for task in recipe.tasks.values())
 
 
@@ -356,7 +356,7 @@ class Names:
         return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
 
     def central(self, arm: str, region: str, task: str) -> str:
-        """Return the centralised training of an arm in a region; but on the region's own frames it is one for all."""
+        """Return the centralised training of an arm in a region; all regions share it unless it uses their frames."""
         shared = self._settings[arm].central != "federate"
         return f"{CENTRAL}-{task}-{arm}" if shared else f"{region}-{CENTRAL}-{task}-{arm}"
 
@@ -369,7 +369,7 @@ class Names:
         return {EDGE: self.edge, MORE_EDGE: self.more_edge, CENTRAL: self.central}[stage](arm, region, task)
 
     def test(self, trained: str, region: str, model: str | None = None) -> str:
-        """Return the test of a step's network, or of the own model of the region `model`, in a region."""
+        """Return the test of a step's network in a region, or of the personal model of the region `model`."""
         return f"test-{trained}-{region}" if model is None else f"test-{trained}-of-{model}-{region}"
 
     def rounds(self, trained: str, region: str) -> str:

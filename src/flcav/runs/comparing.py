@@ -14,7 +14,7 @@ from flcav.runs.results.tests import Test
 from flcav.runs.running import WORK, seed_folders
 from flcav.statistics.estimates import Estimate, combine_spreads, widen
 from flcav.statistics.seeds import LARGEST_SPREAD, MeanOverSeeds, OneTraining, of_one_training
-from flcav.statistics.verdicts import NOT_HELD, UNDECIDED, Claim, Judged, judge, judge_known, tell_loss
+from flcav.statistics.verdicts import NOT_HELD, UNDECIDED, Claim, Judged, judge_known, tell_loss
 
 Key = tuple[str, str, str, str]  # arm, stage, region, task
 
@@ -49,19 +49,12 @@ def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     common = [key for key in (rows[0] if rows else {}) if all(key in row for row in rows)]
     if not common:
         raise InputError(f"{first} and {second}: no test was made by both on the same frames, with the same seed")
-    if len(rows) == 1:
-        return _judge_trainings([rows[0][key] for key in common])
-    means = [mean_of_tests(key[3], *_listed([row[key] for row in rows])) for key in common]
-    judged = judge([Claim(mean) for mean in means])
-    return tuple(
-        _compared(key, [row[key].compared for row in rows], mean, one)
-        for key, mean, one in zip(common, means, judged, strict=True)
-    )
+    return _judge([rows[0][key] if len(rows) == 1 else _average(key, [row[key] for row in rows]) for key in common])
 
 
 @dataclass(frozen=True)
 class _Pair:
-    compared: Compared  # of one seed
+    compared: Compared
     folders: tuple[Path, Path]  # of the first training's tests, the second run's and the first's
     estimate: OneTraining | MeanOverSeeds | None  # what is judged; None for one training of unknown spread
     scenes: int  # of the test
@@ -97,13 +90,20 @@ def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: i
     )
 
 
-def _judge_trainings(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
-    """Return the differences of one seed with their verdicts, judged together; of unknown spread only losses are."""
+def _average(key: Key, pairs: Sequence[_Pair]) -> _Pair:
+    """Return the mean over seeds of a test's differences; its interval is over seeds and scenes."""
+    compared = [pair.compared for pair in pairs]
+    mean = mean_of_tests(key[3], [each.difference.mean for each in compared], [pair.folders for pair in pairs])
+    first, second = np.mean([(each.first, each.second) for each in compared], axis=0).tolist()
+    whole = replace(compared[0], first=first, second=second, difference=mean)
+    return replace(pairs[0], compared=whole, estimate=mean)
+
+
+def _judge(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
+    """Return the differences, judged together; of one training of unknown spread only a large loss is decided."""
     judged = judge_known([None if pair.estimate is None else Claim(pair.estimate) for pair in pairs])
     return tuple(
-        replace(pair.compared, verdict=_judge_unknown(pair, len(pairs)))
-        if one is None
-        else replace(pair.compared, verdict=one.verdict, judged=one)
+        replace(pair.compared, verdict=_judge_unknown(pair, len(pairs)) if one is None else one.verdict, judged=one)
         for pair, one in zip(pairs, judged, strict=True)
     )
 
@@ -112,13 +112,3 @@ def _judge_unknown(pair: _Pair, family: int) -> str:
     """Return the verdict on one training of unknown spread: a loss too large for the spread of both runs is one."""
     lost = tell_loss(pair.compared.difference, pair.scenes, family, LARGEST_SPREAD * 2**0.5)
     return UNDECIDED if lost is None else NOT_HELD
-
-
-def _listed(pairs: Sequence[_Pair]) -> tuple[list[float], list[tuple[Path, Path]]]:
-    """Return the difference and the folders of each seed."""
-    return [pair.compared.difference.mean for pair in pairs], [pair.folders for pair in pairs]
-
-
-def _compared(key: Key, rows: Sequence[Compared], change: Estimate, judged: Judged) -> Compared:
-    first, second = float(np.mean([row.first for row in rows])), float(np.mean([row.second for row in rows]))
-    return Compared(*key, rows[0].measure, first, second, change, judged.verdict, judged)

@@ -37,7 +37,7 @@ PATIENT = RoundRules()  # by which a round is predicted: without a deadline
 
 @dataclass(frozen=True)
 class DrivenRounds:
-    """The rounds of a region on the network: by which rules, who is lost and why, and how long each takes."""
+    """The rounds of a region on the radio network: rules, lost clients with reasons, and durations [s]."""
 
     rules: Rules
     outages: Mapping[tuple[int, str], Outage]  # by round, from 1, and client
@@ -46,7 +46,7 @@ class DrivenRounds:
 
     @property
     def seconds(self) -> list[float]:
-        """Return how long each round takes [s]."""
+        """Return the duration of each round [s]."""
         return [record.end_s - record.start_s for record in self.records]
 
 
@@ -118,7 +118,7 @@ def drive_rounds(
     seeds: Sequence[int],
     earlier: int,
 ) -> DrivenRounds:
-    """Return what the network makes of rounds by `rules`, after `earlier` ones in the scenes before.
+    """Simulate rounds by `rules` on the radio network, after `earlier` ones in the scenes before.
 
     seeds: of each round, which its clients are drawn by. Under deadline selection without given `seconds`
     those take part whose round is predicted to end in time, with all that are in the town at once. A round goes on
@@ -173,7 +173,7 @@ def _find_slow(
 
 @dataclass(frozen=True)
 class DrivenStage:
-    """The rounds of a stage on the network: rules of all regions, who is lost and why, and how long each takes."""
+    """The rounds of a stage on the radio network: rules of all regions, lost clients, and durations [s]."""
 
     rules: Rules
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by edge round, from 1, and client

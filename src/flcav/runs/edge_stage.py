@@ -106,7 +106,7 @@ def federate_regions(
 
 
 def name_results(arm: str) -> str:
-    """Return the name of an arm's file of results; each arm has its own."""
+    """Return the name of the results file of an arm."""
     return "federation.json" if arm == MAIN else f"federation-{arm}.json"
 
 
@@ -124,7 +124,7 @@ def measure_times(results: Federations, out: Path) -> TrainTimes:
 
 
 def tells_of_round(step: str, note: str) -> bool:
-    """Return whether a note of a step tells of a round of a federation, or of a damaged checkpoint."""
+    """Return whether a step's note reports a federated round or a damaged checkpoint."""
     return FEDERATE in step and (note.startswith(LOSS) or DAMAGED in note)
 
 
@@ -158,7 +158,7 @@ def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapp
 
 
 def _collect(graph: Graph, out: Path, step: str, region: str) -> RegionFederation:
-    """Return the results of a finished federation, and copy its weights beside them."""
+    """Return the results of a finished federation, and copy its weights into their folder."""
     folder = out / WORK / step
     result = StageResult.load(folder)
     scores = Checkpoint.read(folder, LAST).scores if result.rounds else ()

@@ -1,4 +1,4 @@
-"""Forecast of a run before anything is spent: rounds, megabytes, epsilon, time, and effects that its tests can tell.
+"""Forecast of a run before anything is spent: rounds, megabytes, epsilon, time, and effects that its tests can detect.
 
 One scene is recorded for each task, in a temporary folder, and a few steps are trained on it: sizes of samples and
 times are measured so. Plans are made as the run makes its first ones; what only a run finds out (times on the air,
@@ -72,7 +72,7 @@ class Forecast(Record):
     minutes: float  # of one core
     arms: Mapping[str, ArmForecast]
     scenes: int  # of tests, in a region
-    effect: float  # smallest difference of AP50 or accuracy that these tell of one training
+    effect: float  # smallest difference of AP50 or accuracy that these tests detect in one training
 
     def lines(self) -> list[str]:
         """Return the forecast in words."""

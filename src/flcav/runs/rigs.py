@@ -50,7 +50,7 @@ def _compare(outline: Outline, folder: Path, name: str) -> str:
 
 
 def _list_pools(outline: Outline, task: str) -> Iterator[Mapping[str, Json]]:
-    """Yield the recipes by which the data that a task is pretrained on are recorded, or were."""
+    """Yield the recording recipes of the data that a task is or was pretrained on."""
     for region, step in outline.pools(task).items():
         own = outline.recipe.regions[region]
         if own.data is not None:

@@ -13,6 +13,7 @@ from flcav.runs.arms import check_federations
 from flcav.runs.engine import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.runs.recipe import RunRecipe, load_run_recipe
 from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.table import save_table
 from flcav.runs.rigs import tell_rigs
 from flcav.runs.spread import list_spreads
 from flcav.runs.stages.deployment import deploy
@@ -39,7 +40,7 @@ def run(
 ) -> Run:
     """Run or finish a recipe, or that in a YAML file, in the folder `out`; write its results there, and return them.
 
-    The files are results.json, history.csv, ledgers, rounds.parquet, and TensorBoard's event files.
+    The files are results.json, results.csv, history.csv, ledgers, rounds.parquet, and TensorBoard's event files.
 
     Args:
         recipe: of the run, or the path of its YAML file.
@@ -161,6 +162,7 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name
     if graph.recipe.retrainings:
         append_records(history.with_name(SPREAD), list_spreads(result, name))
     write_rounds(result, out)
+    save_table(result, out)
     result.save(out)
     return result
 

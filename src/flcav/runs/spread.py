@@ -11,6 +11,7 @@ import io
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
+from typing import TypeVar
 
 from flcav.config import InputError
 from flcav.runs.results.run import Run
@@ -18,6 +19,7 @@ from flcav.runs.results.tests import Difference, Test
 from flcav.runs.tables import read_named_table
 from flcav.statistics.estimates import Spread, measure_spread, pool_spreads, widen, widen_share
 
+FigureT = TypeVar("FigureT", Test, Difference)
 Key = tuple[str, str, str, str, str, str]  # task, region, arm, stage, and of a difference the arm and stage before
 Spreads = Mapping[Key, Spread]
 
@@ -42,9 +44,10 @@ def test_key(task: str, region: str, arm: str, stage: str) -> Key:
     return task, region, arm, stage, "", ""
 
 
-def difference_key(each: Difference) -> Key:
-    """Return the key of a difference."""
-    return each.task, each.region, each.arm, each.stage, each.before_arm, each.before_stage
+def figure_key(each: Test | Difference) -> Key:
+    """Return the key of a test's measure, or of a difference."""
+    arm, stage = (each.before_arm, each.before_stage) if isinstance(each, Difference) else ("", "")
+    return each.task, each.region, each.arm, each.stage, arm, stage
 
 
 def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[SpreadRow]:
@@ -63,24 +66,18 @@ def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[Sprea
 
 def list_figures(run: Run) -> dict[Key, Test | Difference]:
     """Return the tests and differences of a run by key, in this order."""
-    tests = {test_key(each.task, each.region, each.arm, each.stage): each for each in run.tested}
-    return {**tests, **{difference_key(each): each for each in run.differences}}
+    return {figure_key(each): each for each in (*run.tested, *run.differences)}
 
 
 def widen_anew(run: Run, spreads: Spreads) -> Run:
     """Return a run of one training with intervals by `spreads`, which may be newer than those of its results."""
 
-    def of_test(test: Test) -> Test:
-        spread = spreads.get(test_key(test.task, test.region, test.arm, test.stage))
-        alone = test.result.estimate
-        return replace(test, estimate=alone if spread is None else widen_share(alone, spread), spread=spread)
+    def anew(figure: FigureT) -> FigureT:
+        spread, alone = spreads.get(figure_key(figure)), figure.over_scenes
+        widened = alone if spread is None else (widen_share if isinstance(figure, Test) else widen)(alone, spread)
+        return replace(figure, estimate=widened, spread=spread)
 
-    def of_difference(each: Difference) -> Difference:
-        spread, alone = spreads.get(difference_key(each)), each.over_scenes
-        return replace(each, estimate=alone if spread is None else widen(alone, spread), spread=spread)
-
-    tested, differences = map(of_test, run.tested), map(of_difference, run.differences)
-    return replace(run, tested=tuple(tested), differences=tuple(differences))
+    return replace(run, tested=tuple(map(anew, run.tested)), differences=tuple(map(anew, run.differences)))
 
 
 def read_spreads(name: str, beside: Path) -> Spreads:

@@ -1,4 +1,4 @@
-"""Tables (CSV) that a recipe names, of the package or a user's own: learning histories, and spreads of retraining."""
+"""CSV tables that a recipe names, from the package or a user's file: learning histories, spreads of retraining."""
 
 import csv
 from collections.abc import Sequence

@@ -3,8 +3,9 @@
 Tables of users: reading of CSV, and writing as CSV or Parquet by the suffix of the file's name.
 """
 
-import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+import re
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Self, TypeVar
@@ -76,6 +77,12 @@ def flatten_record(values: Mapping[str, Json], above: str = "") -> Iterator[tupl
             yield from flatten_record(value, f"{above}{name}.")
         else:
             yield above + name, value
+
+
+def select(rows: Iterable[RecordT], **values: str | int | Collection[str] | None) -> list[RecordT]:
+    """Return the rows, or other records, whose fields have these values; of a collection of values any of them."""
+    wanted = {name: (value,) if isinstance(value, str | int | None) else value for name, value in values.items()}
+    return [row for row in rows if all(getattr(row, name) in among for name, among in wanted.items())]
 
 
 @cache

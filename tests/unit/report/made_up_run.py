@@ -1,7 +1,5 @@
 """Made-up inputs with the shape of a real run's."""
 
-from typing import Any
-
 import numpy as np
 
 from flcav.geometry import Boxes
@@ -11,9 +9,11 @@ from flcav.runs.provenance import Provenance
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.runs.results.plans import Placed, Plan, Pole, TaskPlan
 from flcav.runs.results.run import ArmResult, LinkUse, Run, Spent
+from flcav.runs.results.table import Row, tabulate
 from flcav.runs.results.tests import Difference, RunFinding, Test, Tested
 from flcav.runs.results.training import Pretrained, Validated
 from flcav.statistics.estimates import Estimate, Spread
+from flcav.storage.records import select
 from flcav.world.map.town import load_town
 
 MEANS = {"grid": (0.412, 0.503, 0.511), "ring": (0.381, 0.447, 0.468)}
@@ -26,7 +26,6 @@ SENT = (
     ("cloud", "wireless", 32.1),
     ("cloud", "wireline", 9.2),
 )
-STAGE_NAMES = {"pretrain": "pretraining", "edge": "edge FL", "cloud": "cloud FL"}
 
 
 def run() -> Run:
@@ -86,34 +85,31 @@ def result_of(town: str, mean: float) -> Tested:
     return Tested(town, "objects", "AP50", estimate, {"AP70": mean - 0.19, "right headings": 0.96}, 96, 8)
 
 
-def chart_rows() -> list[dict[str, Any]]:
+def chart_rows() -> list[Row]:
     """Return the tested rows of a chart."""
-    return [
-        {"stage": stage, "town": town, "score": mean, "low": mean - 0.041, "high": mean + 0.038}
-        for town, means in MEANS.items()
-        for stage, mean in zip(STAGE_NAMES.values(), means, strict=True)
-    ]
+    return select(tabulate(run()), quantity="tested.estimate")
 
 
-def sent() -> list[dict[str, Any]]:
-    return [{"stage": STAGE_NAMES[stage], "link": link, "mb": mb} for stage, link, mb in SENT]
+def sent() -> list[Row]:
+    return select(tabulate(run()), quantity=["arms.spent.wireless.mb", "arms.spent.wireline.mb"])
 
 
-def rounds() -> list[dict[str, Any]]:
+def rounds() -> list[Row]:
     rng = np.random.default_rng(3)
-    rows: list[dict[str, Any]] = [
-        {"stage": "pretraining", "round": n, "town": "suburb", "score": 0.62 * (1 - np.exp(-n / 3))}
-        for n in range(1, 9)
-    ]
+    rows = [_score(PRETRAIN, n, "suburb", 0.62 * (1 - np.exp(-n / 3))) for n in range(1, 9)]
     for town, start, middle, end in (("grid", 0.41, 0.50, 0.51), ("ring", 0.38, 0.45, 0.47)):
-        rows.append({"stage": "pretraining", "round": 8, "town": town, "score": start})
+        rows.append(_score(PRETRAIN, 0, town, start))
         for n in range(1, 7):
             score = middle - (middle - start) * np.exp(-n / 2) + rng.normal(0, 0.006)
-            rows.append({"stage": "edge FL", "round": n, "town": town, "score": score})
+            rows.append(_score(EDGE, n, town, score))
         for n in range(1, 4):
             score = end - (end - middle) * np.exp(-n) + rng.normal(0, 0.004)
-            rows.append({"stage": "cloud FL", "round": n, "town": town, "score": score})
-    return [{**row, "score": float(row["score"])} for row in rows]
+            rows.append(_score(CLOUD, n, town, score))
+    return rows
+
+
+def _score(stage: str, number: int, town: str, score: float) -> Row:
+    return Row(stage=stage, round=number, region=town, quantity="watched.rounds.score", value=float(score))
 
 
 def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:

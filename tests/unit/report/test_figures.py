@@ -183,19 +183,19 @@ def test_validation_and_test_frames_stand_on_axes_of_their_own() -> None:
     validated, tested = figures.by_round(ROUNDS, TESTED, "AP50").axes
     assert _dots(validated) == {}
     assert {len(np.asarray(line.get_xdata())) for line in validated.get_lines() if line.get_marker() == "o"} == {
-        sum(row["town"] == town for row in ROUNDS) for town in {row["town"] for row in ROUNDS}
+        sum(row.region == town for row in ROUNDS) for town in {row.region for row in ROUNDS}
     }
     assert _dots(tested) == {0: {0.412, 0.381}, 1: {0.503, 0.447}, 2: {0.511, 0.468}}
 
 
 def test_towns_that_are_only_tested_are_named() -> None:
-    unseen = [{**row, "town": "unseen"} for row in TESTED if row["town"] == "ring"]
+    unseen = [replace(row, region="unseen") for row in TESTED if row.region == "ring"]
     tested = figures.by_round(ROUNDS, [*TESTED, *unseen], "AP50").axes[1]
-    assert {text.get_text() for text in tested.texts} == {row["town"] for row in TESTED} | {"unseen"}
+    assert {text.get_text() for text in tested.texts} == {row.region for row in TESTED} | {"unseen"}
 
 
 def test_a_stage_that_was_not_tested_takes_no_place() -> None:
-    rest = [row for row in TESTED if row["stage"] != "edge FL"]
+    rest = [row for row in TESTED if row.stage != "edge"]
     tested = figures.by_round(ROUNDS, rest, "AP50").axes[1]
     assert _dots(tested) == {0: {0.412, 0.381}, 1: {0.511, 0.468}}
     assert [label.get_text() for label in tested.get_xticklabels()] == ["pretraining", "cloud FL"]
@@ -215,7 +215,7 @@ def test_bars_add_up_to_the_ledger_and_budgets_stand_where_they_are() -> None:
     bars = [patch for patch in axes.patches if isinstance(patch, Rectangle)]
     for y, link in enumerate(BUDGETS):
         own = [bar for bar in bars if bar.get_y() < y < bar.get_y() + bar.get_height()]
-        total = sum(row["mb"] for row in SENT if row["link"] == link)
+        total = sum(row.value for row in SENT if row.quantity == f"arms.spent.{link}.mb")
         assert sum(bar.get_width() for bar in own) == pytest.approx(total)
         assert max(bar.get_x() + bar.get_width() for bar in own) == pytest.approx(total)
     assert "215 of 230 MB" in {text.get_text() for text in axes.texts}
@@ -230,14 +230,14 @@ def test_arms_stand_in_a_panel_per_town_with_their_intervals() -> None:
 
 
 def test_a_town_of_ones_own_has_a_colour_of_its_own() -> None:
-    rounds = [{**row, "town": "mine" if row["town"] == "ring" else row["town"]} for row in ROUNDS]
+    rounds = [replace(row, region="mine" if row.region == "ring" else row.region) for row in ROUNDS]
     axes = figures.by_round(rounds, [], "AP50").axes[0]
     colours = {str(line.get_color()) for line in axes.get_lines() if len(np.asarray(line.get_xdata())) > 2}
     assert len(colours) >= 3
 
 
 def test_a_measure_of_one_scene_is_drawn_without_a_bar() -> None:
-    single = [{**row, "low": None, "high": None} for row in TESTED]
+    single = [replace(row, low=None, high=None) for row in TESTED]
     assert _dots(figures.by_round(ROUNDS, single, "AP50").axes[1]) == {
         0: {0.412, 0.381},
         1: {0.503, 0.447},

@@ -84,7 +84,8 @@ def test_the_page_tells_the_numbers() -> None:
 
 def test_an_interval_that_one_scene_leaves_unknown_is_said() -> None:
     told = results()
-    told["stages"][0] = told["stages"][0] | {"low": None, "high": None}
+    first = told["stages"][0]
+    told["stages"][0] = replace(first, estimate=replace(first.estimate, low=None, high=None))
     assert "pretrained 0.412 no interval: one scene" in Page(render(told, PICTURES)).text
 
 

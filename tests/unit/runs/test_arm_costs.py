@@ -1,6 +1,7 @@
 """What arms cost and gain, against the committed results of the demo, read as plain JSON."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +14,7 @@ from flcav.report.pages import html
 from flcav.report.pages.run_page import page
 from flcav.runs.analysis.costs import list_arm_costs
 from flcav.runs.results.run import Run
+from flcav.statistics.estimates import Estimate
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
 
@@ -64,20 +66,14 @@ def test_the_report_has_a_table_of_arms_and_one_of_many_undecided_claims(run: Ru
     assert shown.count('<li><span class="badge') == len(run.findings) - len(undecided)
 
 
-def test_names_of_arms_keep_apart():
+def test_names_of_arms_keep_apart(run: Run):
+    one = list_arm_costs(run)[0]
+    drawn = (("main", 30.0, 0.6), ("other", 30.0, 0.6), ("third", 12.0, 0.6), ("bare", 30.2, 0.61))
     rows = [
-        {
-            "arm": name,
-            "measure": "AP50",
-            "mb": mb,
-            "before": 0.5,
-            "score": score,
-            "low": score - 0.1,
-            "high": score + 0.1,
-        }
-        for name, mb, score in (("main", 30.0, 0.6), ("other", 30.0, 0.6), ("third", 12.0, 0.6), ("bare", 30.2, 0.61))
+        replace(one, arm=name, wireless_mb=mb - 10, wireline_mb=10.0, after=Estimate(score, score - 0.1, score + 0.1))
+        for name, mb, score in drawn
     ]
-    figure = figures.gains({"objects": rows})
+    figure = figures.gains(rows)
     assert style.png(figure)[:4] == b"\x89PNG"
     names = {text.get_text(): text.xy for text in figure.axes[0].texts if isinstance(text, Annotation)}
     assert names.keys() == {"main", "other", "third", "bare"}

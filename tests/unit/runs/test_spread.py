@@ -10,7 +10,7 @@ import pytest
 from flcav.config import InputError
 from flcav.report.run_tables import tables
 from flcav.runs.results.run import Run
-from flcav.runs.spread import SpreadRow, difference_key, list_figures, list_spreads, read_spreads, widen_anew
+from flcav.runs.spread import SpreadRow, figure_key, list_figures, list_spreads, read_spreads, widen_anew
 from flcav.runs.tables import append_records
 from flcav.statistics.estimates import Spread
 
@@ -82,7 +82,7 @@ def test_pages_judge_a_run_by_the_present_table() -> None:
     spreads = read_spreads("demo", Path())
     widened = widen_anew(run, spreads)
     for before, after in zip(run.differences, widened.differences, strict=True):
-        assert after.spread == spreads[difference_key(after)]
+        assert after.spread == spreads[figure_key(after)]
         assert after.estimate.mean == before.estimate.mean
     for before, after in zip(run.tested, widened.tested, strict=True):
         assert after.result == before.result

@@ -102,7 +102,7 @@ class Curve:
 
 @style.styled
 def fig3a(article: Sequence[Curve], own: Sequence[Curve], route: Route, graph: nx.Graph) -> Figure:
-    """Return three panels: graph, curves of the article's points by task, curves of our own history by sample size."""
+    """Return three panels: graph, curves of the article's points by task, curves of our history by sample size."""
     figure = style.canvas(14.4, 4.4)
     left, middle, right = figure.subplots(1, 3, width_ratios=(5.6, 3, 3))
     draw_layers(left, graph)

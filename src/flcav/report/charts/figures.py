@@ -6,9 +6,11 @@ from matplotlib.figure import Figure
 
 from flcav.report import style
 from flcav.report.charts import runs
-from flcav.report.charts.runs import Row
 from flcav.report.pictures import clouds, maps
+from flcav.runs.results.run import ArmCost
+from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
+from flcav.storage.records import select
 
 WIDTH = 3.8  # [inch] of a figure that a phone shows
 TALLEST = 2.0  # height of a map in widths: a higher one is drawn narrower
@@ -62,19 +64,20 @@ def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figu
 
 
 @style.styled
-def megabytes(ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
+def megabytes(rows: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
     """Return the traffic of each stage on each link, against the budgets (link -> MB)."""
     figure = style.canvas(WIDTH, 0.55 * WIDTH)
-    runs.draw_megabytes(figure.add_subplot(), ledger_by_stage, budgets)
+    runs.draw_megabytes(figure.add_subplot(), rows, budgets)
     return figure
 
 
 @style.styled
-def gains(costs: Mapping[str, Sequence[Row]]) -> Figure:
-    """Return a measure against the uplink of arms, a panel per task; for the rows see `runs.draw_gains`."""
-    figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(costs))
-    for axes, (task, rows) in zip(figure.subplots(len(costs), squeeze=False)[:, 0], costs.items(), strict=True):
-        runs.draw_gains(axes, rows)
+def gains(costs: Sequence[ArmCost]) -> Figure:
+    """Return a measure against the uplink of arms, a panel per task."""
+    tasks = dict.fromkeys(cost.task for cost in costs)
+    figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(tasks))
+    for axes, task in zip(figure.subplots(len(tasks), squeeze=False)[:, 0], tasks, strict=True):
+        runs.draw_gains(axes, select(costs, task=task))
         axes.set_title(task, fontweight="bold")
     figure.axes[-1].set_xlabel("uplink of stages II and III [MB]")
     return figure

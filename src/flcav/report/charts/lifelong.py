@@ -67,8 +67,7 @@ def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measu
             at = np.arange(len(means)) + APART * (place - (len(arms) - 1) / 2)
             panel.plot(at, [each.mean for each in means], color=colour, marker="o", markersize=3, label=arm)
             for x, each in zip(at.tolist(), means, strict=True):
-                if each.low is not None and each.high is not None:
-                    panel.plot([x, x], [each.low, each.high], color=colour, linewidth=1.0)
+                style.interval(panel, x, each, color=colour, linewidth=1.0)
         panel.axvspan(number + 0.5, number + 1.5, color=style.SIDEWALK, zorder=0)
         panel.set_xticks(range(len(conditions) + 1), ["start", *conditions], rotation=40, ha="right")
         panel.set(title=f"tested in {condition}")

@@ -137,7 +137,7 @@ def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], title: str) -> None:
         axes.plot(places, predicted, color=colour, linestyle=(0, (3, 2)), marker="D", mfc="white")
         axes.plot(places, [each.trained.mean for each in reached], color=colour, marker="o", linewidth=1.8)
         for place, each in zip(places, reached, strict=True):
-            _draw_interval(axes, place, each.trained, color=colour, linewidth=1)
+            style.interval(axes, place, each.trained, color=colour, linewidth=1)
             for seed in each.seeds:
                 axes.plot(place, seed, ".", color=colour, alpha=0.5)
     axes.set_xticks(range(len(STAGES)), list(STAGES.values()))
@@ -145,15 +145,10 @@ def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], title: str) -> None:
     axes.grid(axis="y")
 
 
-def _draw_interval(axes: Axes, place: float, mean: MeanOverSeeds, *, color: str, linewidth: float) -> None:
-    if mean.low is not None and mean.high is not None:
-        axes.plot([place] * 2, [mean.low, mean.high], color=color, linewidth=linewidth)
-
-
 def _draw_differences(axes: Axes, differences: ByStage) -> None:
     for place, stage in enumerate(STAGES):
         each = differences[stage]
-        _draw_interval(axes, place, each.trained, color=style.INK, linewidth=1.2)
+        style.interval(axes, place, each.trained, color=style.INK, linewidth=1.2)
         axes.plot(place, each.trained.mean, "o", color=style.INK)
         axes.plot(place - ASIDE, each.predicted, "D", color=style.MUTED, mfc="white")
         for seed in each.seeds:

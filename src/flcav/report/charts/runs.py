@@ -1,30 +1,32 @@
 """Charts of runs: a measure after every round, megabytes by link, and a forest plot of arms."""
 
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from itertools import cycle
 
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 
 from flcav.report import style
+from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN
+from flcav.runs.results.run import ArmCost
+from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
-
-Row = Mapping[str, Any]
+from flcav.storage.records import select
 
 LINE, TALL = 0.07, 0.13  # height of a name, as a fraction of the axis: of rounds, and of tests, which is lower
-STAGES = ("pretraining", "edge FL", "cloud FL")  # as rows name them, in their order
+STAGES = {PRETRAIN: "pretraining", EDGE: "edge FL", CLOUD: "cloud FL"}  # in their order
 
 
 def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
     """Draw the measure on validation frames after every round, a line per town.
 
-    `rounds` has rows stage, round, town, score; round 0 is before the stage. Stages are named as in `STAGES`; all are
-    equally wide, whatever their number of rounds.
+    `rounds` are the validation scores of `tabulate`. Round 0, of the pretrained network, stands before round 1 of edge
+    FL. All stages are equally wide, whatever their number of rounds.
     """
     places = _places(rounds)
     lines = {
-        town: sorted((places[row["stage"]][row["round"]], row["score"]) for row in rounds if row["town"] == town)
-        for town in dict.fromkeys(row["town"] for row in rounds)
+        town: sorted((places[_stage_of(row)][row.round or 0], row.value) for row in select(rounds, region=town))
+        for town in dict.fromkeys(row.region for row in rounds)
     }
     colours = {town: _colour(town, lines) for town in lines}
     for town, line in lines.items():
@@ -39,54 +41,60 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
 def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
     """Draw the measure on test frames with its interval after every stage, a colour per town.
 
-    `tested` has rows stage, town, score, low, high, stages named as in `STAGES`; low and high may be None.
+    `tested` are rows of `tabulate`, one per stage and region.
     """
-    stages = [stage for stage in STAGES if any(row["stage"] == stage for row in tested)]
-    towns, ends = list(dict.fromkeys(row["town"] for row in tested)), {}
+    stages = [stage for stage in STAGES if select(tested, stage=stage)]
+    towns, ends = list(dict.fromkeys(row.region for row in tested)), {}
     colours = {town: _colour(town, towns) for town in towns}
     for number, town in enumerate(towns):
         aside = 0.5 + 0.12 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
-        own = sorted((stages.index(row["stage"]) + aside, row["score"]) for row in tested if row["town"] == town)
-        axes.plot(*zip(*own, strict=True), color=colours[town], linewidth=0.8, linestyle=(0, (2, 2)))
-        for row in tested:
-            if row["town"] == town:
-                _draw_interval(axes, stages.index(row["stage"]) + aside, row, colours[town])
-        ends[town] = own[-1]
+        reached = {stages.index(row.stage) + aside: row.estimate for row in select(tested, region=town)}
+        points = sorted((x, estimate.mean) for x, estimate in reached.items())
+        axes.plot(*zip(*points, strict=True), color=colours[town], linewidth=0.8, linestyle=(0, (2, 2)))
+        for x, estimate in reached.items():
+            _draw_interval(axes, x, estimate, colours[town])
+        ends[town] = points[-1]
     axes.set(xlim=(0, max(len(stages), 1) + 0.12), xlabel="test frames", ylabel=measure)
     axes.set_ylim(0, None)
     _name_ends(axes, ends, colours, TALL)
-    axes.set_xticks([place + 0.5 for place in range(len(stages))], stages)
+    axes.set_xticks([place + 0.5 for place in range(len(stages))], [STAGES[stage] for stage in stages])
     axes.grid(axis="y")
 
 
-def _name_ends(axes: Axes, ends: Mapping[str, tuple[float, float]], colours: Mapping[str, str], height: float) -> None:
-    """Write each town's name beside the end (x, y) of its line, without overlaps within a stage."""
-    top = axes.get_ylim()[1]
-    for stage in dict.fromkeys(int(x) for x, _ in ends.values()):
-        own = {town: end for town, end in ends.items() if int(end[0]) == stage}
-        right = max(x for x, _ in own.values())
-        places = style.keep_apart([y for _, y in own.values()], height * top, top)
-        for town, place in zip(own, places, strict=True):
+def _name_ends(
+    axes: Axes,
+    ends: Mapping[str, tuple[float, float]],
+    colours: Mapping[str, str],
+    height: float,
+    column: Callable[[float], float] = int,
+) -> None:
+    """Write the name of each line beside its end (x, y), without overlaps within a column of x, such as a stage."""
+    low, top = axes.get_ylim()
+    for at in dict.fromkeys(column(x) for x, _ in ends.values()):
+        near = {name: end for name, end in ends.items() if column(end[0]) == at}
+        right = max(x for x, _ in near.values())
+        places = style.keep_apart([y for _, y in near.values()], height * (top - low), top)
+        for name, place in zip(near, places, strict=True):
             axes.annotate(
-                town,
+                name,
                 (right, place),
                 (9, 0),
                 textcoords="offset points",
-                color=colours[town],
+                color=colours[name],
                 va="center",
                 fontweight="bold",
             )
 
 
 def _colour(town: str, towns: Iterable[str]) -> str:
-    """Return a town's own colour, or one of `style.OTHER_COLOURS`, in turn."""
+    """Return the colour of a town: of `style.TOWN_COLOURS`, or else one of `style.OTHER_COLOURS` in turn."""
     others = [name for name in dict.fromkeys(towns) if name not in style.TOWN_COLOURS]
     return style.TOWN_COLOURS.get(town) or style.OTHER_COLOURS[others.index(town) % len(style.OTHER_COLOURS)]
 
 
 def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
     """Return the x of every round, by stage; the n-th stage spans [n, n + 1]."""
-    numbers = {stage: sorted({row["round"] for row in rounds if row["stage"] == stage}) for stage in STAGES}
+    numbers = {stage: sorted({row.round or 0 for row in rounds if _stage_of(row) == stage}) for stage in STAGES}
     taken = {stage: known for stage, known in numbers.items() if known}
     return {
         stage: {number: start + (rank + 0.5) / len(known) for rank, number in enumerate(known)}
@@ -94,10 +102,14 @@ def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
     }
 
 
+def _stage_of(row: Row) -> str:
+    return EDGE if row.round == 0 else row.stage
+
+
 def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
     """Write the stages' names above, draw their borders, and number the first and last round of each."""
     for start, stage in enumerate(places):
-        axes.text(start + 0.5, 1.02, stage, transform=axes.get_xaxis_transform(), ha="center")
+        axes.text(start + 0.5, 1.02, STAGES[stage], transform=axes.get_xaxis_transform(), ha="center")
         if start:
             axes.axvline(start, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     ends = {known[number]: number for known in places.values() for number in (min(known), max(known))}
@@ -108,64 +120,57 @@ def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
     axes.set_xlim(0, len(places) + 0.12)
 
 
-def _draw_interval(axes: Axes, x: float, row: Row, colour: str) -> None:
-    if row["low"] is not None:
-        axes.plot([x, x], [row["low"], row["high"]], color=colour, marker="_", markersize=7)
-    axes.plot(x, row["score"], "o", color=colour, markersize=6, markeredgecolor="white")
+def _draw_interval(axes: Axes, x: float, reached: Estimate, colour: str) -> None:
+    style.interval(axes, x, reached, color=colour, marker="_", markersize=7)
+    axes.plot(x, reached.mean, "o", color=colour, markersize=6, markeredgecolor="white")
 
 
-def draw_megabytes(axes: Axes, ledger_by_stage: Sequence[Row], budgets: Mapping[str, float]) -> None:
-    """Draw a stacked bar per link, a part per stage, against a line at the link's budget [MB]."""
-    stages = list(dict.fromkeys(row["stage"] for row in ledger_by_stage))
-    widest = max([*budgets.values(), *(row["mb"] for row in ledger_by_stage)])
+def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]) -> None:
+    """Draw a stacked bar of the uplink of each link, a part per stage, against a line at the link's budget [MB].
+
+    `rows` are those of `tabulate` about an arm.
+    """
+    spent = {link: select(rows, quantity=f"arms.spent.{link}.mb") for link in budgets}
+    stages = list(dict.fromkeys(row.stage for of_link in spent.values() for row in of_link))
+    sums = {
+        link: {stage: sum(row.value for row in select(of_link, stage=stage)) for stage in stages}
+        for link, of_link in spent.items()
+    }
+    widest = max([*budgets.values(), *(mb for of_link in sums.values() for mb in of_link.values())])
     for y, (link, budget) in enumerate(budgets.items()):
         left = 0.0
-        for stage, colour in zip(stages, style.STAGE_COLOURS, strict=False):
-            sent = sum(row["mb"] for row in ledger_by_stage if (row["stage"], row["link"]) == (stage, link))
+        for sent, colour in zip(sums[link].values(), style.STAGE_COLOURS, strict=False):
             axes.barh(y, sent, left=left, height=0.42, color=colour, edgecolor="white")
             if sent > 0.05 * widest:
                 axes.text(left + sent / 2, y, f"{sent:.0f}", ha="center", va="center_baseline")
             left += sent
         axes.plot([budget, budget], [y - 0.34, y + 0.30], color=style.INK, linewidth=2)
         axes.text(budget, y - 0.37, f"{left:.0f} of {budget:.0f} MB", ha="right", va="bottom", fontsize=style.SMALL)
-    patches = [Patch(color=colour, label=stage) for stage, colour in zip(stages, style.STAGE_COLOURS, strict=False)]
+    patches = [
+        Patch(color=colour, label=STAGES[stage]) for stage, colour in zip(stages, style.STAGE_COLOURS, strict=False)
+    ]
     style.key(axes.figure, patches)
     axes.set_yticks(range(len(budgets)), list(budgets))
     axes.set(xlabel="uplink megabytes (1 MB = 10⁶ bytes)", ylim=(len(budgets) - 0.6, -0.65))
 
 
-def draw_gains(axes: Axes, rows: Sequence[Row]) -> None:
-    """Draw the measure of each arm against its uplink, with a line from pretraining.
-
-    `rows` have arm, measure, mb, before, score, low, high; low and high may be None.
-    """
-    colours, most = (style.BLUE, *style.OTHER_COLOURS, style.VERMILLION), max(row["mb"] for row in rows)
+def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
+    """Draw the measure of each arm of a task against its uplink [MB], with a line from pretraining."""
+    palette = cycle((style.BLUE, *style.OTHER_COLOURS, style.VERMILLION))
+    colours = dict(zip((cost.arm for cost in costs), palette, strict=False))
+    most = max(cost.uplink_mb for cost in costs)
     at: dict[str, float] = {}  # by arm; bars at the same megabytes stand side by side
-    for number, row in enumerate(rows):
-        colour, before = (
-            colours[number % len(colours)],
-            [each for each in at.values() if abs(each - row["mb"]) < most / 50],
-        )
-        at[row["arm"]] = x = row["mb"] + len(before) * most / 60
-        axes.plot([0, x], [row["before"], row["score"]], color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
-        axes.plot(0, row["before"], "o", color=colour, markerfacecolor="white", markersize=6, clip_on=False)
-        _draw_interval(axes, x, row, colour)
+    for cost in costs:
+        colour = colours[cost.arm]
+        near = [x for x in at.values() if abs(x - cost.uplink_mb) < most / 50]
+        at[cost.arm] = x = cost.uplink_mb + len(near) * most / 60
+        axes.plot([0, x], [cost.before, cost.after.mean], color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
+        axes.plot(0, cost.before, "o", color=colour, markerfacecolor="white", markersize=6, clip_on=False)
+        _draw_interval(axes, x, cost.after, colour)
     low, top = axes.get_ylim()
-    for x in sorted({round(each / most, 1) for each in at.values()}):
-        own = [(row, number) for number, row in enumerate(rows) if round(at[row["arm"]] / most, 1) == x]
-        places = style.keep_apart([row["score"] for row, _ in own], LINE * (top - low), top)
-        right = max(at[row["arm"]] for row, _ in own)
-        for (row, number), place in zip(own, places, strict=True):
-            axes.annotate(
-                row["arm"],
-                (right, place),
-                (9, 0),
-                textcoords="offset points",
-                color=colours[number % len(colours)],
-                va="center",
-                fontweight="bold",
-            )
-    axes.set(ylabel=rows[0]["measure"], xlim=(0, 1.08 * most), ylim=(low, top))
+    ends = {cost.arm: (at[cost.arm], cost.after.mean) for cost in costs}
+    _name_ends(axes, ends, colours, LINE, lambda x: round(x / most, 1))
+    axes.set(ylabel=costs[0].measure, xlim=(0, 1.08 * most), ylim=(low, top))
     axes.grid(axis="y")
 
 
@@ -176,8 +181,7 @@ def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Esti
         colour = colours[number % len(colours)]
         axes.plot([x for x, _ in points], [ap.mean for _, ap in points], "o-", color=colour, label=name, markersize=4)
         for x, ap in points:
-            if ap.low is not None and ap.high is not None:
-                axes.plot([x, x], [ap.low, ap.high], color=colour, linewidth=0.8)
+            style.interval(axes, x, ap, color=colour, linewidth=0.8)
     axes.set(xlabel="wireless uplink [MB]", ylabel="AP50 (95 % interval)", xlim=(0, None))
     axes.legend(loc="lower right", frameon=False)
     axes.grid(axis="y")

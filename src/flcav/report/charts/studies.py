@@ -131,8 +131,7 @@ def costs(
         axes.plot(*zip(*best, strict=True), color=style.SKY, zorder=1)
         for name, (x, mean) in points.items():
             colour = style.BLUE if name in front else style.MUTED
-            if mean.low is not None and mean.high is not None:
-                axes.plot([x, x], [mean.low, mean.high], color=colour, linewidth=1)
+            style.interval(axes, x, mean, color=colour, linewidth=1)
             axes.plot(x, mean.mean, "o", color=colour, markersize=5)
             axes.annotate(
                 name,

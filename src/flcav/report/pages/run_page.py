@@ -1,6 +1,7 @@
 """The HTML page and the pictures of a run, from its results and the files of its steps."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -17,28 +18,27 @@ from flcav.perception.objects.truth import choose_lidar
 from flcav.plugins import load_named
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.report.charts.runs import STAGES, Row
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
 from flcav.runs.analysis.caveats import PLACED_BARE
 from flcav.runs.analysis.costs import list_arm_costs, list_home_costs, tell_gain
-from flcav.runs.analysis.findings import WORDS
 from flcav.runs.arms import Names
 from flcav.runs.driving import CLOCK
 from flcav.runs.frames import Frames
-from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
+from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
 from flcav.runs.results.plans import Placed
-from flcav.runs.results.run import ArmCost, LinkUse, Run
+from flcav.runs.results.run import ArmCost, Run
 from flcav.runs.results.saved import ERRORS
-from flcav.runs.results.tests import SweepComparison, SweepDetections
+from flcav.runs.results.table import Row, tabulate
+from flcav.runs.results.tests import WORDS, SweepComparison, SweepDetections
 from flcav.runs.results.training import TOGETHER
 from flcav.runs.running import WORK
 from flcav.runs.stages.testing import LOOK
 from flcav.runs.training.records import list_rounds
 from flcav.storage.files import write_bytes
+from flcav.storage.records import select
 
-CHART_NAMES: dict[str, str] = dict(zip((PRETRAIN, EDGE, CLOUD), STAGES, strict=True))
 OBJECTS = "objects"
 SHOWN_ROUNDS = 3  # of a region's timeline
 
@@ -69,93 +69,38 @@ def page(run: Run) -> dict[str, Any]:
     """Return the values of the page, for its template."""
     recipe, main = run.recipe, run.arms[MAIN]
     first = recipe.with_role("federate")[0]
-    rows = [
-        {
-            "name": WORDS[test.stage] if test.arm == MAIN else f"{WORDS[test.stage]} ({test.arm})",
-            "region": test.region,
-            "task": test.task,
-            "measure": test.result.measure,
-            **vars(test.estimate),
-            "spread": test.spread,
-            "numbers": test.result.numbers,
-            "frames": test.result.frames,
-            "scenes": test.result.scenes,
-            "main": test.arm == MAIN,
-        }
-        for test in run.tested
-    ]
-    rounds = [
-        {**vars(record), "stage": WORDS[stage.stage], "task": stage.task}
-        for arm, stage, record in list_rounds(run)
-        if arm == MAIN
-    ]
     return {
-        "seed": recipe.seed,
-        "retrained": recipe.retrainings,
+        **vars(main),
+        **vars(run),
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "first": first,
-        "stages": [row for row in rows if row["main"] and row["region"] == first],
-        "tests": rows,
+        "stages": select(run.tested, arm=MAIN, region=first),
         "gains": tell_gain(run),
-        "findings": run.findings,
-        "placed": main.placed,
         "plans": main.plans,
         "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
-        "links": main.links,
         "sent": {link: [main.sent_mb(task, link) for task in recipe.tasks] for link in main.links},
         "regional": [(arm, test) for arm, result in run.arms.items() for test in result.regional or ()],
-        "gap_closed": run.gap_closed,
-        "rounds": rounds,
+        "rounds": [(stage, record) for arm, stage, record in list_rounds(run) if arm == MAIN],
+        "words": WORDS,
         "labels": [
             (arm, stage.region, labels)
             for arm, result in run.arms.items()
             for stage in result.stages
             for labels in stage.labels or ()
         ],
-        "timelines": [
-            {"name": name, "arm": arm, "region": region} for name, (arm, region) in _list_timelines(run).items()
-        ],
-        "delta": f"{recipe.federation.privacy.delta:g}" if recipe.federation.privacy else None,
-        "divergences": [row for row in rounds if row["divergence"] is not None],
-        "seeded": SEEDED if recipe.federation.privacy and recipe.federation.privacy.seeded else None,
+        "timelines": _list_timelines(run),
         "together": TOGETHER,
+        "seeded": SEEDED,
         "spent": {arm: result.privacy.describe() for arm, result in run.arms.items() if result.privacy is not None},
-        "notes": [
-            (arm, name, stage.region, note)
-            for arm, result in run.arms.items()
-            for stage in result.stages
-            for name, note in stage.describe_rows().items()
-        ],
         "sections": run.list_sections(),
-        "private": any(row["epsilon"] is not None for row in rounds),
-        "timed": any(row["seconds"] is not None for row in rounds),
-        "differences": run.differences,
         "costs": _list_costs(run),
         "home": list_home_costs(run),
         "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
         "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
-        "elapsed_s": run.elapsed_s,
-        "provenance": run.provenance,
     }
-
-
-def _list_gains(costs: Sequence[ArmCost], task: str) -> list[Row]:
-    return [
-        {
-            "arm": each.arm,
-            "measure": each.measure,
-            "mb": each.wireless_mb + each.wireline_mb,
-            "before": each.before,
-            "score": each.after.mean,
-            "low": each.after.low,
-            "high": each.after.high,
-        }
-        for each in costs
-        if each.task == task
-    ]
 
 
 def _list_costs(run: Run) -> Sequence[ArmCost]:
@@ -168,15 +113,17 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
     scenes = [(placed, scene) for placed in main.placed if (scene := _map(run, work, placed)) is not None]
     for placed, scene in scenes:
         drawn[f"map_{placed.region}"] = figures.town_map(scene)
-    charts = {task: (*_chart(run, task), _measure(run, task)) for task in run.recipe.tasks}
+    rows = tabulate(run)
+    charts = {task: _chart(run, rows, task) for task in run.recipe.tasks}
     for task, chart in charts.items():
         drawn[f"rounds_{_file_name(task)}"] = figures.by_round(*chart)
     drawn |= _timelines(run, work)
     for section in run.list_sections():
         drawn |= load_named("chart", section.chart, {section.chart: section.chart}, DrawSection)(run)
-    drawn["megabytes"] = figures.megabytes(_sent(run), {link: use.budget_mb for link, use in main.links.items()})
+    budgets = {link: use.budget_mb for link, use in main.links.items()}
+    drawn["megabytes"] = figures.megabytes(select(rows, arm=MAIN), budgets)
     if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
-        drawn["gain"] = figures.gains({task: _list_gains(costs, task) for task in {each.task: None for each in costs}})
+        drawn["gain"] = figures.gains(costs)
     sweep = _sweep(work, run.steps, run) if (work / LOOK).is_dir() else None
     if sweep is not None:
         drawn["before_after"] = figures.before_after(sweep)
@@ -233,52 +180,13 @@ def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
     )
 
 
-def _chart(run: Run, task: str) -> tuple[list[Row], list[Row]]:
-    """Return the rows of a task for `charts.runs.draw_by_round` and `charts.runs.draw_tested`."""
+def _chart(run: Run, rows: Sequence[Row], task: str) -> tuple[list[Row], list[Row], str]:
+    """Return the arguments of `figures.by_round` for a task."""
     starts = " + ".join(run.recipe.with_role("pretrain"))
-    (pretrained,) = (each for each in run.pretrained if each.task == task)
-    rounds: list[Row] = [
-        {"stage": CHART_NAMES[PRETRAIN], "round": number, "town": starts, "score": each.score}
-        for number, each in enumerate(pretrained.validated, start=1)
-    ]
-    for watched in run.watched:
-        if watched.task == task:
-            stage = CHART_NAMES[EDGE if watched.stage == PRETRAIN else watched.stage]  # pretrained: before round 1
-            rounds += [
-                {"stage": stage, "round": each.round, "town": watched.region, "score": each.score}
-                for each in watched.rounds
-            ]
-    tested: list[Row] = [
-        {
-            "stage": CHART_NAMES[test.stage],
-            "town": test.region,
-            "score": test.estimate.mean,
-            "low": test.estimate.low,
-            "high": test.estimate.high,
-        }
-        for test in run.tested
-        if (test.arm, test.task) == (MAIN, task)
-    ]
-    return rounds, tested
-
-
-def _measure(run: Run, task: str) -> str:
-    return next(test.result.measure for test in run.tested if test.task == task)
-
-
-def _sent(run: Run) -> Sequence[Row]:
-    """Return the uplink traffic of the main arm by stage and link [MB]."""
-    stages = dict.fromkeys(spent.stage for spent in run.arms[MAIN].spent)
-    links: dict[str, LinkUse] = dict(run.arms[MAIN].links)
-    return [
-        {
-            "stage": CHART_NAMES[stage],
-            "link": link,
-            "mb": sum(spent.mb for spent in run.arms[MAIN].spent if (spent.stage, spent.link) == (stage, link)),
-        }
-        for stage in stages
-        for link in links
-    ]
+    validated = select(rows, task=task, quantity="pretrained.validated.score")
+    rounds = [replace(row, stage=PRETRAIN, region=starts) for row in validated]
+    tested = select(rows, arm=MAIN, task=task, quantity="tested.estimate")
+    return [*rounds, *select(rows, task=task, quantity="watched.rounds.score")], tested, tested[0].measure
 
 
 def _sweep(work: Path, names: Names, run: Run) -> clouds.ComparedSweep:

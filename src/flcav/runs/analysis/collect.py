@@ -32,7 +32,7 @@ from flcav.runs.training.private_rounds import PrivateTraining, compose_training
 
 
 def collect_results(graph: Graph, work: Path) -> Run:
-    """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` beside it."""
+    """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` next to it."""
     recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
     settings = {name: setting for name, setting in graph.settings.items() if not setting.repeat}
     tests = [

@@ -1,6 +1,6 @@
 """Costs of federated learning: of an arm, and in the towns of pretraining."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +23,7 @@ from flcav.runs.results.tests import HomeCost, Test
 from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.seeds import mean_over_seeds
+from flcav.storage.records import select
 
 
 def list_arm_costs(run: Run) -> tuple[ArmCost, ...]:
@@ -30,28 +31,22 @@ def list_arm_costs(run: Run) -> tuple[ArmCost, ...]:
     rows = []
     for name, arm in run.arms.items():
         for task in run.recipe.tasks:
-            stages = [each for each in arm.stages if each.task == task]
+            stages = select(arm.stages, task=task)
             regions = (run.recipe.arms[name].regions if name != MAIN else ()) or run.recipe.with_role("federate")
-            tests = _find_tests(run, name, task, stages[-1].stage if stages else "", regions)
-            before = _find_tests(run, MAIN, task, PRETRAIN, regions)
+            tests = select(run.tested, arm=name, stage=stages[-1].stage if stages else "", task=task, region=regions)
+            before = select(run.tested, arm=MAIN, stage=PRETRAIN, task=task, region=regions)
             if tests and len(before) == len(tests):
                 mean = float(np.mean([test.estimate.mean for test in before]))
                 rows.append(_row(name, arm, task, tests, mean))
     return tuple(rows)
 
 
-def _find_tests(run: Run, arm: str, task: str, stage: str, regions: Collection[str]) -> list[Test]:
-    asked = (arm, stage, task)
-    return [test for test in run.tested if (test.arm, test.stage, test.task) == asked and test.region in regions]
-
-
 def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: float) -> ArmCost:
     sent = {
-        link: sum(row.mb for row in arm.spent if (row.task, row.link) == (task, link) and row.stage != PRETRAIN)
-        for link in arm.links
+        link: sum(row.mb for row in select(arm.spent, task=task, link=link, stage=(EDGE, CLOUD))) for link in arm.links
     }
     rounds = {
-        stage: max((each.rounds for each in arm.stages if (each.task, each.stage) == (task, stage)), default=0)
+        stage: max((each.rounds for each in select(arm.stages, task=task, stage=stage)), default=0)
         for stage in (EDGE, CLOUD)
     }
     after = average_estimates([test.estimate for test in tests])
@@ -77,26 +72,23 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
 def tell_gain(run: Run) -> tuple[str, ...]:
     """Return sentences for each task: what the run gained, for how many megabytes, and at what cost at home."""
     told, home, arm = [], list_home_costs(run), run.arms[MAIN]
-    for cost in list_arm_costs(run):
-        if cost.arm != MAIN:
-            continue
+    for cost in select(list_arm_costs(run), arm=MAIN):
         links = [f"{arm.sent_mb(cost.task, link):.1f} MB of {link} uplink" for link in arm.links]
         told.append(
             f"Federated learning took {cost.measure} of {cost.task} from {cost.before:.3f} to {cost.after.mean:.3f} on "
             f"{' and '.join(cost.regions)}, for {' and '.join(links)}, pretraining included."
         )
-        for region in dict.fromkeys(each.region for each in home if each.task == cost.task):
+        for region in dict.fromkeys(each.region for each in select(home, task=cost.task)):
             changes = [
                 f"{each.measure} from {each.before:.3f} to {each.after:.3f}"
-                for each in home
-                if (each.region, each.task) == (region, cost.task)
+                for each in select(home, region=region, task=cost.task)
             ]
             told.append(f"On {region}, where it was pretrained, it took {' and '.join(changes)}.")
     return tuple(told)
 
 
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
-    """Return the costs of further measures than the tasks' own, of which `Difference` tells."""
+    """Return the costs at home by the tasks' further measures, such as AP70; `Difference` has the main measure."""
     return tuple(
         _cost(graph, work, (stage, region, task), name, measure)
         for stage, region, task in graph.tested(graph.settings[MAIN])
@@ -124,21 +116,19 @@ def _cost(graph: Graph, work: Path, tested: tuple[str, str, str], name: str, mea
 
 
 def list_home_costs(run: Run) -> list[HomeCost]:
-    """Return what federated learning costs in the towns of pretraining: of each task's own measure and of further ones.
+    """Return the cost of federated learning in the towns of pretraining, by each task's main and further measures.
 
     Results that were collected before further measures had intervals give those of the first training without one.
     """
-    tests = {(test.stage, test.region, test.task): test for test in run.tested if test.arm == MAIN}
+    tests = {test.key: test for test in run.tested}
     costs = []
-    for each in run.differences:
-        own = (each.arm, each.before_arm, each.before_stage) == (MAIN, MAIN, PRETRAIN)
-        if not own or each.region not in run.recipe.with_role("pretrain"):
-            continue
-        pair = [tests[stage, each.region, each.task] for stage in (PRETRAIN, each.stage)]
+    towns = run.recipe.with_role("pretrain")
+    for each in select(run.differences, arm=MAIN, before_arm=MAIN, before_stage=PRETRAIN, region=towns):
+        pair = [tests[MAIN, stage, each.region, each.task] for stage in (PRETRAIN, each.stage)]
         before, after = (test.estimate.mean for test in pair)
         trainings = len(each.trainings)
         costs.append(HomeCost(each.region, each.task, pair[0].result.measure, before, after, each.estimate, trainings))
-        kept = [cost for cost in run.home or () if (cost.region, cost.task) == (each.region, each.task)]
+        kept = select(run.home or (), region=each.region, task=each.task)
         for name in () if kept else further_measures(task_named(each.task)):
             before, after = (test.result.numbers.get(name) for test in pair)
             if before is not None and after is not None:

@@ -8,12 +8,12 @@ import numpy as np
 
 from flcav.perception.outcomes import Outcomes, Values, difference, share_test_scenes
 from flcav.perception.tasks import task_named
-from flcav.runs.analysis.findings import is_joint, name_stage, pair_of
+from flcav.runs.analysis.findings import is_joint, pair_of
 from flcav.runs.arms import Setting, name_repeat
 from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.saved import OUTCOMES
-from flcav.runs.results.tests import Difference, RegionalTest, Test, Tested
-from flcav.runs.spread import difference_key, test_key
+from flcav.runs.results.tests import Difference, RegionalTest, Test, Tested, name_stage
+from flcav.runs.spread import figure_key, test_key
 from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, Spread, average_estimates, measure_spread, widen, widen_share
 from flcav.statistics.seeds import MeanOverSeeds, average_shared, mean_over_seeds
@@ -41,7 +41,7 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
 def mean_over_trainings(
     task: str, first: Estimate, values: Sequence[float], tests: Sequence[Sequence[Path]], seed: int, *, share: bool
 ) -> MeanOverSeeds | None:
-    """Return `mean_of_tests` of a run's own trainings, which share all test scenes.
+    """Return `mean_of_tests` of the trainings of one run, which share all test scenes.
 
     `first`: that of the first training over its scenes. None for one training, and where scenes give no interval.
     """
@@ -143,7 +143,7 @@ def _join(graph: Graph, group: Sequence[Difference]) -> Difference:
     if len(trained) == len(group):
         mean = mean_over_seeds(values, shared=average_shared([each.shared for each in trained]))
         return replace(joint, estimate=mean.as_estimate(), over_trainings=mean)
-    return _widen(joint, graph.spreads.get(difference_key(joint)))
+    return _widen(joint, graph.spreads.get(figure_key(joint)))
 
 
 def _difference(
@@ -167,11 +167,11 @@ def _difference(
     found = Difference(name, *after, *before, region, task, over_scenes, over_scenes, measure_spread(values), retrained)
     if trained is not None:
         return replace(found, estimate=trained.as_estimate(), over_trainings=trained)
-    return _widen(found, graph.spreads.get(difference_key(found)))
+    return _widen(found, graph.spreads.get(figure_key(found)))
 
 
 def _widen(found: Difference, known: Spread | None) -> Difference:
-    """Return a difference with the interval of its own spread of retraining, else of a `known` one."""
+    """Return a difference whose interval includes its spread of retraining, or else a `known` spread."""
     spread = found.spread or known
     return found if spread is None else replace(found, estimate=widen(found.over_scenes, spread), spread=spread)
 

@@ -21,9 +21,9 @@ import numpy as np
 
 from flcav.runs.arms import Setting
 from flcav.runs.label_sources import LABEL_SOURCES
-from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.runs.recipe import ALL, CLOUD, EDGE, ELSEWHERE, MAIN, RunRecipe
 from flcav.runs.results.run import ArmResult
-from flcav.runs.results.tests import Difference, RunFinding, Test
+from flcav.runs.results.tests import Difference, RunFinding, Test, name_stage
 from flcav.statistics.seeds import MeanOverSeeds, of_one_training
 from flcav.statistics.verdicts import (
     ESTIMATE,
@@ -49,12 +49,12 @@ class ClaimQuestion:
 
     @property
     def named(self) -> str | None:
-        """Return "primary" or "secondary"; None for what is neither."""
+        """Return "primary" or "secondary"; None for other kinds."""
         return self.kind if self.kind in ("primary", "secondary") else None
 
 
 def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> ClaimQuestion:
-    """Return what a difference of the run itself is asked; `settings`: those of each arm."""
+    """Return the question that a difference of the run itself answers; `settings`: those of each arm, by name."""
     question = _question(each, recipe, settings)
     if each.before_arm != MAIN and _is_bound(settings[MAIN], settings[each.before_arm], each.task):
         return ClaimQuestion(question, "loss")
@@ -66,7 +66,7 @@ def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) ->
 def ask_all(
     differences: Sequence[Difference], recipe: RunRecipe, settings: Mapping[str, Setting]
 ) -> list[ClaimQuestion]:
-    """Return what each difference is asked; one of a region whose mean over regions is asked, too, is secondary."""
+    """Return the question of each difference; a region's is secondary if the mean over regions is primary."""
     joint = {pair_of(each) for each in differences if each.regions is not None}
     asked = [ask(each, recipe, settings) for each in differences]
     return [
@@ -78,7 +78,7 @@ def ask_all(
 
 
 def pair_of(each: Difference) -> tuple[str, ...]:
-    """Return what a difference is of, wherever it was tested."""
+    """Return both arms and stages and the task of a difference, without its region."""
     return each.arm, each.stage, each.before_arm, each.before_stage, each.task
 
 
@@ -139,20 +139,7 @@ def _question(each: Difference, recipe: RunRecipe, settings: Mapping[str, Settin
     return f"Does the run beat its arm '{each.before_arm}'?"
 
 
-WORDS = {
-    PRETRAIN: "pretrained",
-    EDGE: "edge FL",
-    MORE_EDGE: "further edge FL",
-    CLOUD: "edge + cloud FL",
-    CENTRAL: "central training",
-}
-
 TRAINED = ("plan", "labels", "distillation", "federation", "training", "central")  # settings besides the placement
-
-
-def name_stage(arm: str, stage: str) -> str:
-    """Return the name of an arm's stage in reports, such as "edge FL (densest)"."""
-    return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
 
 
 def findings(
@@ -245,7 +232,7 @@ def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) 
 
 
 def _tell_same_poles(each: Difference, arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> str | None:
-    """Return that two arms chose the same poles, in words, where that is why nothing differs; else None.
+    """Describe that two arms chose the same poles, if that is why nothing differs; else return None.
 
     Arms that differ in more than the placement may come to the same figures, too: that is a difference of 0.
     """

@@ -12,7 +12,6 @@ from itertools import product
 from pathlib import Path
 
 from flcav.config import InputError, parse_config
-from flcav.runs.analysis.findings import name_stage
 from flcav.runs.provenance import Provenance
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN, RunRecipe, Split
 from flcav.runs.results.run import Run
@@ -20,6 +19,7 @@ from flcav.runs.results.saved import Saved
 from flcav.runs.results.tests import Test
 from flcav.runs.results.training import average_regions
 from flcav.runs.tables import HistoryPoint
+from flcav.storage.records import select
 
 AMPLE_MB = 1e6
 UNUSED = Split(scenes=2, spins=1, cavs=1)  # test frames
@@ -80,7 +80,7 @@ def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds
 
 
 def save_origin(recipe: RunRecipe, task: str, runs: Sequence[Run], out: Path) -> None:
-    """Write the origin of the history that `runs` made, beside it in `out`."""
+    """Write the origin of the history that `runs` made to the folder `out`, where the history is."""
     plans = [run.arms["main"].plan.tasks[task] for run in runs]
     HistoryOrigin(
         task=task,
@@ -106,11 +106,12 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
     values = {test.key: test.estimate.mean for test in tests}
     oracle = next((name for name, arm in recipe.arms.items() if arm.central == "federate"), None)
     closed = {}
-    for (arm, stage, region, task), reached in values.items():
-        end = values.get((oracle or "", CENTRAL, region, task))
-        if end is not None and stage != PRETRAIN and arm != oracle:
-            start = values.get((arm, PRETRAIN, region, task), values[MAIN, PRETRAIN, region, task])
-            closed[f"{region}, {task}: {name_stage(arm, stage)}"] = gap_closed(start, reached, end)
+    for test in tests:
+        place = (test.region, test.task)
+        end = values.get((oracle or "", CENTRAL, *place))
+        if end is not None and test.stage != PRETRAIN and test.arm != oracle:
+            start = values.get((test.arm, PRETRAIN, *place), values[MAIN, PRETRAIN, *place])
+            closed[test.name] = gap_closed(start, test.estimate.mean, end)
     return closed
 
 
@@ -122,9 +123,9 @@ def make_history_points(result: Run, run: str) -> list[HistoryPoint]:
     points: list[HistoryPoint] = []
     for task, own in result.arms[MAIN].plan.tasks.items():
         for stage in (PRETRAIN, EDGE, CLOUD):
-            each = [watched for watched in result.watched if (watched.task, watched.stage) == (task, stage)]
-            frames = sum(watched.frames for watched in each)
-            for at in average_regions(each):
+            regions = select(result.watched, task=task, stage=stage)
+            frames = sum(watched.frames for watched in regions)
+            for at in average_regions(regions):
                 counts = (own.edge_rounds, at.round) if stage == CLOUD else (at.round, 0)
                 points.append(HistoryPoint(task, own.samples, *counts, at.score, frames, run, result.recipe.seed))
     return points

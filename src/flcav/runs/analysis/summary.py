@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from flcav.runs.analysis.differences import mean_of_tests
-from flcav.runs.analysis.findings import ask_all, judge_asked, name_stage
+from flcav.runs.analysis.findings import ask_all, judge_asked
 from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import MAIN
 from flcav.runs.results.run import ClaimCount, Mean, Run, Summary
@@ -25,13 +25,7 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
     recorded scenes, the intervals include what these scenes vary by; those of closed gaps do not.
     """
     tests = [{test.key: test for test in run.tested} for run in runs]
-    measures = [
-        Mean(
-            f"{first.region}, {first.task}: {name_stage(first.arm, first.stage)}",
-            _mean_measure([own[key] for own in tests], works),
-        )
-        for key, first in tests[0].items()
-    ]
+    measures = [Mean(first.name, _mean_measure([own[key] for own in tests], works)) for key, first in tests[0].items()]
     differences = [
         Mean(rows[0].name, _mean_difference(rows, tests, works))
         for rows in zip(*(run.differences for run in runs), strict=True)

@@ -198,7 +198,7 @@ def _share_workers(ready: Sequence[tuple[_Run, Step]], free: int, *, lent: bool)
 
 
 def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
-    """Sort the steps by how many others depend on them, directly or not, most first: those hold up the run."""
+    """Sort the steps by the number of others that depend on them, directly or not, largest first."""
     rests: dict[str, set[str]] = {step.name: set() for step in steps}
     for step in reversed(steps):
         for name in step.needs:
@@ -210,7 +210,7 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
 def _settle_records(
     steps: Sequence[Step], folder: Path, stale: str, sources: Sources
 ) -> tuple[dict[str, StepRecord], set[str]]:
-    """Return the record by which each step is, or is to be, done, and the stale steps.
+    """Return the record of each finished or pending step, and the stale steps.
 
     "redo" removes these, and those of other arguments.
     """

@@ -188,7 +188,7 @@ def changed_modules(held: StepRecord, wanted: StepRecord) -> list[str]:
 
 
 def make_stale_error(folder: Path, outdated: Mapping[str, tuple[StepRecord, StepRecord]]) -> InputError:
-    """Return the error for a folder whose steps are of other code; `outdated`: records (held, wanted) by step."""
+    """Return the error for a folder whose steps were run by other code; `outdated`: records (held, wanted) by step."""
     moved = [name for name, (held, wanted) in outdated.items() if held.fingerprint != wanted.fingerprint]
     modules = {name: changed_modules(*records) for name, records in outdated.items()}
     unknown = [name for name, (held, _) in outdated.items() if not held.code]
@@ -232,13 +232,13 @@ def make_edited_error(
 
 
 def asks_the_same(held: StepRecord, wanted: Mapping[str, Json]) -> bool:
-    """Return whether a step was given the same arguments; one that is not there is like one that is None."""
+    """Return whether two steps have the same arguments; a missing argument equals None."""
     told = [{name: each for name, each in (own or {}).items() if each is not None} for own in (held.asked, wanted)]
     return held.asked is not None and told[0] == told[1]
 
 
 def describe_changes(held: StepRecord, wanted: StepRecord) -> list[str]:
-    """Return the arguments of a step that are not as they were, in words; none where they were not recorded."""
+    """Return the changed arguments of a step, in words; empty if the earlier ones were not recorded."""
     if held.asked is None or wanted.asked is None:
         return []
     names = [*dict.fromkeys((*wanted.asked, *held.asked))]
@@ -283,7 +283,7 @@ def remove(folder: Path) -> None:
 
 
 def reserve_sibling(folder: Path, what: str) -> Path:
-    """Return a hidden path beside a step's folder, free for use: what an interrupted run left there is removed."""
+    """Return an unused hidden path next to a step's folder, after removing leftovers of an interrupted run."""
     path = folder.with_name(f".{folder.name}.{what}")
     shutil.rmtree(path, ignore_errors=True)
     return path

@@ -36,7 +36,7 @@ def measure_labels(
 ) -> LabelQuality:
     """Return precision, recall and box errors of the labels of vehicles' `frames`, whose samples are in their order.
 
-    They are compared with ground truth, which nobody learns from here.
+    Ground truth serves this measurement alone; no network is trained on it here.
     """
     each = {name: iter(own) for name, own in samples.items()}
     found, targets, neutral, returns = [], [], [], []
@@ -70,7 +70,7 @@ def measure_labels(
 
 
 def _count_by_returns(returns: NDArray[np.int64], met: NDArray[np.bool_]) -> tuple[FoundTargets, ...]:
-    """Return the targets, and those that are `met`, by their number of LiDAR `returns`, (T,) each."""
+    """Return the numbers of targets and of found (`met`) targets by LiDAR returns; both arrays are (T,)."""
     kind = np.searchsorted(RETURNS, returns, side="right") - 1
     kinds = range(len(RETURNS))
     return tuple(FoundTargets(RETURNS[k], int((kind == k).sum()), int(met[kind == k].sum())) for k in kinds)

@@ -39,7 +39,7 @@ def navigate(data: Dataset, i: int, how: PoseSource) -> tuple[Array, Navigation]
 
 
 def draw_clock_offset(data: Dataset, i: int, how: PoseSource) -> float:
-    """Return by how much the clock of the vehicle of frame `i` is ahead [s], in its scene; 0 with a GNSS receiver."""
+    """Return the clock offset [s] of the vehicle of frame `i`, positive if ahead; 0 with a GNSS receiver."""
     if how == ESTIMATED:
         return 0.0
     key = data.keys[i]
@@ -50,7 +50,7 @@ def draw_clock_offset(data: Dataset, i: int, how: PoseSource) -> float:
 def make_sighting(
     network: Second, data: Dataset, i: int, how: Distillation, poses: PoseSource
 ) -> tuple[Sighting, Boxes]:
-    """Return what the vehicle of frame `i` tells, and its detections in the LiDAR's frame."""
+    """Return the message of the vehicle of frame `i`, and its detections in the LiDAR frame."""
     key, frame = data.keys[i], data.frame(i)
     (found,) = detect_in(network, [frame], score_threshold=TOLD)
     boxes = found.transform(frame.assumed.agent_from_sensor[choose_lidar(frame)])
@@ -59,7 +59,7 @@ def make_sighting(
 
 
 def find_told_posts(frame: Frame, how: Distillation) -> Array:
-    """Return the feet (L, 2) x, y [m] of the posts that a vehicle tells of, its frame; none without a pose graph."""
+    """Return the feet (L, 2) x, y [m, vehicle frame] of the posts that a vehicle reports; none without a pose graph."""
     if not how.pose_graph:
         return np.zeros((0, 2))
     lidar = choose_lidar(frame)

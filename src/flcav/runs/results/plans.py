@@ -12,7 +12,7 @@ from flcav.storage.records import LEFT_OUT
 
 @dataclass(frozen=True)
 class TaskPlan:
-    """The plan of one task: its samples and rounds, and their price on both uplinks."""
+    """The plan of one task: samples, rounds, and their cost on both uplinks [MB]."""
 
     samples: int
     edge_rounds: int

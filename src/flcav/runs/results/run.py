@@ -16,7 +16,7 @@ from flcav.runs.results.training import Pretrained, PrivacySpent, StageResult, W
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import Judged
-from flcav.storage.records import LEFT_OUT, Record
+from flcav.storage.records import LEFT_OUT, Record, select
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class ArmResult:
 
     def sent_mb(self, task: str, link: str) -> float:
         """Return the uplink traffic of a task on a link, over all stages [MB]."""
-        return sum(row.mb for row in self.spent if (row.task, row.link) == (task, link))
+        return sum(row.mb for row in select(self.spent, task=task, link=link))
 
 
 @dataclass(frozen=True)
@@ -83,10 +83,15 @@ class ArmCost(Record):
     gain: float  # how much it rose
     gain_per_mb: float | None  # for a megabyte of uplink on both links; None: nothing was sent
 
+    @property
+    def uplink_mb(self) -> float:
+        """Uplink of stages II and III on both links [MB]."""
+        return self.wireless_mb + self.wireline_mb
+
 
 @dataclass(frozen=True)
 class _RunFigures(Saved):
-    """The figures of a run."""
+    """Fields of a run's results, without those of extras."""
 
     recipe: RunRecipe
     arms: Mapping[str, ArmResult]
@@ -126,10 +131,7 @@ class Run(Displayed, RunRows, _RunFigures):
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
         """Return the result of a test; raises `KeyError` for one that was not made."""
-        for each in self.tested:
-            if (each.arm, each.stage, each.region, each.task) == (arm, stage, region, task):
-                return each.result
-        raise KeyError((arm, stage, region, task))
+        return {each.key: each.result for each in self.tested}[arm, stage, region, task]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Results as JSON in the folders of their steps, and the names of the files beside them."""
+"""Results as JSON in the folders of their steps, and the names of the other files there."""
 
 from pathlib import Path
 from typing import ClassVar, Self
@@ -22,6 +22,6 @@ class Saved(Record):
 
     @classmethod
     def load(cls, folder: Path | str, name: str | None = None) -> Self:
-        """Return what `save` wrote; raises `InputError` where it is not there, or of another version."""
+        """Load what `save` wrote; raises `InputError` if the file is missing or of another version."""
         path = Path(folder) / (name or cls.file)
         return cls.from_json(read_json(path), str(path))

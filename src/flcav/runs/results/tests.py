@@ -4,10 +4,24 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated
 
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.saved import Saved
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.records import LEFT_OUT
+
+WORDS = {  # for stages in reports
+    PRETRAIN: "pretrained",
+    EDGE: "edge FL",
+    MORE_EDGE: "further edge FL",
+    CLOUD: "edge + cloud FL",
+    CENTRAL: "central training",
+}
+
+
+def name_stage(arm: str, stage: str) -> str:
+    """Return the name of an arm's stage in reports, such as "edge FL (densest)"."""
+    return WORDS[stage] if arm == MAIN else f"{WORDS[stage]} ({arm})"
 
 
 @dataclass(frozen=True)
@@ -25,7 +39,7 @@ class Tested(Saved):
 
 @dataclass(frozen=True)
 class Test:
-    """A test with the arm, stage, region and task that it is of."""
+    """Test of an arm's network after a stage, in a region, with its interval over scenes and trainings."""
 
     arm: str
     stage: str
@@ -45,6 +59,26 @@ class Test:
         return self.arm, self.stage, self.region, self.task
 
     @property
+    def network(self) -> str:
+        """Return the name of the network in reports, by its arm and stage."""
+        return name_stage(self.arm, self.stage)
+
+    @property
+    def name(self) -> str:
+        """Return the name of the test in reports."""
+        return f"{self.region}, {self.task}: {self.network}"
+
+    @property
+    def measure(self) -> str:
+        """Return the name of what was measured."""
+        return self.result.measure
+
+    @property
+    def over_scenes(self) -> Estimate:
+        """Return the estimate of the first training; its interval is over scenes alone."""
+        return self.result.estimate
+
+    @property
     def steps(self) -> tuple[str, ...]:
         """Return the folders of the tests of all trainings whose outcomes are known, the first training's first."""
         return (self.step, *(self.retrained_steps or ()))
@@ -52,7 +86,7 @@ class Test:
     @property
     def trainings(self) -> tuple[float, ...]:
         """Return the measure of each training, the first training's first."""
-        return (self.result.estimate.mean, *self.retrained)
+        return (self.over_scenes.mean, *self.retrained)
 
 
 @dataclass(frozen=True)
@@ -85,8 +119,13 @@ class Difference:
     regions: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose mean it is; None: `region` alone
 
     @property
+    def minus(self) -> str:
+        """Return what is subtracted, as arm/stage."""
+        return f"{self.before_arm}/{self.before_stage}"
+
+    @property
     def places(self) -> tuple[str, ...]:
-        """Return the regions that it is of."""
+        """Return the regions of the difference: several for a mean over regions."""
         return self.regions or (self.region,)
 
     @property
@@ -97,7 +136,7 @@ class Difference:
 
 @dataclass(frozen=True)
 class HomeCost:
-    """The cost of federated learning in a town of pretraining: a measure there before it and after it, same frames."""
+    """Change of a measure in a town of pretraining by federated learning, on the same frames before and after."""
 
     region: str
     task: str

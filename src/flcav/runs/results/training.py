@@ -63,13 +63,13 @@ class FederatedRound(Record):
     clients: tuple[str, ...]  # whose updates were combined
     failed: Mapping[str, str]  # by client what was wrong
     samples: int  # of the clients together
-    loss: float | None  # mean training loss, weighted by samples; None: of nobody that is known
+    loss: float | None  # mean training loss, weighted by samples; None: no client reported one
     up_bytes: int  # of all clients' messages, on their link
     down_bytes: int
     epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
     seconds: float | None = None  # of the simulated network; None: without one
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several
-    empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples: the model is that of before
+    empty: Annotated[bool, WHERE_TRUE] = False  # no update, since clients had no samples: the model stays
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class StatisticsScore(Record):
 
 @dataclass(frozen=True)
 class FoundTargets(Record):
-    """How many targets of some numbers of LiDAR returns have a right label."""
+    """Number of targets with a right label, for a range of LiDAR returns."""
 
     returns: int  # from this number up to, not including, that of the next kind
     targets: int
@@ -93,7 +93,7 @@ class FoundTargets(Record):
 
 @dataclass(frozen=True)
 class LabelQuality(Record):
-    """Precision, recall and boxes of the labels that vehicles train on, against ground truth that they do not know.
+    """Precision, recall and box errors of the labels that vehicles train on, against ground truth unknown to them.
 
     A label is right that matches a target at IoU 0.5 in 3D; labels on neutral objects do not count.
     """
@@ -171,7 +171,7 @@ def average_regions(watched: Sequence[Watched]) -> tuple[ScoredRound, ...]:
 
 
 def average_last(watched: Sequence[Watched]) -> float:
-    """Return the mean over regions of the score after each one's last round, weighted by frames."""
+    """Return the mean over regions of the score after the last round, weighted by frames."""
     return float(np.average([each.rounds[-1].score for each in watched], weights=[each.frames for each in watched]))
 
 
@@ -188,6 +188,6 @@ class PrivacySpent(Record):
     noise: Annotated[tuple[float, ...] | None, LEFT_OUT] = None  # found for the planned rounds; None: it was given
 
     def describe(self) -> str:
-        """Return it in words; of seeded noise with whom it does not hold against."""
+        """Describe the guarantee in words; for seeded noise, also against whom it does not hold."""
         found = "" if self.noise is None else f", noise {' and '.join(f'{each:g}' for each in self.noise)} x clip"
         return f"epsilon {self.epsilon:.2f} at delta {self.delta:g}{found}" + (f" ({SEEDED})" if self.seeded else "")

@@ -49,7 +49,7 @@ class LabelSettings(Config):
 
 
 class PlannedTask(Config):
-    """A task as the step that plans it is given it."""
+    """A task as the planning step receives it."""
 
     network: str | None  # name of the configuration; None: the task's first
     weight: float  # of its error in the objective
@@ -156,7 +156,7 @@ def frame_plan(settings: FirstPlanSettings) -> PlanSettings:
 def _request(
     work: Work, settings: FirstPlanSettings, name: str, scenes: Mapping[str, Sequence[RadioLinks]]
 ) -> PlanRequest:
-    """Return a task as the planner sees it; `scenes`: links of the vehicles' drives, by region."""
+    """Return the planner's request for a task; `scenes`: radio links of the vehicles' drives, by region."""
     own, task = settings.tasks[name], task_named(name)
     config, shared = find_configuration(task, own.network), as_shared(task)
     pools = [Frames.open(work.inputs[step]) for step in own.pools]
@@ -316,7 +316,7 @@ def _plan_task(outline: Outline, task: str) -> PlannedTask:
 
 
 def _label_task(outline: Outline, task: str) -> LabelSettings | None:
-    """Return what the messages of labels are predicted from; None where no arm labels by the road average."""
+    """Return the inputs for predicting label messages; None if no arm labels by the road average."""
     arms = [arm for arm in outline.settings.values() if arm.central is None]
     averaging = outline.averaging(task)
     if not averaging:
@@ -336,7 +336,7 @@ def _label_task(outline: Outline, task: str) -> LabelSettings | None:
 
 
 def _predict_air(outline: Outline) -> AirSettings | None:
-    """Return what a plan within a horizon predicts times on the network from; None without a network."""
+    """Return the inputs for predicting transmission times of a plan with a horizon; None without a network."""
     recipe, network = outline.recipe, outline.recipe.federation.network
     if network is None or recipe.horizon_s is None:
         return None

@@ -101,7 +101,7 @@ class Conduct:
 
     @property
     def vacant(self) -> bool:
-        """Return whether nobody takes part."""
+        """Return whether the conduct has no participants."""
         return False
 
     @property
@@ -191,7 +191,7 @@ class StageFederation:
                 where.renew(clients)
 
     def open_replay(self, cloud: CloudServer) -> dict[str, Trainable]:
-        """Return the cloud's own training by its name, if there is any.
+        """Return the cloud's training on samples of stage I by its client name, if there is any.
 
         It counts for so many samples, one at least, that its share is right where all vehicles take part in a round.
         """
@@ -244,7 +244,7 @@ class StageFederation:
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where the vehicles of a federation train, to the same weights."""
+    """Where the vehicles of a federation train: in this process, in others, or on a deployed fleet."""
 
     runtime: str = "embedded"  # one of `RUNTIMES`
     processes: int = 1  # in so many, or actors
@@ -255,7 +255,7 @@ class Whereabouts:
 
     @contextlib.contextmanager
     def reach(self, clients: list[str]) -> Iterator["Whereabouts"]:
-        """Yield the same with the deployed vehicles, where there is a fleet for these clients."""
+        """Yield this with the deployed vehicles connected, if there is a fleet for these clients."""
         if self.runtime != "flower":
             yield self
             return
@@ -266,7 +266,7 @@ class Whereabouts:
 def federate_stage(
     own: StageFederation, driven: DrivenStage, where: Whereabouts = Whereabouts()
 ) -> tuple[float | None, ...]:
-    """Run the rounds of a stage; write weights and ledger, return each round's loss.
+    """Run the rounds of a stage, write weights and ledger, and return the mean training loss of each round.
 
     Rounds are as the radio network has `driven` them: vehicles that it loses are lost in theirs, and the cloud's rounds
     need all edge servers. A privacy budget may end them before the schedule's end, and of asynchronous rounds each
@@ -381,7 +381,7 @@ def _keep_round(
 
 
 def _save_regional_models(learning: Learning, folder: Path, states: Mapping[str, FederationState]) -> None:
-    """Write each region's own model: the common weights with what its edge server keeps."""
+    """Write each region's personal model: the common weights with the arrays that its edge server keeps."""
     for region, own in states.items():
         model = load_stage_network(learning.task, folder)
         from_arrays(model, {**to_arrays(model), **own.personal})

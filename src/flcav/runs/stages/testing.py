@@ -62,7 +62,7 @@ class RoundsSettings(StepSettings):
 
 
 class LookSettings(StepSettings):
-    """Settings of the look at one test sweep."""
+    """Settings of the comparison of detections in one test sweep."""
 
     before: str  # step that trained the first network
     after: str  # and the second
@@ -146,7 +146,7 @@ def detect_before_after(before: Path, after: Path, split: Frames) -> SweepCompar
 
 
 def _right(seen: SweepDetections) -> int:
-    """Return how many targets are found, less the false boxes."""
+    """Return the number of found targets minus the number of false boxes."""
     return sum(seen.found) - (len(seen.hit) - sum(seen.hit))
 
 

@@ -147,7 +147,7 @@ class FederationCheckpoints:
         return [PrivacySpent(max(private), self.privacy.delta, self.privacy.seeded).describe()]
 
     def _tell_failures(self) -> list[str]:
-        """Return which rounds since the last note are empty, and who failed or was lost, in words.
+        """Describe the empty rounds and the failed or lost clients since the last note.
 
         Those of stage III are all rounds of edge servers.
         """
@@ -183,7 +183,7 @@ def _ledger_name(round_: int) -> str:
 
 
 def round_path(folder: Path, round_: int) -> Path:
-    """Return the file of a federation's weights after a round."""
+    """Return the path of a federation's weights after a round."""
     return folder / f"round{round_}.safetensors"
 
 
@@ -226,14 +226,14 @@ class Checkpoint(Record):
     scores: tuple[Mapping[str, float], ...] = ()  # on validation frames after each round, by region
 
     def find_damage(self, folder: Path) -> str | None:
-        """Return the name of a file that is missing or not what was written; None where all are whole."""
+        """Return the name of a missing or damaged file; None if all are intact."""
         for name, known in self.sha256.items():
             if not (folder / name).exists() or sha256(folder / name) != known:
                 return name
         return None
 
     def keep(self, folder: Path) -> None:
-        """Write the checkpoint; the last one becomes the one before."""
+        """Write the checkpoint, and keep the last one as the previous one."""
         if (folder / LAST).exists():
             write_bytes(folder / BEFORE, (folder / LAST).read_bytes())
         values = self.as_json()

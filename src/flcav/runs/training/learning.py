@@ -62,12 +62,12 @@ class Learning:
 
 
 def regional_weights(region: str) -> str:
-    """Return the name of the file of a region's own model, of a stage III with personal arrays."""
+    """Return the file name of a region's personal model after a stage III with personal arrays."""
     return f"weights-{region}.safetensors"
 
 
 def load_stage_network(task: Task, folder: Path, region: str | None = None) -> Any:
-    """Return the trained network of the stage in `folder`; with a `region` its own model."""
+    """Load the trained network of the stage in `folder`; with `region`, that region's personal model."""
     return load_network(task, folder / (WEIGHTS if region is None else regional_weights(region)))
 
 
@@ -100,17 +100,17 @@ def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
 
 
 def keep_statistics(weights: Weights, folder: Path, region: str) -> None:
-    """Write the statistics among a region's weights to the folder of stage III, in place of those of before."""
+    """Write a region's batch-normalisation statistics to the folder of stage III, replacing earlier ones."""
     write_bytes(_path(folder, region), save({name: weights[name] for name in statistics_names(weights)}))
 
 
 def score_statistics(
     task: Task, network: Any, folder: Path, validation: Mapping[str, Frames]
 ) -> tuple[StatisticsScore, ...]:
-    """Return the scores of `network` on each region's validation frames, by whose statistics it has.
+    """Return the scores of `network` on each region's validation frames, with averaged and with regional statistics.
 
-    These are its own, and those of the region that `keep_statistics` wrote to `folder`. Without a cloud round there are
-    none, and the result is empty.
+    The averaged ones are in `network`, the regional ones were written to `folder` by `keep_statistics`. Without a cloud
+    round there are none, and the result is empty.
     """
     arrays, scores = to_arrays(network), []
     for region, split in validation.items():

@@ -40,7 +40,7 @@ def send_to_vehicles(book: Ledger, message: bytes, task: Task, region: str, clie
 
 
 def report_errors(book: Ledger, task: Task, found: Registry, region: str, drive: Frames) -> Registry:
-    """Return the registry as the edge server has it, of what each vehicle reports: a message for each of its frames.
+    """Return the error registry of the edge server, from one message per frame of each vehicle.
 
     Such a message is the vehicle's request to learn. A task that does not tell frames apart sends its registry at once.
     """
@@ -64,7 +64,7 @@ class SharedFrames:
     samples: SharedSamples
 
     def send(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
-        """Send the frames to a region's vehicles, and the network that they begin with to those who lack it."""
+        """Send the frames to a region's vehicles, and the initial network to those without it."""
         have = {entry.client for entry in book.entries if (entry.stage, entry.direction) == (EDGE, "down")}
         if lacking := [client for client in clients if client not in have]:
             send_to_vehicles(book, pack_arrays(to_arrays(network)), self.samples.task, region, lacking)
@@ -73,7 +73,7 @@ class SharedFrames:
 
 
 def send_region_network(book: Ledger, task: Task, weights: Weights, clients: Iterable[str], stage: str) -> None:
-    """Send a region's network after stage II to its vehicles, who go on from it in a later `stage`."""
+    """Send a region's network after stage II to its vehicles, which continue from it in a later `stage`."""
     for client in clients:
         send_message(
             book, pack_arrays(weights), stage=stage, task=task.name, link="wireless", direction="down", client=client

@@ -56,14 +56,14 @@ def plan_private_rounds(
 
 
 def find_budget_noise(asked: Rules, private: Rules) -> float | None:
-    """Return the noise that `private` rules have and the `asked` ones lack; None where these have it, or want none."""
+    """Return the noise multiplier found for the privacy budget; None if the rules give it, or have no privacy."""
     if asked.privacy is None or asked.privacy.noise is not None or private.privacy is None:
         return None
     return private.privacy.noise
 
 
 def take_noise(rules: RulesT, noise: float | None) -> RulesT:
-    """Return rules with the noise that was found for them (None: they have it)."""
+    """Return rules with this noise multiplier; unchanged for None."""
     if rules.privacy is None or noise is None:
         return rules
     return rules.model_copy(update={"privacy": rules.privacy.model_copy(update={"noise": noise})})

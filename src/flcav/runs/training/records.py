@@ -37,7 +37,7 @@ SCHEMA = pa.schema(
 def read_rounds(
     folder: Path, region: str | None, before: int, seconds: Mapping[str, Sequence[float]] = {}
 ) -> tuple[FederatedRound, ...]:
-    """Return the rounds of the federation that was carried out in `folder`, with the bytes of their messages.
+    """Return the rounds of the federation in `folder`, with the bytes of their messages.
 
     region: of stage II; of stage III None, and the cloud's rounds come before those of the edge servers. before: number
     of entries that its ledger begins with, of messages before the first round. seconds: of each round, by server, where
@@ -105,7 +105,7 @@ def write_rounds(run: Run, out: Path) -> None:
 
 
 def scalars(record: FederatedRound) -> dict[str, float]:
-    """Return what is drawn of a round, by name."""
+    """Return the numbers of a round that TensorBoard shows, by name."""
     found = {
         "loss": record.loss,
         "clients": float(len(record.clients)),

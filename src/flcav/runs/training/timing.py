@@ -30,14 +30,14 @@ class TrainTimes(Saved):
 
 @dataclass(frozen=True)
 class TimedClient:
-    """A client that appends the CPU time of each of its trainings [s] to a file."""
+    """A client that appends the CPU time of each local training [s] to a file."""
 
     name: str
     client: Trainable
     path: Path
 
     def train(self, weights: Weights, **how: Any) -> Update:
-        """Return the client's update."""
+        """Train the client, record the CPU time, and return its update."""
         begun = time.process_time()
         update = self.client.train(weights, **how)
         spent = time.process_time() - begun
@@ -46,7 +46,7 @@ class TimedClient:
         return update
 
     def count_samples(self, steps: int) -> int:
-        """Return the client's number of samples; raises TypeError of a client that does not count them."""
+        """Return the client's number of samples; raises TypeError if the client cannot count them."""
         return count_samples(self.client, steps)
 
 

@@ -102,7 +102,7 @@ def drive_buffers(
 def count_buffers(
     strategy: Strategy, rounds: int, starts: Mapping[str, RegionStart], cloud: bool
 ) -> tuple[int, Mapping[str, RegionStart]]:
-    """Return rounds and regions with as many buffers as have the updates of so many rounds.
+    """Return rounds and regions, with as many buffers as hold the updates of so many rounds.
 
     In a cloud round each region fills one at least. Raises `InputError` where a region has fewer vehicles than a buffer
     has updates.
@@ -122,7 +122,7 @@ def count_buffers(
 def drive_stage(
     work: Work, settings: StageSettings, federation: StageFederation, ways_s: float | None
 ) -> DrivenStage | None:
-    """Return the buffered rounds of a stage, and write their clock; None of another strategy, or without a network.
+    """Return the buffered rounds of a stage, and write their clock; None for another strategy or without a network.
 
     ways_s: that the ways of a model down and up by wireline take [s]; None: there is no cloud.
     """
@@ -156,7 +156,7 @@ def open_buffered_fleet(
 
 
 def check_buffers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where an arm's rounds are buffers, and no clock is theirs, or something goes by rounds."""
+    """Raise `InputError` if an arm has buffers without a network, or with a setting that needs synchronous rounds."""
     if not isinstance(strategy, FedBuff):
         return
     if setting.federation.network is None:

@@ -10,7 +10,7 @@ from flcav.runs.recipe import Arm, RunRecipe
 
 
 def resolve_distillation(recipe: RunRecipe, arm: Arm) -> Distillation:
-    """Return how an arm averages labels: as the recipe has it, with the fields that differ."""
+    """Return the settings of label averaging of an arm: the recipe's, overridden by the arm's fields."""
     return Distillation.model_validate(_join(recipe, arm))
 
 

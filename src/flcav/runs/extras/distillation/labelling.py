@@ -47,7 +47,7 @@ from flcav.runs.stages.settings import FederationSettings
 from flcav.runs.training.learning import Learning
 from flcav.world.map.lanes import map_layers
 
-SURVEYED = np.eye(4)  # road sensors tell of boxes in the world frame
+SURVEYED = np.eye(4)  # pose of a road sensor: it sends its boxes in the world frame
 
 
 class RoadAverageLabels(RenewedSamples):
@@ -114,7 +114,7 @@ class RoadAverageLabels(RenewedSamples):
         return self._split.data.keys[frame].scene, self._split.data.keys[frame].index
 
     def _find_around(self, spin: Spin) -> tuple[Spin, ...]:
-        """Return the spins in the window of a spin, itself first."""
+        """Return the spins in the window around a spin, the spin itself first."""
         ends = self._time_s[spin] - self._how.window_s - SLACK_S, self._time_s[spin] + self._how.window_s + SLACK_S
         near = (each for each, time_s in self._time_s.items() if each[0] == spin[0] and ends[0] <= time_s <= ends[1])
         return spin, *(each for each in near if each != spin)
@@ -123,7 +123,7 @@ class RoadAverageLabels(RenewedSamples):
         return [*self._views.get(spin, {}).values()]
 
     def send_views(self) -> None:
-        """Send what the road sensors see to the vehicles, for the free ground; before the first round."""
+        """Send the road sensors' free space to the vehicles, before the first round."""
         for i in self._frames:
             sent = [self._send("down", i, 0, view.message()) for view in self._seen_by[i]]
             self._seen_by[i] = [RoadView.from_message(message) for message in sent]
@@ -154,7 +154,7 @@ class RoadAverageLabels(RenewedSamples):
             LabelHistory((*kept, quality)).save(self._folder, LABELS)
 
     def _average(self, told: Mapping[int, Sighting]) -> Iterator[tuple[int, Guidance]]:
-        """Yield the number of each frame to be labelled, and what its vehicle is told of it."""
+        """Yield the number of each frame to be labelled, and the averaged boxes that its vehicle receives."""
         spins: dict[Spin, dict[int, Sighting]] = {}
         for i, sighting in told.items():
             spins.setdefault(self._spin(i), {})[i] = sighting

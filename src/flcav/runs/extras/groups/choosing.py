@@ -51,7 +51,7 @@ def weigh_offers(offers: Mapping[str, Offer]) -> dict[str, float]:
 
 
 def find_in_range(positions: Mapping[str, Array], of: Sequence[str], range_m: float) -> list[str]:
-    """Return the clients within `range_m` of one of the clients `of`, who are among them; positions (3,) [m]."""
+    """Return the clients within `range_m` [m] of any client in `of`, these included; positions (3,) [m, world]."""
     centres = [positions[name] for name in of if name in positions]
     near = lambda own: any(np.linalg.norm(own - each) <= range_m for each in centres)  # noqa: E731
     return [name for name, own in positions.items() if name in of or near(own)]
@@ -120,7 +120,7 @@ class GroupWatch:
         return {name: members.get(name, own) for name, own in clients.items()}
 
     def hear(self, ask: Ask, weights: Weights, *, counted: bool = True) -> dict[str, bytes]:
-        """Return the messages with the members' losses of a network."""
+        """Return the messages in which the members report a network's loss on their held-back samples."""
         replies = ask(SCORE, [*self.members], weights, counted=counted)
         return {name: answer[MESSAGE].tobytes() for name, answer in replies.answers.items() if MESSAGE in answer}
 
@@ -144,7 +144,7 @@ class GroupWatch:
 
 
 def read_losses(messages: Mapping[str, bytes]) -> dict[str, float]:
-    """Return the losses in messages, by client; those that cannot be read are left out."""
+    """Return the losses in messages, by client, without unreadable ones."""
     found: dict[str, float] = {}
     for name, message in messages.items():
         with contextlib.suppress(Unreadable):

@@ -81,7 +81,7 @@ Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `fi
 
 @dataclass(frozen=True)
 class Called(Conduct):
-    """A group that was called, or not, in a region: the conduct of its rounds."""
+    """Conduct of the rounds of a region's group, which may be empty where no vehicle sent a request."""
 
     group: Group
     samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
@@ -97,7 +97,7 @@ class Called(Conduct):
 
     @property
     def vacant(self) -> bool:
-        """Return whether nobody trains."""
+        """Return whether the group has no members and no roadside units."""
         return not self.samples
 
     @property
@@ -106,11 +106,11 @@ class Called(Conduct):
         return self.watch.over
 
     def choose(self, samples: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
-        """Return what the members and units train on."""
+        """Return the training samples of the members and roadside units."""
         return self.samples
 
     def enlist(self, clients: Mapping[str, Trainable]) -> Mapping[str, Trainable]:
-        """Return the clients, of which members answer questions, too."""
+        """Return the clients of the rounds; those of members also answer questions."""
         return self.watch.enlist(clients)
 
     def resume(
@@ -142,7 +142,7 @@ class Called(Conduct):
             run(start, account, done, on_round)
 
     def report(self, work: Work, settings: EdgeSettings, rounds: int, deployed: "Deployed") -> dict[str, Any]:
-        """Return the row of the group after its rounds, of which so many were planned."""
+        """Return the group's row of the results after its rounds; `planned`: their number in the plan."""
         shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
         with open_questions(self.watch.members, deployed, Account(self.book, EDGE, self.task.name, "wireless")) as ask:
             return {"group": self.dissolve(work.folder, work.inputs[settings.inputs.pretrain], shown, rounds, ask)}
@@ -259,7 +259,7 @@ def make_members(
 
 @dataclass(frozen=True)
 class GroupUplink:
-    """Uplink of a region's vehicles before a group: what they are asked, and the messages that they send."""
+    """Uplink of a region's vehicles before a group forms: requests, offers and their ledger entries."""
 
     ask: Ask
     book: Ledger
@@ -267,7 +267,7 @@ class GroupUplink:
     silent: dict[str, str] = field(default_factory=dict)  # by client why nothing is heard of it
 
     def check(self, clients: Sequence[str]) -> dict[str, CheckedNetwork]:
-        """Return the checks of clients: they are for the record, and no messages on the radio."""
+        """Return the clients' checks of the deployed network; they are recorded, and sent over no link."""
         replies, found = self.ask(CHECK, clients, counted=False), dict[str, CheckedNetwork]()
         for name, answer in replies.answers.items():
             told: Any = answer
@@ -281,7 +281,7 @@ class GroupUplink:
     def hear(
         self, question: str, clients: Sequence[str], read: Callable[[bytes], AnswerT], arrays: Weights = NOTHING
     ) -> dict[str, AnswerT]:
-        """Return what `read` makes of the clients' messages, which enter the ledger."""
+        """Return the clients' messages as `read` decodes them, and enter them in the ledger."""
         replies, found = self.ask(question, clients, arrays), dict[str, AnswerT]()
         for name, answer in replies.answers.items():
             message = answer.get(MESSAGE, np.zeros(0, np.uint8)).tobytes()
@@ -315,7 +315,7 @@ def find_units(
 
 
 def find_client_places(split: Frames, region: str, clients: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Return where (scenes, 3) [m] each client is when it is first in each scene of a split; NaN where it is not."""
+    """Return each client's first position (scenes, 3) [m, world frame] in each scene of a split; NaN if absent."""
     keys = split.data.keys
     scenes = {scene: number for number, scene in enumerate(dict.fromkeys(keys[i].scene for i in split.vehicles))}
     found = {name: np.full((len(scenes), 3), np.nan) for name in clients}
@@ -344,7 +344,7 @@ def find_linked(
     clients: Sequence[str],
     most_s: float,
 ) -> list[str]:
-    """Return the clients whose update, alone on the air, takes so many seconds at most; all without a network."""
+    """Return the clients whose update, alone on the channel, takes at most `most_s` [s]; all without a network."""
     network = settings.federation.network
     if network is None:
         return [*clients]

@@ -23,7 +23,7 @@ LEAVES = (LEFT_TOWN, NO_COVERAGE)  # why a vehicle is lost that cannot lead any 
 
 
 class LeadLeft(Exception):
-    """The lead of a group is gone."""
+    """Raised when the vehicle that leads an ad hoc group has left."""
 
 
 class _LeadBook(Ledger):
@@ -73,7 +73,7 @@ def follow_leads(
 
 
 def _keeps(term: LeadTerm, key: tuple[int, str], outage: Outage) -> bool:
-    """Return whether an outage is that of the lead's own update in its term, which crosses no link."""
+    """Return whether an outage concerns the lead's update in its own term, which is sent over no link."""
     number, client = key
     within = term.first <= number <= (number if term.left is None else term.left)
     return client == term.lead and within and outage.sent_bytes is not None

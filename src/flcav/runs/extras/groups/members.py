@@ -37,7 +37,7 @@ MESSAGE = "message"  # array of any other answer: the bytes of a message on the 
 
 
 class Unreadable(ValueError):
-    """A message that is not what was asked for."""
+    """Raised for a message that cannot be decoded as what was requested."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def read_loss(message: bytes) -> float:
 
 
 def _read(message: bytes, **shapes: tuple[int, ...]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a message, of which these have `shapes`."""
+    """Return the arrays of a message after checking the shapes of those named in `shapes`; raises `Unreadable`."""
     try:
         found = unpack_arrays(message)
     except (SafetensorError, ValueError) as error:
@@ -112,17 +112,17 @@ class GroupMember:
     client: Trainable | None = None  # that trains, where it is called
 
     def train(self, weights: Weights, **how: Any) -> Update:
-        """Return the update of its client."""
+        """Train the vehicle's client and return its update."""
         assert self.client is not None
         return self.client.train(weights, **how)
 
     def count_samples(self, steps: int) -> int:
-        """Return its client's number of samples; raises TypeError of a client that does not count them."""
+        """Return the number of samples of the vehicle's client; raises TypeError if the client cannot count them."""
         assert self.client is not None
         return count_samples(self.client, steps)
 
     def answer(self, question: str, arrays: Weights) -> Weights:
-        """Return its answer to one of the questions above; of a `SCORE`, the `arrays` are the weights to score."""
+        """Return the member's answer to a question of this module; for `SCORE`, `arrays` are the weights to score."""
         use_threads(1)
         if question == CHECK:
             loss = self.driving_loss
@@ -141,7 +141,7 @@ class GroupMember:
 
     @cached_property
     def driving_loss(self) -> float:
-        """Loss of the network that drives on what the vehicle holds back; 0 where that is nothing."""
+        """Loss of the deployed network on the samples that the vehicle holds back; 0 without any."""
         if not len(self.held):
             return 0.0
         return measure_loss(self.task, self.config, self.network, self.held, self.batch)
@@ -153,7 +153,7 @@ class GroupMember:
 
 
 def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
-    """Return the places of `count` samples to train on, and of those held back: evenly spread, one of each at least.
+    """Split `count` samples: indices to train on and indices held back, evenly spread, at least one of each.
 
     Of a single sample nothing is held back.
     """
@@ -163,7 +163,7 @@ def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
 
 
 def measure_loss(task: Task, config: Any, weights: Weights, samples: Sequence[Any], batch: int) -> float:
-    """Return the mean loss of a network on samples, which does not change it."""
+    """Return the mean loss of a network on samples; the network stays as it is."""
     network = task.build(config)
     from_arrays(network, weights)
     network.eval()
@@ -206,7 +206,7 @@ def sketch_gradient(gradient: Weights, seed: int) -> Array:
 
 
 class Picked(Sequence[Any]):
-    """Some of a vehicle's samples, by their places."""
+    """A subset of a vehicle's samples, given by indices."""
 
     def __init__(self, samples: Sequence[Any], places: Sequence[int]) -> None:
         self._samples, self._places = samples, tuple(places)

@@ -20,7 +20,7 @@ class CheckedNetwork(Record):
 
     @property
     def error(self) -> float:
-        """Return the loss by which it asks."""
+        """Return the loss that is compared with the limit."""
         return self.before if self.told is None else max(self.before, self.told)
 
 

@@ -135,7 +135,7 @@ def _test(graph: Graph, work: Path, trained: str, region: str) -> Tested:
 
 
 def _reachable(graph: Graph, work: Path, condition: str, task: str) -> float:
-    """Return the validation score of the condition's own network, which stage II trained from the pretrained one.
+    """Return the validation score of the network that stage II trained for this condition from the pretrained one.
 
     It is that of the pretrained network where this has the better one.
     """
@@ -145,7 +145,7 @@ def _reachable(graph: Graph, work: Path, condition: str, task: str) -> float:
 
 @dataclass(frozen=True)
 class LifelongSection(PageSection):
-    """The values of the section."""
+    """Values of the report's section on lifelong learning."""
 
     template: ClassVar[str] = "lifelong/section.html.j2"
     chart: ClassVar[str] = "flcav.report.charts.lifelong:draw_lifelong"

@@ -53,7 +53,7 @@ class LifelongArm(Record):
         tested: tuple[tuple[float, ...], ...],
         passed: tuple[Passed, ...],
     ) -> "LifelongArm":
-        """Return the record with what follows from its scores."""
+        """Build the record, computing final mean, backward and forward transfer from its scores."""
         found = (compute_final_mean(tested), compute_backward_transfer(tested), compute_forward_transfer(tested))
         return cls(arm, task, measure, tuple(each.condition for each in passed), tested, passed, *found)
 
@@ -69,12 +69,12 @@ class LifelongArm(Record):
 
     @property
     def broken(self) -> tuple[Passed, ...]:
-        """Return the conditions that the network that drove was not good enough for when they came."""
+        """Return the conditions in which the deployed network was below the required score when they began."""
         return tuple(each for each in self.passed if each.learned_s != 0)
 
     @property
     def mended(self) -> tuple[float, ...]:
-        """Return the seconds until a network drives that is good enough, of those of `broken` that have one."""
+        """Return the time [s] until a network of the required score drives, for conditions of `broken` with one."""
         return tuple(each.mended_s for each in self.broken if each.mended_s is not None)
 
     def describe(self) -> str:

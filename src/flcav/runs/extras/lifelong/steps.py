@@ -81,7 +81,7 @@ class Driving(Saved):
 
 
 def drive_step(work: Work, settings: DriveSettings) -> None:
-    """Have the copy take the driving network's place if it errs less, and send it to the condition's vehicles.
+    """Deploy the group's copy if its loss is lower than the deployed network's, and send it to the vehicles.
 
     The folder is then that of a pretraining, as the rounds of the next condition take it: weights, the score from which
     detections are labels, and the ledger of stage I.
@@ -105,7 +105,7 @@ def drive_step(work: Work, settings: DriveSettings) -> None:
 
 
 def compare_copies(group: Group) -> tuple[float, float] | None:
-    """Return the mean loss on what the members held back: with the network that drives, and with the copy.
+    """Return the mean loss on the members' held-back samples: of the deployed network and of the copy.
 
     None without a group, and of members that hold nothing back.
     """
