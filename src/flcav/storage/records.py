@@ -3,9 +3,8 @@
 Tables of users: reading of CSV, and writing as CSV or Parquet by the suffix of the file's name.
 """
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from collections.abc import Iterable, Iterator, Mapping, Sequence
 import re
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, BinaryIO, Self, TypeVar
