@@ -10,7 +10,7 @@ import numpy as np
 import pyarrow as pa
 
 from flcav.arrays import Array
-from flcav.cli.tables import numbers, read_table
+from flcav.cli.tables import numbers, read_input_table
 from flcav.config import InputError, shorten
 from flcav.interface.wording import plural
 from flcav.world.geodesy import find_on_ground
@@ -59,7 +59,7 @@ def read_places(path: Path, what: str, known: Sequence[str], town: Town | None, 
     places that are no numbers or not on Earth, and latitudes without a town.
     """
     named = [each for name in NAMES for each in (name, name.upper(), name.capitalize())]
-    table = _rename(read_table(path, (), named), path, known)
+    table = _rename(read_input_table(path, (), named), path, known)
     geodetic = LATITUDE in table.column_names and LONGITUDE in table.column_names
     axes = (LATITUDE, LONGITUDE) if geodetic else AXES[:2]
     for axis in axes:
