@@ -81,7 +81,7 @@ def _melt(value: Any, quantity: str, **at: Any) -> Iterator[Row]:
         yield from _melt_list(value, quantity, at)
 
 
-def _melt_list(values: tuple[Any, ...], quantity: str, at: Mapping[str, Any]) -> Iterator[Row]:
+def _melt_list(values: tuple[Any, ...], quantity: str, at: dict[str, Any]) -> Iterator[Row]:
     column, first = SERIES.get(quantity.rpartition(".")[2], ("", 0))
     if values and isinstance(values[0], str):
         yield from _melt(len(values), quantity, **at)
