@@ -9,6 +9,7 @@ and traffic.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import NamedTuple
 
@@ -16,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.config import Json
+from flcav.experiments.comparison import average_arms, mean_difference
 from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
 from flcav.geometry.boxes import Boxes, concatenate
 from flcav.interface.progress import Report, ignore_progress
@@ -33,7 +35,7 @@ from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import WEIGHTS
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
@@ -119,19 +121,16 @@ def compare_corner_cases(
             town: {arm: score_arm(run, work, arm, town) for arm in arms} for town, arms in TOWNS.items()
         }
         progress(number, len(runs), "")
-    each = [*seeds.values()]
-
-    def mean(town: str, arm: str, field: str) -> MeanOverSeeds:
-        return mean_over_seeds([getattr(seed[town][arm], field) for seed in each], share=True)
+    by_town = {town: {seed: scores[town] for seed, scores in seeds.items()} for town in TOWNS}
 
     def gain(town: str, after: str, before: str, field: str) -> MeanOverSeeds:
-        return mean_over_seeds([getattr(own[town][after], field) - getattr(own[town][before], field) for own in each])
+        return mean_difference(by_town[town], after, before, attrgetter(field))
 
     told = {"rare": "rare kinds", "every": "all objects"}
     return CornerCaseResult(
         seeds=seeds,
-        rare={town: {arm: mean(town, arm, "rare") for arm in arms} for town, arms in TOWNS.items()},
-        every={town: {arm: mean(town, arm, "every") for arm in arms} for town, arms in TOWNS.items()},
+        rare={town: average_arms(by_town[town], arms, attrgetter("rare")) for town, arms in TOWNS.items()},
+        every={town: average_arms(by_town[town], arms, attrgetter("every")) for town, arms in TOWNS.items()},
         differences={f"{row[0]}, {told[row[3]]}: {row[1]} - {row[2]}": gain(*row) for row in COMPARED},
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),

@@ -26,7 +26,7 @@ from flcav.statistics.power import MOST_SEEDS, plan_seeds
 from flcav.statistics.seeds import LEVEL, MeanOverSeeds, half_width, mean_over_seeds
 from flcav.statistics.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED, Judged, judge_means, verdict
 from flcav.storage.markdown import format_table
-from flcav.storage.records import Record
+from flcav.storage.records import Record, select
 
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
@@ -186,7 +186,7 @@ def _tested(run: Run, town: str, arm: str, stage: str) -> ReachedAP:
 
 
 def _placed(run: Run, town: str) -> PlacedSensor:
-    placed = next(each for each in run.arms[MAIN].placed if each.region == town)
+    (placed,) = select(run.arms[MAIN].placed, region=town)
     return PlacedSensor(placed.first, placed.densest, placed.poles, placed.errors, placed.covered, placed.range_m)
 
 

@@ -60,7 +60,7 @@ def span_divergence(records: Iterable[FederatedRound]) -> RoundDivergence | None
 def _gains(run: Run, task: str) -> Mapping[str, Sequence[float]]:
     """Return edge + cloud FL minus edge FL in each federating region, in each training."""
     compared = select(run.differences, arm=MAIN, stage=CLOUD, before_arm=MAIN, before_stage=EDGE, task=task)
-    return {each.region: each.trainings for each in compared}
+    return {each.region: (each.over_scenes.mean, *each.retrained) for each in compared}
 
 
 def format_divergence(

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from flcav.runs.extras.groups.rows import CheckedNetwork, Group, LeadTerm
+from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
 from flcav.runs.results.run import Run
 from flcav.runs.results.table import Row, save_table, tabulate
 from flcav.storage.records import select
@@ -80,6 +82,34 @@ def test_results_csv_has_a_row_for_each(tmp_path: Path) -> None:
         assert (cells["quantity"], cells["region"], float(cells["value"])) == (row.quantity, row.region, row.value)
         assert (cells["low"] or None) == (None if row.low is None else cells["low"])
         assert row.low is None or float(cells["low"]) == row.low
+
+
+def test_groups_losses_and_lifelong_learning_have_rows_of_their_places() -> None:
+    run = Run.load(RUNS / "demo")
+    main = run.arms["main"]
+    group = Group(
+        0.5, {"grid/cav0": CheckedNetwork(4, 0.75)}, "cav0", terms=(LeadTerm("cav0", 1, 2, 1), LeadTerm("cav1", 2))
+    )
+    stage = replace(main.stages[0], losses=(0.5, 0.25), group=group)
+    passed = [Passed(name, ("a", "b"), 2, 3, True, {}, 0.5, 24.0, 0.0, 0.0, 10, 20) for name in ("fog", "rain")]
+    arm = LifelongArm.of("replay", "objects", "AP50", ((0.5, 0.4), (0.6, 0.5), (0.6, 0.7)), tuple(passed))
+    arms = {**run.arms, "main": replace(main, stages=(stage, *main.stages[1:]))}
+    rows = tabulate(replace(run, arms=arms, lifelong=(arm,)))
+    places = Counter(astuple(replace(row, value=0.0, low=None, high=None)) for row in rows)
+    assert max(places.values()) == 1
+    losses = select(rows, arm="main", stage=stage.stage, region=stage.region, quantity="arms.stages.losses")
+    assert [(row.round, row.value) for row in losses] == [(1, 0.5), (2, 0.25)]
+    (before,) = select(rows, quantity="arms.stages.group.vehicles.grid/cav0.before")
+    assert (before.stage, before.value) == (stage.stage, 0.75)
+    assert [row.value for row in select(rows, quantity=[f"arms.stages.group.terms{n}.first" for n in ("", ".2")])] == [
+        1,
+        2,
+    ]
+    (final,) = select(rows, arm="replay", task="objects", quantity="lifelong.final")
+    assert (final.measure, final.value) == ("AP50", pytest.approx(0.65))
+    assert [
+        row.value for row in select(rows, quantity=("lifelong.passed.fog.asked", "lifelong.passed.rain.up_bytes"))
+    ] == [2, 10]
 
 
 def test_rows_are_selected_by_values_and_by_collections_of_them() -> None:

@@ -12,7 +12,6 @@ from flcav.runs.results.run import Run
 from flcav.statistics.estimates import Estimate
 from flcav.storage.records import write_any_table
 
-TABLE = "results.csv"  # in the folder of a run
 UNITS = {"mb": "MB", "bytes": "byte", "s": "s", "seconds": "s", "m": "m"}  # by the last word of a quantity
 
 
@@ -51,7 +50,7 @@ def save_table(run: Run, folder: Path) -> None:
     """Write the long table of a run to results.csv in `folder`, atomically; an empty cell: it does not apply."""
     rows = tabulate(run)
     columns = {each.name: [getattr(row, each.name) for row in rows] for each in fields(Row)}
-    write_any_table(pa.table(columns), folder / TABLE)
+    write_any_table(pa.table(columns), folder / "results.csv")
 
 
 def tabulate(run: Run) -> tuple[Row, ...]:
@@ -82,17 +81,18 @@ def _melt(value: Any, quantity: str, **at: Any) -> Iterator[Row]:
         yield from _melt_list(value, quantity, at)
 
 
-def _melt_list(values: tuple[Any, ...], quantity: str, at: Mapping[str, Any]) -> Iterator[Row]:
+def _melt_list(values: tuple[Any, ...], quantity: str, at: dict[str, Any]) -> Iterator[Row]:
     column, first = SERIES.get(quantity.rpartition(".")[2], ("", 0))
     if values and isinstance(values[0], str):
         yield from _melt(len(values), quantity, **at)
     seen = Counter[str]()
     for each in values if column or is_dataclass(next(iter(values), None)) else ():
-        place = repr(_find_place(each))
-        numbered = {column: first + seen[place]} if column else {}
-        seen[place] += 1
         names = [str(getattr(each, name)) for name in NAMES if getattr(each, name, None) is not None]
-        yield from _melt(each, ".".join((quantity, *names)), **{**at, **numbered})
+        place = repr((_find_place(each), names))
+        if seen[place] and not column:  # nothing else tells it from an earlier one
+            names.append(str(seen[place] + 1))
+        yield from _melt(each, ".".join((quantity, *names)), **(at | ({column: first + seen[place]} if column else {})))
+        seen[place] += 1
 
 
 def _find_place(record: Any) -> dict[str, Any]:
