@@ -324,6 +324,13 @@ def test_places_that_are_none_are_one_sentence(written, more, named, tmp_path, c
     assert err.count("\n") == 1
 
 
+def test_a_parquet_table_with_a_column_twice_is_one_sentence(files, capsys):
+    table = files[0].with_suffix(".parquet")
+    pq.write_table(pa.table([[0.0], [0.0], [1.0]], names=["x", "y", "x"]), table)
+    assert asked((table, files[1])) == 2
+    assert "errors.parquet: column 'x' is there twice; found x, y, x\n" in capsys.readouterr().err
+
+
 def test_the_curve_has_the_gain_of_each_further_sensor(tmp_path, capsys):
     random = np.random.default_rng(0)
     points = random.normal(0, 50, (60, 2))

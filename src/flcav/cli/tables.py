@@ -20,7 +20,7 @@ def read_input_table(path: Path, columns: Sequence[str], names: Sequence[str] = 
     names: columns that a CSV has as they are written, "007" not as 7; whole numbers without such zeros are numbers.
     """
     table = read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, names)
-    for column in columns:
+    for column in dict.fromkeys((*columns, *table.column_names)):
         if table.column_names.count(column) != 1:
             found = "is missing" if column not in table.column_names else "is there twice"
             raise InputError(f"{path}: column '{column}' {found}; found {', '.join(table.column_names)}")
