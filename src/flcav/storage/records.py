@@ -3,6 +3,7 @@
 Tables of users: CSV read, and tables written as CSV or Parquet by the suffix of the file's name.
 """
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -21,6 +22,8 @@ if TYPE_CHECKING:
 Class = Annotated[str, Field(alias="class")]  # a field named "class" in JSON, a reserved word in Python
 LEFT_OUT = Field(exclude_if=lambda value: value is None)  # for `Annotated`: not in the JSON where it is None
 WHERE_TRUE = Field(exclude_if=lambda value: not value)  # for `Annotated`: in the JSON where it is true
+
+LOOKED_AT = 65_536  # bytes of a CSV file, by which its separator is told
 
 RecordT = TypeVar("RecordT")
 
@@ -94,15 +97,19 @@ def check_ending(path: Path) -> None:
 def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str = "") -> pa.Table:
     """Return the table in the CSV file at `path`, or in an open one called `origin`, the columns `texts` as text.
 
-    Only an empty cell is None; "NaN" is a number, "NA" is text. Raises `InputError` where the file is missing or no
-    table, or a column is there twice.
+    Only an empty cell is None; "NaN" is a number, "NA" is text. Cells may be separated by semicolons or tabs, where the
+    header has these and no commas; numbers among semicolons may have decimal commas. Raises `InputError` where the file
+    is missing or no table, or a column is there twice.
     """
     named = origin or str(path)
-    written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
     if isinstance(path, Path | str):
         check_is_file(Path(path))
     try:
-        table = csv.read_csv(path, convert_options=written)
+        separator, point = _find_separator(path)
+        written = csv.ConvertOptions(
+            column_types=dict.fromkeys(texts, pa.string()), null_values=[""], decimal_point=point
+        )
+        table = csv.read_csv(path, parse_options=csv.ParseOptions(delimiter=separator), convert_options=written)
     except (pa.ArrowException, OSError, UnicodeDecodeError) as error:
         said = str(error) if str(error).isprintable() else "its bytes are no text"
         raise InputError(f"{named}: not a table ({said})") from None
@@ -110,6 +117,21 @@ def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str
         if name and table.column_names.count(name) > 1:
             raise InputError(f"{named}: column '{name}' is there twice; found {', '.join(table.column_names)}")
     return table
+
+
+def _find_separator(path: Path | str | BinaryIO) -> tuple[str, str]:
+    """Return what separates the cells of a CSV file by its header, and the decimal point of its numbers."""
+    if isinstance(path, Path | str):
+        with Path(path).open("rb") as file:
+            return _find_separator(file)
+    begins = path.tell()
+    header, rest = path.readline(LOOKED_AT), path.read(LOOKED_AT)
+    path.seek(begins)
+    if "\0" in header.decode(errors="ignore") or header.decode(errors="ignore").encode() != header:
+        return ",", "."  # compressed, in UTF-16, or no text
+    separator = next((mark for mark in (b";", b"\t") if mark in header and b"," not in header), b",")
+    comma = separator == b";" and re.search(rb"(^|;)\s*-?\d+,\d+\s*(;|\r|\n|$)", rest)
+    return separator.decode(), "," if comma else "."
 
 
 def write_any_table(table: pa.Table, path: Path) -> None:
