@@ -110,3 +110,14 @@ def test_a_column_of_its_own_name_counts_and_the_others_are_left() -> None:
     columns = {"samples": [10], "frames": [99], "error": [0.4], "AP": [0.3], "weight": [2]}
     found = parse_histories(columns, "history", "task")["task"]
     assert (found.resources.tolist(), found.accuracy.tolist()) == ([[10, 0, 0]], [0.6])
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["N;Straße;acc\n10;x;0,42\n20;y;0,5\n", "N;acc\n10;0.42\n20;0.5\n", "N\tacc\n10\t0.42\n20\t0.5\n"],
+)
+def test_semicolons_tabs_and_decimal_commas_are_read(tmp_path: Path, text: str) -> None:
+    (tmp_path / "mine.csv").write_text(text)
+    found = load_history(tmp_path / "mine.csv")
+    assert found.resources[:, 0].tolist() == [10, 20]
+    assert found.accuracy.tolist() == [0.42, 0.5]
