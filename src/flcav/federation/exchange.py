@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.federation import wire
-from flcav.federation.acceptance import Expected, NoSamples, ReplyRefused
+from flcav.federation.acceptance import Expected, NoSamples, NotFinite, ReplyRefused
 from flcav.federation.rules import Rules
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.strategies import Strategy
@@ -28,6 +28,10 @@ class ClientFailed(OSError):
     reached: Weights | None = None  # after the last round that came to an end; of `federate`
 
 
+class Diverged(ClientFailed):
+    """All clients that failed sent an update that is not finite, so that too few are left."""
+
+
 @dataclass
 class Attendance:
     """Attendance of a round: the clients that are asked, and those of them without an update, with the reason."""
@@ -37,6 +41,7 @@ class Attendance:
     away: Mapping[str, str] = field(default_factory=dict)  # clients that are not there at first, with the reason
     failed: dict[str, str] = field(default_factory=dict)  # by client what was wrong
     lost: set[str] = field(default_factory=set)  # those of them whom the network lost
+    diverged: set[str] = field(default_factory=set)  # those of them whose update is not finite
     idle: set[str] = field(default_factory=set)  # those of them without samples, or with no weight for the strategy
     shortage: ClientFailed | TooFewClients | None = None  # why there is no update
     few: bool = False  # whether fewer take part than the rules need
@@ -98,7 +103,8 @@ class Attendance:
                 if isinstance(least, int) and usable + len(self.idle.intersection(clients)) >= wanted:
                     self.shortage = ClientFailed(told)
                     continue
-                raise ClientFailed(f"round {number}: {told} ({reasons})")
+                kind = Diverged if self.failed.keys() - self.lost - self.idle <= self.diverged else ClientFailed
+                raise kind(f"round {number}: {told} ({reasons})")
         if isinstance(strategy, Robust):
             try:
                 strategy.check_clients(sum(name not in self.failed for name in self.chosen))
@@ -203,5 +209,6 @@ class Exchange:
             except ReplyRefused as error:
                 here.failed[event.client] = str(error)
                 here.idle |= {event.client} if isinstance(error, NoSamples) else set()
+                here.diverged |= {event.client} if isinstance(error, NotFinite) else set()
             else:
                 yield event.client, answer

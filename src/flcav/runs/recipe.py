@@ -373,6 +373,17 @@ class _Drive(Config):
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
 
+def _refuse_owners(values: Mapping[str, Any], part: str, owners: Sequence[str]) -> None:
+    """Raise ValueError where a part of a recipe is given by region or task, whose own part is below them."""
+    given = values.get(part)
+    for owner in owners:
+        named = values.get(owner)
+        if not (isinstance(given, Mapping) and isinstance(named, Mapping)):
+            continue
+        if odd := next((name for name in given if name in named), None):
+            raise ValueError(f"{part}.{odd}: '{odd}' is one of the {owner}; write {owner}.{odd}.{part}")
+
+
 class RunRecipe(RecipeFields, _Drive, LabelFields, _Scene):
     """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
@@ -401,6 +412,8 @@ class RunRecipe(RecipeFields, _Drive, LabelFields, _Scene):
         """Fill in defaults: of tasks without fields, and of the tasks whose errors decide the placement."""
         if not isinstance(values, dict) or not isinstance(values.get("tasks"), dict):
             return values
+        for part, owners in (("recording", ("regions", "tasks")), ("training", ("tasks",))):
+            _refuse_owners(values, part, owners)
         tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
         placement = values.get("placement", {})
         if isinstance(placement, dict) and "tasks" not in placement:

@@ -18,11 +18,12 @@ from flcav.runs.driving import DrivenStage, join_regions
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import CLOUD, EDGE, MORE_EDGE, Federation
-from flcav.runs.registry import CONDUCTS, COUNTS, DRIVES, load_all
+from flcav.runs.registry import CONDUCTS, COUNTS, DEALS, DRIVES, load_all
 from flcav.runs.results.plans import Plan, TaskPlan
 from flcav.runs.results.training import StageResult, StatisticsScore
 from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.regions import (
+    LabelledSamples,
     RenewedSamples,
     choose_loss,
     drive_region,
@@ -131,7 +132,7 @@ def federate_step(
     where = Whereabouts(runtime, processes, fleet, settings.vehicles, bool(timed))
     held = [name for own in labelled.values() for name in own.samples if len(own.samples[name])]
     with where.reach(held) as reached:
-        conduct, samples = Conduct(), {region: own.samples for region, own in labelled.items()}
+        conduct, (samples, dealt) = Conduct(), _deal(work, settings, labelled)
         if isinstance(settings, EdgeSettings) and settings.stage == EDGE:
             about = (work, settings, labelled[first.region], book, plan, reached.deployed)
             conduct = next((found for call in load_all(CONDUCTS) if (found := call(*about)) is not None), conduct)
@@ -145,7 +146,7 @@ def federate_step(
         if isinstance(settings, EdgeSettings):
             conduct = conduct.foresee(driven.records.get(first.region, ()), first.region)
             federation = replace(federation, conduct=conduct)
-        losses = federate_stage(federation, driven, reached)
+        losses, kept = federate_stage(federation, driven, reached)
         rows = conduct.report(work, settings, federation.schedule.rounds, reached.deployed)
     labels, clients = None, [client for own in federation.regions.values() for client in own.clients.values()]
     if settings.scored and settings.stage == EDGE and clients:
@@ -164,8 +165,22 @@ def federate_step(
         labels=labels,
         noise=noise,
         statistics=_score_statistics(work, settings, federation.learning) if settings.stage == CLOUD else None,
+        kept=kept,
+        **dealt,
         **rows,
     ).save(work.folder)
+
+
+def _deal(
+    work: Work, settings: StageSettings, labelled: Mapping[str, LabelledSamples]
+) -> tuple[dict[str, Mapping[str, Sequence[Any]]], dict[str, Any]]:
+    """Return the samples of each region's vehicles, by region, as extras deal them, and rows of the stage's result."""
+    samples, rows = {region: own.samples for region, own in labelled.items()}, dict[str, Any]()
+    for deal in load_all(DEALS):
+        for region, inputs in settings.regions.items():
+            samples[region], found = deal(work, settings, inputs, samples[region])
+            rows |= found
+    return samples, rows
 
 
 def _name_messages(settings: StageSettings) -> str:

@@ -5,7 +5,7 @@ Both stages end with weights and a ledger in their folder, by way of checkpoints
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -265,8 +265,11 @@ class Whereabouts:
 
 def federate_stage(
     own: StageFederation, driven: DrivenStage, where: Whereabouts = Whereabouts()
-) -> tuple[float | None, ...]:
+) -> tuple[tuple[float | None, ...], int | None]:
     """Run the rounds of a stage; write weights and ledger, return each round's loss.
+
+    Where the training diverges, it stops with the weights of the last round that were sound, whose number is returned,
+    too; None: those of the last round.
 
     Rounds are as the radio network has `driven` them: vehicles that it loses are lost in theirs, and the cloud's rounds
     need all edge servers. A privacy budget may end them before the schedule's end, and of asynchronous rounds each
@@ -302,8 +305,8 @@ def federate_stage(
     far = where.deployed and where.deployed.beside(within)
     own.conduct.resume(own.folder, clients, far, wireless, done)
     opened = contextlib.nullcontext(far) if far else open_runtime(where.runtime, clients, where.processes)
-    with checkpoints.refusals(), opened as runtime, contextlib.suppress(RoundsOver):
-        if own.conduct.over:
+    with checkpoints.refusals(), opened as runtime, checkpoints.divergence(), contextlib.suppress(RoundsOver):
+        if own.conduct.over or checkpoints.kept is not None:
             raise RoundsOver
         servers = {} if cloud is None else own.open_servers(driven, wireless, done, states, runtime)
         keep = partial(_keep_round, own, servers, state, checkpoints)
@@ -318,8 +321,8 @@ def federate_stage(
             own.conduct.run(run, start, wireless, keep, state, done)
     losses = checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
     if cloud is not None and rules.personal:
-        _save_regional_models(learning, own.folder, states)
-    return losses
+        _save_regional_models(learning, own.folder, {} if checkpoints.kept is not None else states, own.regions)
+    return losses, checkpoints.kept
 
 
 def _lay_out(
@@ -376,13 +379,15 @@ def _keep_round(
         keep_statistics(server.trained, own.folder, region)
     personal = [each.state.personal for each in regions if each.state.personal and each.rules.personal_arrays]
     checkpoints.save(number, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
-    if own.conduct.over:
+    if own.conduct.over or checkpoints.kept is not None:
         raise RoundsOver
 
 
-def _save_regional_models(learning: Learning, folder: Path, states: Mapping[str, FederationState]) -> None:
-    """Write each region's own model: the common weights with what its edge server keeps."""
-    for region, own in states.items():
+def _save_regional_models(
+    learning: Learning, folder: Path, states: Mapping[str, FederationState], regions: Iterable[str]
+) -> None:
+    """Write each region's own model: the common weights with what its edge server keeps, of a region with a state."""
+    for region in regions:
         model = load_stage_network(learning.task, folder)
-        from_arrays(model, {**to_arrays(model), **own.personal})
+        from_arrays(model, {**to_arrays(model), **(states[region].personal if region in states else {})})
         save_network(learning.task, model, folder / regional_weights(region))

@@ -1,0 +1,150 @@
+"""Partitions of a region's samples among its vehicles: whole, of the kind asked for, and the same again."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from flcav.config import InputError, parse_config
+from flcav.runs.arms import check_federations
+from flcav.runs.extras.partition.dealing import (
+    deal_by_amount,
+    deal_by_class,
+    deal_by_dirichlet,
+    deal_by_place,
+    give_each_one,
+)
+from flcav.runs.extras.partition.samples import count_labels, deal_samples, name_classes
+from flcav.runs.extras.partition.settings import Partition
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.stages.graph import Graph
+from flcav.statistics.streams import stream
+
+LABELS = np.repeat(["clear", "cloudy", "fog", "rain"], 60)
+
+
+def _rng(seed: int = 1) -> np.random.Generator:
+    return stream(seed, "partition")
+
+
+def _classes_held(owner: np.ndarray, vehicles: int) -> list[int]:
+    return [len(set(LABELS[owner == vehicle])) for vehicle in range(vehicles)]
+
+
+def test_by_class_each_vehicle_has_few_classes_and_as_many_samples() -> None:
+    owner = deal_by_class(LABELS, 8, 1, _rng())
+    assert np.bincount(owner).tolist() == [30] * 8
+    assert _classes_held(owner, 8) == [1] * 8
+    assert max(_classes_held(deal_by_class(LABELS, 8, 2, _rng()), 8)) == 2
+    assert set(_classes_held(deal_by_class(LABELS, 8, 30, _rng()), 8)) == {4}
+
+
+def test_by_place_areas_do_not_overlap_and_have_equal_numbers() -> None:
+    positions = _rng().uniform((0, 0), (300, 100), (90, 2))
+    owner = deal_by_place(positions, 3)
+    assert np.bincount(owner).tolist() == [30, 30, 30]
+    columns = [positions[owner == vehicle, 0] for vehicle in range(3)]  # 300 m are halved along x both times
+    assert columns[0].max() < columns[1].min() < columns[1].max() < columns[2].min()
+
+
+def test_by_amount_shares_follow_the_concentration_and_classes_do_not() -> None:
+    few, even = (deal_by_amount(4000, 8, alpha, _rng()) for alpha in (0.1, 1000.0))
+    counts = [np.bincount(owner, minlength=8) for owner in (few, even)]
+    assert counts[0].max() > 2000  # a few vehicles have most
+    assert counts[1].min() > 430  # 500 each, of standard deviation 15
+    labels = np.arange(4000) % 4
+    largest = labels[few == counts[0].argmax()]
+    assert np.bincount(largest) / len(largest) == pytest.approx([0.25] * 4, abs=0.05)
+
+
+def test_dirichlet_shares_are_those_of_each_class() -> None:
+    labels = np.repeat([0, 1], 20_000)
+    drawn = _rng()
+    expected = []
+    for _ in range(2):  # the draws written out
+        drawn.permutation(20_000)
+        expected.append(drawn.dirichlet([0.5] * 5))
+    owner = deal_by_dirichlet(labels, 5, 0.5, _rng())
+    for label in (0, 1):
+        shares = np.bincount(owner[labels == label], minlength=5) / 20_000
+        assert shares == pytest.approx(expected[label], abs=1e-4)
+
+
+def test_everybody_has_a_sample_where_there_are_enough() -> None:
+    owner = give_each_one(np.zeros(6, np.int64), 4)
+    assert np.bincount(owner, minlength=4).tolist() == [3, 1, 1, 1]
+    assert np.bincount(give_each_one(np.zeros(2, np.int64), 4), minlength=4).sum() == 2
+
+
+def _pictures(count: int, label: int) -> list[Any]:
+    return [SimpleNamespace(label=label) for _ in range(count)]
+
+
+@pytest.mark.parametrize("by", ["class", "place", "amount", "dirichlet"])
+def test_each_sample_is_one_vehicles_and_the_draw_can_be_repeated(by: Any) -> None:
+    samples = {"grid/cav0": _pictures(12, 0), "grid/cav1": _pictures(9, 1), "grid/cav2": _pictures(9, 0)}
+    counts = count_labels(samples, ("clear", "fog"))
+    positions = _rng().uniform(size=(30, 2))
+    dealt, record = deal_samples(Partition(by=by), samples, counts, positions, _rng())
+    again, _ = deal_samples(Partition(by=by), samples, counts, positions, _rng())
+    assert sorted(id(each) for own in dealt.values() for each in own) == sorted(
+        id(each) for own in samples.values() for each in own
+    )
+    for name, own in dealt.items():
+        assert list(map(id, own)) == list(map(id, again[name]))
+        held = record.vehicles[name]
+        assert held.labels == {"clear": sum(s.label == 0 for s in own), "fog": sum(s.label == 1 for s in own)}
+        share = held.labels["clear"] / held.samples
+        assert held.distance == pytest.approx(abs(share - 21 / 30))  # of two classes, written out
+    assert record.describe().startswith(f"dealt by {by}: cav0 {record.vehicles['grid/cav0'].samples} sample")
+
+
+def test_a_sample_of_several_labels_is_of_its_rarest_class() -> None:
+    assert name_classes([{"Car": 5, "Cyclist": 1}, {"Car": 1}, {}]) == ["Cyclist", "Car", "none"]
+
+
+def test_samples_without_labels_are_not_dealt_by_class() -> None:
+    samples = {"grid/cav0": [SimpleNamespace()] * 3}
+    with pytest.raises(InputError, match="no sample has a label to deal by"):
+        deal_samples(Partition(by="class"), samples, count_labels(samples, ()), None, _rng())
+    _, record = deal_samples(Partition(by="amount"), samples, count_labels(samples, ()), None, _rng())
+    assert record.vehicles["grid/cav0"].distance is None
+
+
+def _recipe(task: str = "weather", **federation: Any) -> RunRecipe:
+    return RunRecipe.model_validate(
+        {
+            "tasks": {task: {"plan": {"samples": 4, "edge_rounds": 1, "cloud_rounds": 1}}},
+            "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate"}},
+            "budgets_mb": {"wireless": 100, "wireline": 100},
+            "placement": {"rule": "none"},
+            "federation": federation,
+        }
+    )
+
+
+@pytest.mark.parametrize(
+    ("fields", "told"),
+    [
+        ({"by": "class", "alpha": 1.0}, "'alpha' is of a partition by amount or dirichlet"),
+        ({"by": "place", "shards": 2}, "'shards' are of a partition by class"),
+        ({"by": "weather"}, "'class', 'place', 'amount' or 'dirichlet'"),
+        ({"by": "amount", "alpha": 0}, "0.001"),
+    ],
+)
+def test_fields_of_another_kind_are_refused(fields: Any, told: str) -> None:
+    with pytest.raises(InputError, match=told):
+        parse_config(Partition, fields, "federation.partition")
+
+
+def test_a_task_without_classes_is_not_dealt_by_class(tmp_path: Any) -> None:
+    recipe = _recipe("trajectory", partition={"by": "dirichlet"})
+    with pytest.raises(InputError, match="'trajectory' has no classes to deal by; take 'place' or 'amount'"):
+        check_federations(recipe, Graph(recipe, tmp_path).settings.values())
+
+
+def test_groups_on_request_keep_what_they_recorded(tmp_path: Any) -> None:
+    recipe = _recipe(partition={"by": "class"}, requests={})
+    with pytest.raises(InputError, match="leave out 'requests' and 'lifelong'"):
+        check_federations(recipe, Graph(recipe, tmp_path).settings.values())
