@@ -1,7 +1,7 @@
 """Partitions of a region's samples among its vehicles: whole, of the kind asked for, and the same again."""
 
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,7 +15,7 @@ from flcav.runs.extras.partition.dealing import (
     deal_by_place,
     give_each_one,
 )
-from flcav.runs.extras.partition.samples import count_labels, deal_samples, name_classes
+from flcav.runs.extras.partition.samples import count_labels, deal_samples, locate_samples, name_classes
 from flcav.runs.extras.partition.settings import Partition
 from flcav.runs.recipe import RunRecipe
 from flcav.runs.stages.graph import Graph
@@ -148,3 +148,27 @@ def test_groups_on_request_keep_what_they_recorded(tmp_path: Any) -> None:
     recipe = _recipe(partition={"by": "class"}, requests={})
     with pytest.raises(InputError, match="leave out 'requests' and 'lifelong'"):
         check_federations(recipe, Graph(recipe, tmp_path).settings.values())
+
+
+def test_samples_are_where_their_frames_are_also_where_a_frame_has_several_or_none() -> None:
+    held = {0: 2, 1: 0, 2: 1, 3: 1}  # pictures of each frame; the first two are of cav0
+
+    class Pictures:
+        def samples(self, data: Any, config: Any, frames: tuple[int]) -> list[int]:
+            if not held[frames[0]]:
+                raise InputError("no picture")
+            return [0] * held[frames[0]]
+
+    def frame(i: int) -> Any:
+        return SimpleNamespace(world_from_agent=np.array([[1, 0, 0, 10.0 * i], [0, 1, 0, 5.0], [0, 0, 1, 0]]))
+
+    keys = [SimpleNamespace(agent=agent) for agent in ("cav0", "cav0", "cav1", "cav1")]
+    split: Any = SimpleNamespace(data=SimpleNamespace(frame=frame, keys=keys))
+
+    def locate(samples: Any) -> list[Any]:
+        return list(locate_samples(cast(Any, Pictures()), None, split, [*held], "grid", samples))
+
+    found = locate({"grid/cav0": "ab", "grid/cav1": "cd"})
+    assert [each.tolist() for each in found] == [[0, 5], [0, 5], [20, 5], [30, 5]]
+    with pytest.raises(InputError, match="grid/cav1 do not tell where"):
+        locate({"grid/cav0": "ab", "grid/cav1": "cde"})

@@ -9,7 +9,7 @@ from flcav.arrays import Array
 from flcav.config import InputError
 from flcav.federation.strategies import Strategy
 from flcav.optimization.quality import label_distribution_distance
-from flcav.perception.task import find_configuration
+from flcav.perception.task import Task, find_configuration
 from flcav.perception.tasks import task_named
 from flcav.runs.arms import Setting
 from flcav.runs.engine import Work
@@ -70,7 +70,8 @@ def deal_region(
     rng = stream(0, "partition", str(split.data.manifest.recipe.get("seed")), inputs.region)
     counts, positions = count_labels(samples, getattr(learning.config, "classes", ())), None
     if how.by == BY_PLACE:
-        positions = np.array([*_list_positions(work, settings, inputs, split, samples)]).reshape(-1, 2)
+        about = (learning.task, learning.config, split, select_group(work, split, inputs), inputs.region)
+        positions = np.array([*locate_samples(*about, samples)]).reshape(-1, 2)
     dealt = deal_samples(how, samples, counts, positions, rng)
     return dealt[0], {"partition": dealt[1]} if inputs.edge is None else {}
 
@@ -134,26 +135,25 @@ def deal_samples(
     return {name: Picked(everything, own) for name, own in places.items()}, Partitioned(how.by, held)
 
 
-def _list_positions(
-    work: Work, settings: FederationSettings, inputs: RegionInputs, split: Frames, samples: Samples
+def locate_samples(
+    task: Task, config: Any, split: Frames, frames: Sequence[int], region: str, samples: Samples
 ) -> Iterator[Array]:
-    """Yield the position (2,) [m] of each sample, one vehicle after another.
+    """Yield the position (2,) [m] of each sample of `frames` of a split, one vehicle after another.
 
-    Where frames have several samples, or none, their number is that of each frame alone.
+    Frames may have several samples, or none: their number is that of each frame alone. Raises `InputError` where these
+    are not as many as the vehicle has.
     """
-    learning, frames = settings.learning.resolve(), dict[str, list[int]]()
-    for i in select_group(work, split, inputs):
-        frames.setdefault(f"{inputs.region}/{split.data.keys[i].agent}", []).append(i)
 
     def count(i: int) -> int:
         try:
-            return len(learning.task.samples(split.data, learning.config, (i,)))
+            return len(task.samples(split.data, config, (i,)))
         except InputError:  # a frame without a sample of the task
             return 0
 
-    for name, own in samples.items():
-        each = [1] * len(frames[name]) if len(own) == len(frames[name]) else [count(i) for i in frames[name]]
-        if sum(each) != len(own):
+    for name, held in samples.items():
+        own = [i for i in frames if f"{region}/{split.data.keys[i].agent}" == name]
+        numbers = [count(i) for i in own]
+        if sum(numbers) != len(held):
             raise InputError(f"federation.partition: frames of {name} do not tell where its samples are from")
-        for i, number in zip(frames[name], each, strict=True):
+        for i, number in zip(own, numbers, strict=True):
             yield from [split.data.frame(i).world_from_agent[:2, 3]] * number
