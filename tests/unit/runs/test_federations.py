@@ -440,6 +440,20 @@ def test_a_training_that_diverges_stops_and_keeps_the_last_weights_known_to_be_s
     assert float(to_arrays(load_stage_network(learning.task, tmp_path))["bias"][0]) == reached
 
 
+def test_a_later_stage_diverges_by_the_loss_that_stage_two_began_with(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1, start_share=0.0), 3)
+    network = learning.build_network()
+    from_arrays(network, {name: np.zeros_like(array) for name, array in to_arrays(network).items()})
+    clients: Any = {"a/cav0": Explodes([50.0, 50.0])}
+    ends = {}
+    for first in (None, 0.5):
+        book, folder = Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / str(first)
+        how = (learning.schedule(2, 1, "more_edge", "a"), FEDAVG, 3, book, folder, ignore_progress)
+        federation = replace(edge_federation(learning, network, clients, *how), first_loss=first)
+        ends[first] = federate_stage(federation, DrivenStage(Rules(), {}))
+    assert ends == {None: ((50.0, 50.0), None), 0.5: ((50.0,), 0)}
+
+
 def test_updates_that_are_not_finite_in_the_first_round_are_an_error(tmp_path: Path) -> None:
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
     network = learning.build_network()

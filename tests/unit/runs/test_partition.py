@@ -5,8 +5,10 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+from matplotlib.patches import Rectangle
 
 from flcav.config import InputError, parse_config
+from flcav.report.charts.partition import draw_dealt
 from flcav.runs.arms import check_federations
 from flcav.runs.extras.partition.dealing import (
     deal_by_amount,
@@ -15,6 +17,7 @@ from flcav.runs.extras.partition.dealing import (
     deal_by_place,
     give_each_one,
 )
+from flcav.runs.extras.partition.rows import Holding, Partitioned
 from flcav.runs.extras.partition.samples import count_labels, deal_samples, locate_samples, name_classes
 from flcav.runs.extras.partition.settings import Partition
 from flcav.runs.recipe import RunRecipe
@@ -172,3 +175,14 @@ def test_samples_are_where_their_frames_are_also_where_a_frame_has_several_or_no
     assert [each.tolist() for each in found] == [[0, 5], [0, 5], [20, 5], [30, 5]]
     with pytest.raises(InputError, match="grid/cav1 do not tell where"):
         locate({"grid/cav0": "ab", "grid/cav1": "cde"})
+
+
+def test_the_chart_has_a_bar_for_each_vehicle_and_class_as_long_as_what_it_holds() -> None:
+    held = {"grid/cav0": Holding(5, {"clear": 5, "fog": 0}, 0.4), "grid/cav1": Holding(4, {"clear": 1, "fog": 3}, 0.5)}
+    figure = draw_dealt({"main · grid · weather": Partitioned("class", held)})
+    (axes,) = figure.axes
+    assert [bar.get_width() for bar in axes.patches if isinstance(bar, Rectangle)] == [5, 1, 0, 3]  # by class
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["cav0", "cav1"]
+    bare = {name: Holding(own.samples, {}, None) for name, own in held.items()}
+    (axes,) = draw_dealt({"main · grid · trajectory": Partitioned("place", bare)}).axes
+    assert [bar.get_width() for bar in axes.patches if isinstance(bar, Rectangle)] == [5, 4]

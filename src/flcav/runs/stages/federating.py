@@ -219,9 +219,11 @@ def _find_noise(work: Work, settings: StageSettings, plan: Plan) -> float | None
     return find_budget_noise(settings.federation, _plan_private(settings, plan).rules)
 
 
-def _count_rounds(settings: StageSettings, plan: Plan, conduct: Conduct) -> int:
-    """Return the planned rounds of the stage, as many as privacy affords."""
+def _count_rounds(settings: StageSettings, plan: Plan, conduct: Conduct, before: Sequence[StageResult]) -> int:
+    """Return the planned rounds of the stage, as many as privacy affords; none after a stage II that diverged."""
     own = plan.tasks[settings.learning.task]
+    if any(each.kept is not None for each in before):
+        return 0
     if isinstance(settings, CloudSettings):
         return own.cloud_rounds
     if settings.stage == MORE_EDGE:
@@ -242,11 +244,14 @@ def _open_federation(
     learning, strategies = choose_loss(work, settings, first.pretrain), Strategies(*find_strategies(how))
     began = first.pretrain if cloud else first.edge or first.pretrain
     network = load_stage_network(learning.task, work.inputs[began])
-    rounds, starts = _count_rounds(settings, plan, conduct), dict[str, RegionStart]()
+    before = {
+        name: StageResult.load(work.inputs[own.edge]) for name, own in settings.regions.items() if own.edge is not None
+    }
+    rounds, starts = _count_rounds(settings, plan, conduct, [*before.values()]), dict[str, RegionStart]()
     for region, inputs in settings.regions.items():
         clients = make_clients(learning, network.config, samples[region])
         weights = to_arrays(load_stage_network(learning.task, work.inputs[inputs.edge or inputs.pretrain]))
-        earlier, own = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds, samples[region]
+        earlier, own = before[region].rounds if region in before else 0, samples[region]
         if inputs.edge is not None and rounds and isinstance(own, RenewedSamples):
             own.renew(1, weights)
         starts[region] = RegionStart(clients, weights, earlier, how.edge_rounds_per_cloud_round if cloud else 1)
@@ -257,6 +262,7 @@ def _open_federation(
     restart = how.cloud_rate if cloud else None
     start_share = 0.0 if earlier else learning.training.start_share
     relabel = samples[first.region] if settings.stage == EDGE else None
+    losses = [loss for each in before.values() for loss in each.losses[:1] if loss is not None]
     return StageFederation(
         learning=learning,
         network=network,
@@ -274,6 +280,7 @@ def _open_federation(
         else {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()},
         relabel=relabel.renew if isinstance(relabel, RenewedSamples) else None,
         conduct=conduct,
+        first_loss=max(losses, default=None),
     )
 
 

@@ -161,6 +161,7 @@ class StageFederation:
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     relabel: BeforeRound | None = None  # changes the clients' labels before each round of stage II
     conduct: Conduct = field(default_factory=Conduct)  # of the rounds of stage II
+    first_loss: float | None = None  # of stage II, where it is over: a training diverges by it
 
     def afford(self, rules: Rules, rounds: int, buffers: Mapping[str, Buffers]) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
@@ -293,6 +294,7 @@ def federate_stage(
         schedule.rounds,
         rules.privacy,
         own.score if own.validation else None,
+        own.first_loss,
     )
     start, done = checkpoints.resume(to_arrays(own.network))
     named = {EDGE if cloud is None else f"{EDGE}/{region}": each for region, each in own.regions.items()}

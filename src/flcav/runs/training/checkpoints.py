@@ -50,6 +50,7 @@ class FederationCheckpoints:
     rounds: int = 0  # of the federation, told with each
     privacy: Privacy | None = None  # of the updates, whose delta is told with epsilon
     score: Callable[[int], Mapping[str, float]] | None = None  # on validation frames after a round, by region
+    first_loss: float | None = None  # of the stage before, which a training is judged by; None: of its own first round
     losses: list[float | None] = field(default_factory=list)  # of each round
     scores: list[Mapping[str, float]] = field(default_factory=list)
     _hashes: dict[str, str] = field(default_factory=dict)  # of the files of weights, by name
@@ -122,7 +123,9 @@ class FederationCheckpoints:
     @property
     def kept(self) -> int | None:
         """Return the round whose weights are kept, since the training diverges; None: the last."""
-        return last_sound_round(self.losses) if self._broken or diverges(self.losses) else None
+        before = [] if self.first_loss is None else [self.first_loss]
+        losses = [*before, *self.losses]
+        return max(last_sound_round(losses) - len(before), 0) if self._broken or diverges(losses) else None
 
     @contextlib.contextmanager
     def divergence(self) -> Iterator[None]:
