@@ -36,8 +36,8 @@ def spearman(one: Any, other: Any) -> float:
 @pytest.fixture(scope="module")
 def fleet() -> FleetWorth:
     vehicles = tuple(
-        VehicleWorth(samples, {"fog": samples}, *figures, 0.5, tuple(NetworkScore(loss, 0.5) for loss in losses))
-        for samples, *figures, losses in zip(SAMPLES, DISTANCE, NOVELTIES, LOSSES, strict=True)
+        VehicleWorth(samples, {"fog": samples}, far, new, 0.5, tuple(NetworkScore(loss, 0.5) for loss in losses))
+        for samples, far, new, losses in zip(SAMPLES, DISTANCE, NOVELTIES, LOSSES, strict=True)
     )
     return FleetWorth(NetworkScore(2.0, 0.3), (NetworkScore(1.1, 0.6), NetworkScore(1.0, 0.7)), vehicles)
 
