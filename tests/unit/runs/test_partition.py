@@ -1,5 +1,6 @@
 """Partitions of a region's samples among its vehicles: whole, of the kind asked for, and the same again."""
 
+import pickle
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -101,6 +102,15 @@ def test_each_sample_is_one_vehicles_and_the_draw_can_be_repeated(by: Any) -> No
         share = held.labels["clear"] / held.samples
         assert held.distance == pytest.approx(abs(share - 21 / 30))  # of two classes, written out
     assert record.describe().startswith(f"dealt by {by}: cav0 {record.vehicles['grid/cav0'].samples} sample")
+
+
+def test_a_vehicle_is_given_its_own_samples_alone_also_where_it_is_sent_to_another_process() -> None:
+    samples = {f"grid/cav{i}": [np.full(50_000, i, np.uint8) for _ in range(10)] for i in range(4)}
+    dealt, record = deal_samples(Partition(by="amount", alpha=1000.0), samples, [{}] * 40, None, _rng())
+    for name, own in dealt.items():
+        count = record.vehicles[name].samples
+        assert len(own) == count
+        assert len(pickle.dumps(own)) < (count + 0.5) * 50_000
 
 
 def test_a_sample_of_several_labels_is_of_its_rarest_class() -> None:

@@ -106,7 +106,7 @@ def deal_samples(
     counts: labels by class, of each sample, one vehicle after another. positions: (N, 2) [m] of these, where they are
     dealt by place. Raises `InputError` where no sample has a label, and they are dealt by class.
     """
-    everything, number = Joined([*samples.values()]), len(samples)
+    number = len(samples)
     if how.by in (BY_CLASS, BY_DIRICHLET):
         if not any(counts):
             raise InputError(
@@ -122,7 +122,7 @@ def deal_samples(
         assert positions is not None
         owner = deal_by_place(positions, number)
     else:
-        owner = deal_by_amount(len(everything), number, how.alpha or ALPHA, rng)
+        owner = deal_by_amount(len(counts), number, how.alpha or ALPHA, rng)
     owner = give_each_one(owner, number)
     places = {name: np.flatnonzero(owner == vehicle).tolist() for vehicle, name in enumerate(samples)}
     classes = sorted({label for each in counts for label in each})
@@ -132,7 +132,17 @@ def deal_samples(
         name: Holding(len(own), dict(zip(classes, map(int, row), strict=True)), distance)
         for (name, own), row, distance in zip(places.items(), table, distances, strict=True)
     }
-    return {name: Picked(everything, own) for name, own in places.items()}, Partitioned(how.by, held)
+    return {name: _take([*samples.values()], own) for name, own in places.items()}, Partitioned(how.by, held)
+
+
+def _take(parts: Sequence[Sequence[Any]], places: Sequence[int]) -> Joined:
+    """Return the samples at `places` of all parts, one after another; of those in memory it holds no others."""
+    ends = np.cumsum([len(part) for part in parts])
+    taken = []
+    for part, end in zip(parts, ends.tolist(), strict=True):
+        own = [place - (end - len(part)) for place in places if end - len(part) <= place < end]
+        taken.append([part[place] for place in own] if isinstance(part, list) else Picked(part, own))
+    return Joined(taken)
 
 
 def locate_samples(
