@@ -66,10 +66,10 @@ def federate_edge(
     own: StageFederation, rules: Rules, outages: Outages = NOBODY, **where: Any
 ) -> tuple[float | None, ...]:
     """Run stage II by `rules`; `where` as in `Whereabouts`."""
-    return federate_stage(own, DrivenStage(rules, outages), Whereabouts(**where))
+    return federate_stage(own, DrivenStage(rules, outages), Whereabouts(**where))[0]
 
 
 def federate_cloud(own: StageFederation, rounds: int, rules: Rules, **where: Any) -> tuple[float | None, ...]:
     """Run so many rounds of stage III by `rules`; `where` as in `Whereabouts`."""
     planned = replace(own, schedule=replace(own.schedule, rounds=rounds))
-    return federate_stage(planned, DrivenStage(rules), Whereabouts(**where))
+    return federate_stage(planned, DrivenStage(rules), Whereabouts(**where))[0]

@@ -77,6 +77,9 @@ def _describe(result: "StageResult") -> str:
     records = result.records or ()
     seconds = [record.seconds for record in records if record.seconds is not None]
     told += f", {sum(seconds):.1f} s on the network" if seconds else ""
+    if result.kept is not None:
+        weights = f"after round {result.kept}" if result.kept else "that it began with"
+        told += f", the training diverged: the weights are those {weights}"
     rest = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
     told = ", ".join([told, *filter(None, rest)])
     return "; ".join([told, *result.describe_rows().values()])

@@ -117,7 +117,7 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: M
 
 
 def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str]:
-    from flcav.runs.analysis.caveats import PLACED_BARE
+    from flcav.runs.analysis.caveats import DIVERGING, PLACED_BARE
     from flcav.runs.analysis.costs import tell_gain
     from flcav.runs.results.training import TOGETHER
 
@@ -129,6 +129,7 @@ def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str
             if arm.privacy is not None:
                 yield f"{name}, {TOGETHER}: {arm.privacy.describe()}"
         yield from results[0].describe_rows()
+        yield from (caveat for caveat in results[0].caveats if caveat.startswith(DIVERGING))
         if PLACED_BARE in results[0].caveats:
             yield f"privacy: {PLACED_BARE}"
         return

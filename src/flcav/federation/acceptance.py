@@ -30,6 +30,10 @@ class ReplyRefused(ValueError):
     """A reply that does not match its request, or exceeds the limits of the rules."""
 
 
+class NotFinite(ReplyRefused):
+    """A reply whose arrays are not finite: the client's training diverged, or its data are damaged."""
+
+
 class NoSamples(ReplyRefused):
     """A valid reply of a client without samples."""
 
@@ -178,7 +182,7 @@ def _check_change(weights: Weights, start: Weights, rules: Rules) -> None:
             if array.dtype.kind == "f":
                 total += _squared_norm(array.reshape(-1), start[name].reshape(-1) if start else None)
                 if not total < math.inf and not np.isfinite(array).all():
-                    raise ReplyRefused(f"'{name}' has values that are not finite")
+                    raise NotFinite(f"'{name}' has values that are not finite")
     if not total <= most**2:
         raise ReplyRefused(f"a change of the norm {total**0.5:.3g}, where {most:g} is the largest")
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from flcav.config import InputError
 from flcav.federation import wire
-from flcav.federation.acceptance import Expected, NoSamples, ReplyRefused
+from flcav.federation.acceptance import Expected, NoSamples, NotFinite, ReplyRefused
 from flcav.federation.rules import Rules
 from flcav.federation.secure.messages import TooFewClients
 from flcav.federation.strategies import Strategy
@@ -28,6 +28,10 @@ class ClientFailed(OSError):
     reached: Weights | None = None  # weights after the last completed round; set by `federate`
 
 
+class Diverged(ClientFailed):
+    """All clients that failed sent an update that is not finite, so that too few are left."""
+
+
 @dataclass
 class Attendance:
     """The attendance of a round: its clients, and those of them without an update, with the reason."""
@@ -37,6 +41,7 @@ class Attendance:
     away: Mapping[str, str] = field(default_factory=dict)  # clients absent at the start, with the reason
     failed: dict[str, str] = field(default_factory=dict)  # reason by client
     lost: set[str] = field(default_factory=set)  # failed clients that the network lost
+    diverged: set[str] = field(default_factory=set)  # failed clients whose update is not finite
     idle: set[str] = field(default_factory=set)  # failed clients without samples, or without weight in the strategy
     shortage: ClientFailed | TooFewClients | None = None  # why the round has no update
     few: bool = False  # whether fewer clients take part than the rules need
@@ -100,7 +105,8 @@ class Attendance:
                 if isinstance(least, int) and usable + len(self.idle.intersection(clients)) >= wanted:
                     self.shortage = ClientFailed(few)
                     continue
-                raise ClientFailed(f"round {number}: {few} ({reasons})")
+                kind = Diverged if self.failed.keys() - self.lost - self.idle <= self.diverged else ClientFailed
+                raise kind(f"round {number}: {few} ({reasons})")
         if isinstance(strategy, Robust):
             try:
                 strategy.check_clients(sum(name not in self.failed for name in self.chosen))
@@ -206,5 +212,6 @@ class Exchange:
             except ReplyRefused as error:
                 here.failed[event.client] = str(error)
                 here.idle |= {event.client} if isinstance(error, NoSamples) else set()
+                here.diverged |= {event.client} if isinstance(error, NotFinite) else set()
             else:
                 yield event.client, answer

@@ -17,6 +17,7 @@ import math
 import secrets
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, Protocol
 
 import numpy as np
@@ -28,6 +29,7 @@ from flcav.federation.selection import Selection
 from flcav.federation.trainable import Arrays, LocalUpdate, Weights
 from flcav.federation.upload import apply_change, find_change
 from flcav.statistics.streams import stream
+from flcav.storage.records import Record
 
 ROUNDING = 1e-12  # relative; above the rounding error of a clipped change's norm in float64
 MOST_NOISE = 1e6
@@ -140,6 +142,45 @@ def expected_clients(selection: Selection, names: Sequence[str]) -> float:
         assert selection.probability is not None
         return selection.probability * len(names)
     return float(len(selection.choose(names, 1, 0)))
+
+
+@dataclass(frozen=True)
+class RoundNoise(Record):
+    """The noise of a round beside what it is to hide: L2 norms over all values that are learned and sent."""
+
+    clients: float  # that a round expects
+    values: int  # d, of an update
+    norm: float  # expected norm of the noise in the sum of the updates
+    most: float  # norm of the sum of clipped updates, if all point the same way
+
+    @property
+    def drowns(self) -> bool:
+        """Return whether the noise is longer than all updates together can be."""
+        return self.norm > self.most
+
+    def describe(self) -> str:
+        """Return the comparison in words, with what would help where the noise is longer."""
+        told = (
+            f"noise of a round {self.norm:.3g} over {self.values:,} values, beside {self.most:.3g} at most of the "
+            f"clipped updates of {self.clients:g} vehicles"
+        )
+        if not self.drowns:
+            return told
+        return (
+            f"WARNING: {told}: {self.norm / self.most:.3g} times as long, which can ruin the network; less noise (a "
+            "larger epsilon, fewer rounds), more vehicles in a round, or fewer layers (upload.layers) make it shorter"
+        )
+
+
+def measure_round_noise(privacy: Privacy, clients: float, values: int) -> RoundNoise:
+    """Return the noise of a round beside the most that its updates add up to: sigma C sqrt(d) and n C.
+
+    clients: n, expected in a round. values: d, that are learned and sent. Where each client adds noise, the sum has
+    sqrt(n) times as much. The mean that the weights change by is 1 / n of both. Raises ValueError where the noise is
+    not known yet.
+    """
+    norm = privacy.deviation * math.sqrt(values * (clients if privacy.local else 1.0))
+    return RoundNoise(clients, values, norm, clients * privacy.clip)
 
 
 def account_epsilon(privacy: Privacy, selection: Selection, names: Sequence[str], rounds: int) -> float:

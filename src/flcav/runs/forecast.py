@@ -14,6 +14,9 @@ from typing import Annotated
 
 import numpy as np
 
+from flcav.federation.privacy import RoundNoise, expected_clients, measure_round_noise
+from flcav.federation.strategies.fedbuff import FedBuff
+from flcav.federation.trainable import learned_names
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.network.ledger import Link
@@ -23,9 +26,9 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.runs.allocation import PlanRequest, make_plan
-from flcav.runs.arms import Setting, check_federations
+from flcav.runs.arms import Setting, check_federations, find_strategies
 from flcav.runs.frames import Frames, deal_frames, make_recording_recipe, record_frames
-from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, RunRecipe
+from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, Federation, RunRecipe
 from flcav.runs.registry import FORECASTS, load_all
 from flcav.runs.results.training import PrivacySpent
 from flcav.runs.stages.graph import Graph
@@ -54,6 +57,7 @@ class PlannedRounds(Record):
     edge_rounds: int
     cloud_rounds: int
     noise: Annotated[float | None, LEFT_OUT] = None  # that a privacy budget alone gives; None: it is given, or none is
+    round_noise: Annotated[RoundNoise | None, LEFT_OUT] = None  # where it is longest beside the updates; None: no noise
 
 
 @dataclass(frozen=True)
@@ -84,6 +88,8 @@ class Forecast(Record):
                 counts = {"sample": own.samples, "edge round": own.edge_rounds, "cloud round": own.cloud_rounds}
                 rounds = ", ".join(plural(count, what) for what, count in counts.items())
                 lines.append(f"{name}, {task}: {rounds}")
+                if own.round_noise is not None:
+                    lines.append(f"{name}, {task}: {own.round_noise.describe()}")
             sent = " and ".join(f"{megabytes:.1f} MB {link}" for link, megabytes in arm.uplink_mb.items())
             lines.append(f"{name}: about {sent} of uplink")
             if arm.privacy is not None:
@@ -189,8 +195,24 @@ def _plan_arm(graph: Graph, arm: Setting, measured: Mapping[str, _Measured]) -> 
             arm.federation, vehicles, own.edge_rounds, further if arm.stages[-1] in (CLOUD, MORE_EDGE) else 0, k
         )
         found = find_budget_noise(arm.federation, private.rules)
-        planned[name] = PlannedRounds(own.samples, private.edge, private.further // k, found)
+        counts = (own.samples, private.edge, private.further // k)
+        planned[name] = PlannedRounds(*counts, found, measure_noise(graph, arm, name, private.rules))
     return planned
+
+
+def measure_noise(graph: Graph, arm: Setting, task: str, rules: Federation) -> RoundNoise | None:
+    """Return the noise of a round of an arm in the region with the fewest vehicles in a round; None without noise."""
+    if rules.privacy is None or arm.central:
+        return None
+    weights = to_arrays(graph.learning(arm, task).resolve().build_network())
+    sent = {*rules.upload.exchanged(weights)}
+    values = sum(weights[name].size for name in learned_names(weights) if name in sent)
+    strategy, _ = find_strategies(rules)
+    if isinstance(strategy, FedBuff):
+        return measure_round_noise(rules.privacy, strategy.buffer, values)
+    names = ([str(number) for number in range(graph.vehicles[region])] for region in arm.regions)
+    fewest = min(expected_clients(rules.selection, each) for each in names)
+    return measure_round_noise(rules.privacy, fewest, values)
 
 
 def _size_messages(settings: FirstPlanSettings, task: str, own: _Measured) -> MessageSizes:

@@ -374,6 +374,17 @@ class _Drive(Config):
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
 
+def _refuse_owners(values: Mapping[str, Any], part: str, model: type[Config]) -> None:
+    """Raise ValueError where a part of a recipe is given by region or task, whose own part is below them."""
+    given = values.get(part)
+    unknown = [name for name in given if name not in model.model_fields] if isinstance(given, Mapping) else []
+    for owner, has in (("regions", Region), ("tasks", TaskRecipe)):
+        named = values.get(owner)
+        odd = next((name for name in unknown if isinstance(named, Mapping) and name in named), None)
+        if odd is not None and part in has.model_fields:
+            raise ValueError(f"{part}.{odd}: '{odd}' is one of the {owner}; write {owner}.{odd}.{part}")
+
+
 class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
     """The recipe of a run: pretraining, edge FL and cloud FL (Wang et al., IEEE Network 37(3), 2023).
 
@@ -402,6 +413,8 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
         """Fill in defaults: of tasks without fields, and of the tasks whose errors decide the placement."""
         if not isinstance(values, dict) or not isinstance(values.get("tasks"), dict):
             return values
+        for part, model in (("recording", Recording), ("training", Training)):
+            _refuse_owners(values, part, model)
         tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
         placement = values.get("placement", {})
         if isinstance(placement, dict) and "tasks" not in placement:

@@ -18,6 +18,8 @@ from flcav.runs.extras.groups.rows import GroupRow
 from flcav.runs.extras.groups.settings import RequestFields
 from flcav.runs.extras.lifelong.rows import LifelongRow
 from flcav.runs.extras.lifelong.settings import LifelongFields
+from flcav.runs.extras.partition.rows import PartitionRow
+from flcav.runs.extras.partition.settings import PartitionFields
 
 
 class LabelFields(
@@ -43,6 +45,7 @@ class RecipeFields(
 
 class FederationFields(
     RequestFields,
+    PartitionFields,
     Config,
 ):
     """Fields of a recipe's `federation`."""
@@ -51,6 +54,7 @@ class FederationFields(
 @dataclass(frozen=True)
 class StageRows(
     GroupRow,
+    PartitionRow,
 ):
     """Rows of a stage's result."""
 
@@ -74,6 +78,7 @@ ARM_CHECKS = (
     "flcav.runs.extras.groups.checks:check_groups",
     "flcav.runs.extras.lifelong.checks:check_conditions",
     "flcav.runs.extras.distillation.checks:check_averaged",
+    "flcav.runs.extras.partition.samples:check_partition",
 )
 # called with recipe and `Federation`: return how many vehicles a plan may call, or None
 CALLS = ("flcav.runs.extras.groups.checks:count_called",)
@@ -85,6 +90,9 @@ SOURCES: Mapping[str, Mapping[str, Any]] = {
 }
 # called with a step's work, settings and `Labelling`: return samples that are labelled anew, or None
 LABELLERS = ("flcav.runs.extras.distillation.labelling:label_by_average",)
+# called in stages II and III with a step's work, settings, `RegionInputs` and labelled samples by vehicle: return these
+# as they are dealt to the vehicles, and rows of the stage's result
+DEALS = ("flcav.runs.extras.partition.samples:deal_region",)
 # called with settings of a federation and `Learning`: return the latter with another loss, or None
 LOSSES = ("flcav.runs.extras.distillation.labelling:choose_distillation",)
 # called with the drives of regions, `Sensors`, settings of averaging and configuration of the network: return the size
@@ -104,7 +112,10 @@ RESULTS = ("flcav.runs.extras.lifelong.results:collect_lifelong",)
 # called with `Graph`, task, rounds of stage II and times of a step and of a tested frame [s]: return further seconds
 FORECASTS = ("flcav.runs.extras.lifelong.steps:forecast_lifelong_s",)
 # called with a `Run`: return a `PageSection` of its page, or None
-SECTIONS = ("flcav.runs.extras.lifelong.results:describe_lifelong",)
+SECTIONS = (
+    "flcav.runs.extras.partition.section:describe_partitions",
+    "flcav.runs.extras.lifelong.results:describe_lifelong",
+)
 
 
 @dataclass(frozen=True)

@@ -106,6 +106,7 @@ def read_csv(path: Path | str | BinaryIO, texts: Sequence[str] = (), origin: str
     the file is missing or not a table, or where two columns have the same name.
     """
     named = origin or str(path)
+    written = csv.ConvertOptions(column_types=dict.fromkeys(texts, pa.string()), null_values=[""])
     if isinstance(path, Path | str):
         check_is_file(Path(path))
     try:

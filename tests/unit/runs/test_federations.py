@@ -14,6 +14,7 @@ from line_task import LineTask, Slope
 from safetensors.numpy import load_file
 
 from flcav.config import InputError
+from flcav.federation.exchange import ClientFailed
 from flcav.federation.privacy import account_epsilon
 from flcav.federation.rules import Rules
 from flcav.federation.strategies import FEDAVG
@@ -25,12 +26,13 @@ from flcav.perception.client import TaskClient
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
-from flcav.perception.weights import to_arrays
+from flcav.perception.weights import from_arrays, to_arrays
 from flcav.runs.arms import check_federations, find_strategies
+from flcav.runs.driving import DrivenStage
 from flcav.runs.recipe import Federation, Training
-from flcav.runs.results.saved import WEIGHTS
+from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.results.training import StatisticsScore
-from flcav.runs.stages.rounds import RegionStart
+from flcav.runs.stages.rounds import RegionStart, federate_stage
 from flcav.runs.training.checkpoints import round_path
 from flcav.runs.training.learning import (
     Learning,
@@ -386,3 +388,77 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)
     assert noted[-1].endswith(f"epsilon {fifth:.2f} at delta 1e-05")
     assert (cloud(5), edge(9, 6)) == (0, 0)  # it affords no cloud round of five edge rounds, and nothing more
+
+
+class Explodes:
+    """A client whose weights count the rounds, and whose loss is what is given for each; None: no finite update."""
+
+    def __init__(self, losses: list[float | None]) -> None:
+        self.losses = losses
+
+    def train(self, weights: Weights, **how: Any) -> LocalUpdate:
+        number = round(float(weights["bias"][0]))  # of the rounds before
+        loss = self.losses[number]
+        moved = {name: np.full_like(array, np.nan if loss is None else number + 1) for name, array in weights.items()}
+        return LocalUpdate(moved, 1, loss or 0.0)
+
+
+@pytest.mark.parametrize(
+    ("losses", "rounds", "kept"),
+    [
+        ([0.8, 0.7, 0.6, 2945961.0, 1.0], 4, 2),  # round 3 began with the weights after round 2, and was sound
+        ([0.8, 50.0, 1.0, 1.0, 1.0], 2, 0),  # of the first weights alone a sound loss is known
+        ([0.8, 0.7, None, 1.0, 1.0], 2, 1),  # no update of the third round is finite
+        ([0.8, 0.7, 0.6, 9.9, 1.0], 5, None),
+    ],
+)
+def test_a_training_that_diverges_stops_and_keeps_the_last_weights_known_to_be_sound(
+    losses: list[float | None], rounds: int, kept: int | None, tmp_path: Path
+) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1, average_rounds=1, start_share=0.0), 3)
+    network, notes = learning.build_network(), []
+    from_arrays(network, {name: np.zeros_like(array) for name, array in to_arrays(network).items()})
+    clients: Any = {f"a/cav{i}": Explodes(losses) for i in range(2)}
+
+    def report(done: int, total: int, note: str = "") -> None:
+        notes.append(note)
+
+    def end() -> tuple[tuple[float | None, ...], int | None]:
+        book = Ledger(LinkMegabytes(1.0, 1.0))
+        how = (learning.schedule(5, 1, "edge", "a"), FEDAVG, 0, book, tmp_path, report)
+        return federate_stage(edge_federation(learning, network, clients, *how), DrivenStage(Rules(), {}))
+
+    assert end() == (tuple(losses[:rounds]), kept)
+    reached = float(to_arrays(load_stage_network(learning.task, tmp_path))["bias"][0])
+    assert reached == (rounds if kept is None else kept)
+    told = [note for note in notes if "diverges and stops" in note]
+    assert len(told) == (kept is not None)
+    if kept is not None:
+        assert told[0].endswith(f"after round {kept}" if kept else "that it began with")
+    (tmp_path / LEDGER).unlink()  # as if it was killed before it ended
+    assert end() == (tuple(losses[:rounds]), kept)  # no further round is begun
+    assert float(to_arrays(load_stage_network(learning.task, tmp_path))["bias"][0]) == reached
+
+
+def test_a_later_stage_diverges_by_the_loss_that_stage_two_began_with(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1, start_share=0.0), 3)
+    network = learning.build_network()
+    from_arrays(network, {name: np.zeros_like(array) for name, array in to_arrays(network).items()})
+    clients: Any = {"a/cav0": Explodes([50.0, 50.0])}
+    ends = {}
+    for first in (None, 0.5):
+        book, folder = Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / str(first)
+        how = (learning.schedule(2, 1, "more_edge", "a"), FEDAVG, 3, book, folder, ignore_progress)
+        federation = replace(edge_federation(learning, network, clients, *how), first_loss=first)
+        ends[first] = federate_stage(federation, DrivenStage(Rules(), {}))
+    assert ends == {None: ((50.0, 50.0), None), 0.5: ((50.0,), 0)}
+
+
+def test_updates_that_are_not_finite_in_the_first_round_are_an_error(tmp_path: Path) -> None:
+    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1), 3)
+    network = learning.build_network()
+    from_arrays(network, {name: np.zeros_like(array) for name, array in to_arrays(network).items()})
+    how = (learning.schedule(2, 1, "edge", "a"), FEDAVG, 0, Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
+    clients: Any = {"a/cav0": Explodes([None])}
+    with pytest.raises(ClientFailed, match="values that are not finite"):
+        federate_edge(edge_federation(learning, network, clients, *how), Rules())

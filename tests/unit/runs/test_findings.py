@@ -3,18 +3,20 @@
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
+from flcav.runs.analysis.caveats import list_cut, list_diverged
 from flcav.runs.analysis.findings import findings
 from flcav.runs.analysis.histories import gap_closed, gaps_closed
 from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.runs.results import tests as results
-from flcav.runs.results.plans import Placed, Plan
+from flcav.runs.results.plans import Placed, Plan, TaskPlan
 from flcav.runs.results.run import ArmResult
 from flcav.runs.results.tests import Difference
-from flcav.runs.results.training import diverges
+from flcav.runs.results.training import StageResult, diverges
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.seeds import SharedScenes, mean_over_seeds
 from flcav.statistics.verdicts import ESTIMATE, HELD, NOT_HELD, UNDECIDED
@@ -222,3 +224,22 @@ def test_gaps_are_closed_of_every_stage_where_there_is_an_oracle() -> None:
 )
 def test_a_training_diverges_where_its_loss_is_far_above_the_first(losses: Sequence[float | None], expected: bool):
     assert diverges(losses) is expected
+
+
+def test_a_training_that_stopped_is_told_and_not_laid_on_the_privacy_budget() -> None:
+    from test_run_recipe import parsed
+
+    about: Any = {"task": "objects", "samples": 9, "clients": 3, "poles": ()}
+    stopped = StageResult(EDGE, region="grid", rounds=4, losses=(0.8, 0.7, 0.6, 2945961.0), kept=2, **about)
+    left_out = StageResult(CLOUD, region=None, rounds=0, **about)
+    own = TaskPlan(320, 6, 3, 216.0, 128.1, 0.37, 1.35, {})
+    ruined = {MAIN: replace(arm(), plan=Plan("joint", {"objects": own}), stages=(stopped, left_out))}
+    assert list_diverged(ruined) == (
+        "the training diverged: objects in stage II of 'main' on grid, its loss went from 0.8 to 2.95e+06; it stopped "
+        "in round 4, and has the weights after round 2; no rounds follow",
+    )
+    settings = resolve_settings(parsed(federation={"privacy": {"epsilon": 8}}), {"objects": "road"})
+    assert list_cut(ruined, settings) == ()
+    short = replace(stopped, losses=(0.8,) * 4, kept=None)
+    assert list_diverged({MAIN: replace(ruined[MAIN], stages=(short, left_out))}) == ()
+    assert len(list_cut({MAIN: replace(ruined[MAIN], stages=(short, left_out))}, settings)) == 2

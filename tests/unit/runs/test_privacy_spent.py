@@ -2,16 +2,19 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from dp_accounting import GaussianDpEvent, rdp
 
 from flcav.config import InputError
-from flcav.federation.privacy import SEEDED, Privacy
+from flcav.federation.privacy import SEEDED, Privacy, add_noise, measure_round_noise
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
 from flcav.runs.analysis.collect import list_trainings
 from flcav.runs.arms import name_repeat
+from flcav.runs.forecast import measure_noise
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, RunRecipe
 from flcav.runs.results.training import PrivacySpent, StageResult
 from flcav.runs.stages.graph import Graph
@@ -109,3 +112,59 @@ def test_a_budget_alone_gives_one_noise_for_all_regions() -> None:
     assert spent is not None
     assert spent.epsilon <= 6
     assert spent.describe().endswith(f"at delta 1e-05, noise {few.noise:g} x clip")
+
+
+@pytest.mark.parametrize(("where", "clients"), [("central", 3), ("local", 4)])
+def test_the_noise_of_a_round_is_as_long_as_the_noise_that_is_drawn(where: Any, clients: int) -> None:
+    privacy = Privacy(where=where, noise=0.7, clip=0.5, seeded=True)
+    nothing = {"a": np.zeros((300, 100)), "b": np.zeros(2000)}
+    drawn = [add_noise(nothing, privacy, seed, None) for seed in range(clients if where == "local" else 1)]
+    length = math.sqrt(sum(float(np.square(sum(each[name] for each in drawn)).sum()) for name in nothing))
+    found = measure_round_noise(privacy, clients, 32_000)
+    assert found.norm == pytest.approx(length, rel=0.02)
+    assert found.most == clients * 0.5
+
+
+def test_noise_that_is_longer_than_the_updates_is_warned_of() -> None:
+    ruinous = measure_round_noise(Privacy(noise=1.81), 3, 162_540)
+    assert ruinous.drowns
+    assert ruinous.describe().startswith(
+        "WARNING: noise of a round 730 over 162,540 values, beside 3 at most of the clipped updates of 3 vehicles: 243 "
+    )
+    faint = measure_round_noise(Privacy(noise=0.005), 3, 162_540)
+    assert not faint.drowns
+    assert faint.describe() == (
+        "noise of a round 2.02 over 162,540 values, beside 3 at most of the clipped updates of 3 vehicles"
+    )
+
+
+@pytest.mark.parametrize(
+    ("federation", "clients", "values"),
+    [
+        ({}, 3, 61_836),
+        ({"selection": {"rule": "poisson", "probability": 0.5}}, 1.5, 61_836),
+        ({"upload": {"layers": ["*bias*"]}}, 3, 6 + 16 + 120 + 84 + 8),  # of the layers of LeNet-5
+        ({"strategy": {"fedbuff": {"buffer": 2}}, "network": {}}, 2, 61_836),
+    ],
+)
+def test_a_forecast_counts_the_values_that_are_sent_and_the_vehicles_of_a_round(
+    federation: Any, clients: float, values: int, tmp_path: Path
+) -> None:
+    recipe = RunRecipe.model_validate(
+        {
+            "tasks": {"weather": {"plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}, "train_s": 1.0}},
+            "regions": {
+                "suburb": {"role": "pretrain"},
+                "grid": {"role": "federate", "vehicles": 5},
+                "ring": {"role": "federate", "vehicles": 3},
+            },
+            "budgets_mb": {"wireless": 90, "wireline": 90},
+            "placement": {"rule": "none"},
+            "federation": {"privacy": PRIVACY, **federation},
+        }
+    )
+    graph = Graph(recipe, tmp_path)
+    arm = graph.settings[MAIN]
+    found = measure_noise(graph, arm, "weather", arm.federation)
+    assert found is not None
+    assert (found.clients, found.values) == (clients, values)

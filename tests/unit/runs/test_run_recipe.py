@@ -81,6 +81,13 @@ ARM = {"placement": {"rule": "densest"}}
         ({"arms": {"x": {"labels": {"signs": "annotated"}}}}, "arms.x.labels: 'signs' is none of objects"),
         ({"arms": {"x": {"stages": ["cloud"]}}}, "must be [edge], [edge, cloud] or [edge, more_edge]"),
         ({"placement": {"tasks": ["signs"]}}, "'signs' is none of the run's tasks: objects"),
+        (
+            {"recording": {"grid": {"weather": "fog"}}},
+            "recording.grid: 'grid' is one of the regions; write regions.grid.recording",
+        ),
+        ({"recording": {"objects": {}}}, "recording.objects: 'objects' is one of the tasks; write tasks.objects.rec"),
+        ({"training": {"objects": {"steps": 9}}}, "'objects' is one of the tasks; write tasks.objects.training"),
+        ({"recording": {"fog": {}}}, "unknown field 'recording.fog'; known fields: cal"),
         ({"size": "huge"}, "'toy', 'demo' or 'full'"),
         ({"rounds": 3}, "unknown field 'rounds'; known fields: arms, budgets_mb"),
     ],

@@ -11,6 +11,7 @@ from flcav.runs.results.training import StageResult, diverges
 from flcav.world.map.town import HILLY
 
 STAGES = {EDGE: "stage II", CLOUD: "stage III", MORE_EDGE: "further edge rounds", CENTRAL: "centralised training"}
+DIVERGING = "the training diverged"
 PLACED_BARE = "vehicles send the places of their errors as they are: neither noise nor masks cover the error registry"
 
 
@@ -58,9 +59,15 @@ def list_diverged(arms: Mapping[str, ArmResult]) -> tuple[str, ...]:
             losses = (first.get(stage.task), *stage.losses) if stage.stage == CLOUD else stage.losses
             first.setdefault(stage.task, next((loss for loss in losses if loss is not None), None))
             known = [loss for loss in losses if loss is not None]
-            if diverges(losses):
+            if diverges(losses) or stage.kept is not None:
                 at = f"{stage.task} in {_name_stage(name, stage)}"
-                found.append(f"the training diverged: {at}, its loss went from {known[0]:.3g} to {known[-1]:.3g}")
+                told = f"{DIVERGING}: {at}, its loss went from {known[0]:.3g} to {known[-1]:.3g}"
+                if stage.kept is not None:
+                    weights = f"after round {stage.kept}" if stage.kept else "that it began with"
+                    told += f"; it stopped in round {stage.rounds}, and has the weights {weights}"
+                    further = any(each.stage in (CLOUD, MORE_EDGE) for each in arm.stages)
+                    told += "; no rounds follow" if stage.stage == EDGE and further else ""
+                found.append(told)
     return tuple(found)
 
 
@@ -72,7 +79,8 @@ def list_cut(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> 
         for stage in arm.stages if privacy is not None and privacy.epsilon is not None else ():
             plan = arm.plan.tasks[stage.task]
             planned = plan.cloud_rounds if stage.stage == CLOUD else plan.edge_rounds
-            if stage.stage in (EDGE, CLOUD) and stage.rounds < planned:
+            stopped = any(each.kept is not None for each in arm.stages if each.task == stage.task)
+            if stage.stage in (EDGE, CLOUD) and stage.rounds < planned and not stopped:
                 at = _name_stage(name, stage)
                 found.append(f"privacy affords {stage.rounds} of {planned} planned rounds of {stage.task} in {at}")
     return tuple(found)

@@ -132,6 +132,7 @@ class _StageFigures(Saved):
     labels: Annotated[tuple[LabelQuality, ...] | None, LEFT_OUT] = None  # before each round; None: not measured
     noise: Annotated[float | None, LEFT_OUT] = None  # that the privacy budget gave for the planned rounds; None: none
     statistics: Annotated[tuple[StatisticsScore, ...] | None, LEFT_OUT] = None  # of stage III; None: not asked for
+    kept: Annotated[int | None, LEFT_OUT] = None  # round whose weights it keeps, since it diverged; None: the last
 
 
 @dataclass(frozen=True)
@@ -148,6 +149,16 @@ def diverges(losses: Sequence[float | None]) -> bool:
     """Return whether the last known loss of a training is no number, or `DIVERGED` times the first, and 1, or more."""
     known = [loss for loss in losses if loss is not None]
     return bool(known) and (not np.isfinite(known[-1]) or known[-1] > DIVERGED * max(known[0], 1.0))
+
+
+def last_sound_round(losses: Sequence[float | None]) -> int:
+    """Return the round after which the weights of a training that diverges were last known to be sound; 0: none.
+
+    They are those that the last round began with whose loss is known and does not diverge.
+    """
+    numbers = range(1, len(losses) + 1)
+    sound = [number for number in numbers if losses[number - 1] is not None and not diverges(losses[:number])]
+    return max(sound[-1] - 1 if sound else len(losses) - 1, 0)
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,12 @@ from flcav.runs.driving import DrivenStage, join_regions
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import CLOUD, EDGE, MORE_EDGE, Federation
-from flcav.runs.registry import CONDUCTS, COUNTS, DRIVES, load_all
+from flcav.runs.registry import CONDUCTS, COUNTS, DEALS, DRIVES, load_all
 from flcav.runs.results.plans import Plan, TaskPlan
 from flcav.runs.results.training import StageResult, StatisticsScore
 from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.regions import (
+    LabelledSamples,
     RenewedSamples,
     choose_loss,
     drive_region,
@@ -131,7 +132,7 @@ def federate_step(
     where = Whereabouts(runtime, processes, fleet, settings.vehicles, bool(timed))
     held = [name for own in labelled.values() for name in own.samples if len(own.samples[name])]
     with where.reach(held) as reached:
-        conduct, samples = Conduct(), {region: own.samples for region, own in labelled.items()}
+        conduct, (samples, dealt) = Conduct(), _deal(work, settings, labelled)
         if isinstance(settings, EdgeSettings) and settings.stage == EDGE:
             about = (work, settings, labelled[first.region], book, plan, reached.deployed)
             conduct = next((found for call in load_all(CONDUCTS) if (found := call(*about)) is not None), conduct)
@@ -145,7 +146,7 @@ def federate_step(
         if isinstance(settings, EdgeSettings):
             conduct = conduct.foresee(driven.records.get(first.region, ()), first.region)
             federation = replace(federation, conduct=conduct)
-        losses = federate_stage(federation, driven, reached)
+        losses, kept = federate_stage(federation, driven, reached)
         rows = conduct.report(work, settings, federation.schedule.rounds, reached.deployed)
     labels, clients = None, [client for own in federation.regions.values() for client in own.clients.values()]
     if settings.scored and settings.stage == EDGE and clients:
@@ -164,8 +165,22 @@ def federate_step(
         labels=labels,
         noise=noise,
         statistics=_score_statistics(work, settings, federation.learning) if settings.stage == CLOUD else None,
+        kept=kept,
+        **dealt,
         **rows,
     ).save(work.folder)
+
+
+def _deal(
+    work: Work, settings: StageSettings, labelled: Mapping[str, LabelledSamples]
+) -> tuple[dict[str, Mapping[str, Sequence[Any]]], dict[str, Any]]:
+    """Return the samples of each region's vehicles, by region, as extras deal them, and rows of the stage's result."""
+    samples, rows = {region: own.samples for region, own in labelled.items()}, dict[str, Any]()
+    for deal in load_all(DEALS):
+        for region, inputs in settings.regions.items():
+            samples[region], found = deal(work, settings, inputs, samples[region])
+            rows |= found
+    return samples, rows
 
 
 def _name_messages(settings: StageSettings) -> str:
@@ -204,9 +219,11 @@ def _find_noise(work: Work, settings: StageSettings, plan: Plan) -> float | None
     return find_budget_noise(settings.federation, _plan_private(settings, plan).rules)
 
 
-def _count_rounds(settings: StageSettings, plan: Plan, conduct: Conduct) -> int:
-    """Return the planned rounds of the stage, as many as privacy affords."""
+def _count_rounds(settings: StageSettings, plan: Plan, conduct: Conduct, before: Sequence[StageResult]) -> int:
+    """Return the planned rounds of the stage, as many as privacy affords; none after a stage II that diverged."""
     own = plan.tasks[settings.learning.task]
+    if any(each.kept is not None for each in before):
+        return 0
     if isinstance(settings, CloudSettings):
         return own.cloud_rounds
     if settings.stage == MORE_EDGE:
@@ -227,11 +244,14 @@ def _open_federation(
     learning, strategies = choose_loss(work, settings, first.pretrain), Strategies(*find_strategies(how))
     began = first.pretrain if cloud else first.edge or first.pretrain
     network = load_stage_network(learning.task, work.inputs[began])
-    rounds, starts = _count_rounds(settings, plan, conduct), dict[str, RegionStart]()
+    before = {
+        name: StageResult.load(work.inputs[own.edge]) for name, own in settings.regions.items() if own.edge is not None
+    }
+    rounds, starts = _count_rounds(settings, plan, conduct, [*before.values()]), dict[str, RegionStart]()
     for region, inputs in settings.regions.items():
         clients = make_clients(learning, network.config, samples[region])
         weights = to_arrays(load_stage_network(learning.task, work.inputs[inputs.edge or inputs.pretrain]))
-        earlier, own = 0 if inputs.edge is None else StageResult.load(work.inputs[inputs.edge]).rounds, samples[region]
+        earlier, own = before[region].rounds if region in before else 0, samples[region]
         if inputs.edge is not None and rounds and isinstance(own, RenewedSamples):
             own.renew(1, weights)
         starts[region] = RegionStart(clients, weights, earlier, how.edge_rounds_per_cloud_round if cloud else 1)
@@ -242,6 +262,7 @@ def _open_federation(
     restart = how.cloud_rate if cloud else None
     start_share = 0.0 if earlier else learning.training.start_share
     relabel = samples[first.region] if settings.stage == EDGE else None
+    losses = [loss for each in before.values() for loss in each.losses[:1] if loss is not None]
     return StageFederation(
         learning=learning,
         network=network,
@@ -259,6 +280,7 @@ def _open_federation(
         else {name: Frames.open(work.inputs[step]) for name, step in settings.validation.items()},
         relabel=relabel.renew if isinstance(relabel, RenewedSamples) else None,
         conduct=conduct,
+        first_loss=max(losses, default=None),
     )
 
 

@@ -5,7 +5,7 @@ Both stages end with weights and a ledger in their folder, by way of checkpoints
 
 import contextlib
 import shutil
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -161,6 +161,7 @@ class StageFederation:
     validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
     relabel: BeforeRound | None = None  # changes the clients' labels before each round of stage II
     conduct: Conduct = field(default_factory=Conduct)  # of the rounds of stage II
+    first_loss: float | None = None  # of stage II, where it is over: a training diverges by it
 
     def afford(self, rules: Rules, rounds: int, buffers: Mapping[str, Buffers]) -> int:
         """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
@@ -265,8 +266,14 @@ class Whereabouts:
 
 def federate_stage(
     own: StageFederation, driven: DrivenStage, where: Whereabouts = Whereabouts()
-) -> tuple[float | None, ...]:
+) -> tuple[tuple[float | None, ...], int | None]:
     """Run the rounds of a stage, write weights and ledger, and return the mean training loss of each round.
+
+    Where the training diverges, it stops with the weights of the last sound round, whose number is returned as well;
+    None: the weights are those of the last round.
+
+    Where the training diverges, it stops with the weights of the last round that were sound, whose number is returned,
+    too; None: those of the last round.
 
     Rounds are as the radio network has `driven` them: vehicles that it loses are lost in theirs, and the cloud's rounds
     need all edge servers. A privacy budget may end them before the schedule's end, and of asynchronous rounds each
@@ -290,6 +297,7 @@ def federate_stage(
         schedule.rounds,
         rules.privacy,
         own.score if own.validation else None,
+        own.first_loss,
     )
     start, done = checkpoints.resume(to_arrays(own.network))
     named = {EDGE if cloud is None else f"{EDGE}/{region}": each for region, each in own.regions.items()}
@@ -302,8 +310,8 @@ def federate_stage(
     far = where.deployed and where.deployed.beside(within)
     own.conduct.resume(own.folder, clients, far, wireless, done)
     opened = contextlib.nullcontext(far) if far else open_runtime(where.runtime, clients, where.processes)
-    with checkpoints.refusals(), opened as runtime, contextlib.suppress(RoundsOver):
-        if own.conduct.over:
+    with checkpoints.refusals(), opened as runtime, checkpoints.divergence(), contextlib.suppress(RoundsOver):
+        if own.conduct.over or checkpoints.kept is not None:
             raise RoundsOver
         servers = {} if cloud is None else own.open_servers(driven, wireless, done, states, runtime)
         keep = partial(_keep_round, own, servers, state, checkpoints)
@@ -318,8 +326,8 @@ def federate_stage(
             own.conduct.run(run, start, wireless, keep, state, done)
     losses = checkpoints.finish(own.network, learning.training.average_rounds, own.start_share)
     if cloud is not None and rules.personal:
-        _save_regional_models(learning, own.folder, states)
-    return losses
+        _save_regional_models(learning, own.folder, {} if checkpoints.kept is not None else states, own.regions)
+    return losses, checkpoints.kept
 
 
 def _lay_out(
@@ -376,13 +384,15 @@ def _keep_round(
         keep_statistics(server.trained, own.folder, region)
     personal = [each.state.personal for each in regions if each.state.personal and each.rules.personal_arrays]
     checkpoints.save(number, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
-    if own.conduct.over:
+    if own.conduct.over or checkpoints.kept is not None:
         raise RoundsOver
 
 
-def _save_regional_models(learning: Learning, folder: Path, states: Mapping[str, FederationState]) -> None:
-    """Write each region's personal model: the common weights with the arrays that its edge server keeps."""
-    for region, own in states.items():
+def _save_regional_models(
+    learning: Learning, folder: Path, states: Mapping[str, FederationState], regions: Iterable[str]
+) -> None:
+    """Write each region's personal model: the common weights with the arrays that its edge server keeps, if any."""
+    for region in regions:
         model = load_stage_network(learning.task, folder)
-        from_arrays(model, {**to_arrays(model), **own.personal})
+        from_arrays(model, {**to_arrays(model), **(states[region].personal if region in states else {})})
         save_network(learning.task, model, folder / regional_weights(region))

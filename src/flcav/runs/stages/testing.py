@@ -107,7 +107,8 @@ def rounds_step(work: Work, settings: RoundsSettings) -> None:
     networks = {0: start}
     if settings.stage != PRETRAIN:
         how = (settings.averaged, settings.share)
-        numbers = range(1, StageResult.load(folder).rounds + 1)
+        result = StageResult.load(folder)
+        numbers = range(1, (result.rounds if result.kept is None else result.kept) + 1)
         networks = {each: load_round_network(task, start, folder, each, *how) for each in numbers}
     rounds = []
     for number, network in networks.items():

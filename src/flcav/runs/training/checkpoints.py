@@ -20,6 +20,7 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file, save
 
 from flcav.config import InputError, Json, read_json
+from flcav.federation.exchange import Diverged
 from flcav.federation.privacy import Privacy, Secret
 from flcav.federation.state import FederationState, RoundRecord, describe_empty, describe_failures
 from flcav.federation.strategies.fedavg import average
@@ -29,7 +30,7 @@ from flcav.network.ledger import BudgetExceeded, Ledger
 from flcav.perception.task import ConfigT, NetworkT, SampleT, Task
 from flcav.perception.weights import from_arrays, save_network, to_arrays
 from flcav.runs.results.saved import LEDGER, WEIGHTS
-from flcav.runs.results.training import PrivacySpent, diverges
+from flcav.runs.results.training import PrivacySpent, diverges, last_sound_round
 from flcav.storage.files import flush_all, sha256, write_bytes, write_in_pieces, write_json
 from flcav.storage.records import Record
 
@@ -49,11 +50,13 @@ class FederationCheckpoints:
     rounds: int = 0  # of the federation, told with each
     privacy: Privacy | None = None  # of the updates, whose delta is told with epsilon
     score: Callable[[int], Mapping[str, float]] | None = None  # on validation frames after a round, by region
+    first_loss: float | None = None  # of the stage before, which a training is judged by; None: of its own first round
     losses: list[float | None] = field(default_factory=list)  # of each round
     scores: list[Mapping[str, float]] = field(default_factory=list)
     _hashes: dict[str, str] = field(default_factory=dict)  # of the files of weights, by name
     _told: dict[str, int] = field(default_factory=dict)  # of how many records failures were told, by state
     _goes_on: bool = False  # after rounds that were carried out before, to an end that it has not reached
+    _broken: bool = False  # whether the round after these gave updates that are not finite
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
         """Return the last round's weights, in the order of `weights`, and number, restoring ledger, losses and states.
@@ -117,6 +120,28 @@ class FederationCheckpoints:
                 remove_secrets(self.folder, used=used)
             raise
 
+    @property
+    def kept(self) -> int | None:
+        """Return the round whose weights are kept, since the training diverges; None: the last."""
+        before = [] if self.first_loss is None else [self.first_loss]
+        losses = [*before, *self.losses]
+        return max(last_sound_round(losses) - len(before), 0) if self._broken or diverges(losses) else None
+
+    @contextlib.contextmanager
+    def divergence(self) -> Iterator[None]:
+        """Stop the federation where, after a round or more, the clients' updates are no longer finite, and say so."""
+        try:
+            yield
+        except Diverged as error:
+            if not self.losses:
+                raise
+            self._broken = True
+            self.report(len(self.losses), self.rounds, f"{error}: {self._tell_divergence()}")
+
+    def _tell_divergence(self) -> str:
+        at = f"after round {self.kept}" if self.kept else "that it began with"
+        return f"the training diverges and stops, with the weights {at}"
+
     def save(self, round_: int, weights: Weights, loss: float | None) -> None:
         """Save the checkpoint after a round, and report its loss, privacy, scores and failures."""
         self.losses.append(loss)
@@ -134,7 +159,7 @@ class FederationCheckpoints:
         for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
             (self.folder / name).unlink(missing_ok=True)
         note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
-        note += ["the training diverges"] if diverges(self.losses) else []
+        note += [self._tell_divergence()] if self.kept is not None else []
         note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self.score else {}).items()]
         self.report(round_, self.rounds, ", ".join([*note, *self._tell_failures()]))
 
@@ -163,9 +188,10 @@ class FederationCheckpoints:
     def finish(self, start: Any, averaged: int, start_share: float = 0.0) -> tuple[float | None, ...]:
         """Write the ledger and the final weights, see `load_round_network`; return the loss of each round.
 
-        Without rounds the weights are those of `start`. Secrets are removed.
+        Without rounds the weights are those of `start`; where the training diverges, those of the last sound round.
+        Secrets are removed.
         """
-        network, rounds = start, len(self.losses)
+        network, rounds = start, len(self.losses) if self.kept is None else self.kept
         if rounds:
             network = load_round_network(self.task, start, self.folder, rounds, averaged, start_share)
         save_network(self.task, network, self.folder / WEIGHTS)
