@@ -272,9 +272,6 @@ def federate_stage(
     Where the training diverges, it stops with the weights of the last sound round, whose number is returned as well;
     None: the weights are those of the last round.
 
-    Where the training diverges, it stops with the weights of the last round that were sound, whose number is returned,
-    too; None: those of the last round.
-
     Rounds are as the radio network has `driven` them: vehicles that it loses are lost in theirs, and the cloud's rounds
     need all edge servers. A privacy budget may end them before the schedule's end, and of asynchronous rounds each
     budget. Where rules make arrays personal, the weights have the mean of the regions' arrays, and each region's model
