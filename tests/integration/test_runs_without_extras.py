@@ -56,7 +56,8 @@ def work(tmp_path_factory: pytest.TempPathFactory) -> Path:
     asked["regions"]["grid"]["vehicles"] = 2
     asked["tasks"]["objects"] |= {"history": None, "plan": {"samples": 2, "edge_rounds": 1, "cloud_rounds": 1}}
     asked |= {"training": {"steps": 2, "local_steps": 1}, "retrainings": 0, "horizon_s": None, "primary_claims": []}
-    asked["federation"].pop("requests")
+    for field in ("requests", "partition"):
+        asked["federation"].pop(field)
     for arm in asked["arms"].values():
         arm.pop("distillation")
     (folder / "recipe.yaml").write_text(json.dumps(asked))
