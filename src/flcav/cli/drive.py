@@ -48,6 +48,7 @@ def drive(
     from flcav.driving.driver import DriverSettings
     from flcav.driving.jobs import DriveJob, Sensed, run_jobs
     from flcav.driving.loop import Loop
+    from flcav.driving.measures import describe_drives
     from flcav.driving.scenarios import find_scenarios
     from flcav.driving.studies.error_measurement import measure_errors
     from flcav.driving.studies.pole_gain import measure_pole_gain
@@ -66,7 +67,7 @@ def drive(
         raise InputError("--pole: needs scenarios of one town, --scenario")
     if measure is not None:
         check_writable(measure.parent)
-    model = read_model(perception, errors)
+    sensed = Sensed(perception.value, read_model(perception, errors))
     loop = Loop(DriverSettings(margin, sigmas), lasts)
     if measure is not None:
         with show_progress("measure") as report:
@@ -83,9 +84,9 @@ def drive(
         return
     with show_progress("drive") as report:
         tasks = [DriveJob(each, seed, loop=loop) for each in chosen for seed in numbers]
-        drives = run_jobs(tasks, Sensed(perception.value, model), jobs, report)
-    yield {"drives": [own.as_json() for own in drives]}
+        drives = run_jobs(tasks, sensed, jobs, report)
+    yield {"perception": sensed.line(), "drives": [own.as_json() for own in drives]}
+    yield sensed.line()
     for own in drives:
         yield own.line()
-    faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
-    yield f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others"
+    yield describe_drives(drives)

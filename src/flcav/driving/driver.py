@@ -130,6 +130,10 @@ class Decision:
     controls: Controls
     acceleration: float  # that it wants [m/s^2]
     emergency: bool
+    cause: int | str | None = None  # what it slows for: the row of `Seen`, or the light; None on a free road
+
+
+Need = tuple[float, int | str | None]  # an acceleration [m/s^2], and its cause as in `Decision`
 
 
 def decide_controls(
@@ -139,11 +143,11 @@ def decide_controls(
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
     free = _follow(own.speed, wanted, FARTHEST_GAP_M, wanted)
-    needs = [free, _stop_at_light(route, own, seen, half, wanted)]
+    needs: list[Need] = [(free, None), _stop_at_light(route, own, seen, half, wanted)]
     margin = np.minimum(settings.margin_m + settings.sigmas * seen.spread, settings.most_m)
     occupied = find_occupied(route, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, margin)
     needs += _avoid(route, own, seen, occupied, half, wanted)
-    acceleration = min(needs)
+    acceleration, cause = min(needs, key=lambda need: need[0])
     emergency = acceleration < -EMERGENCY_MPS2
     if emergency:
         acceleration = -vehicle.brake_mps2
@@ -152,7 +156,7 @@ def decide_controls(
         pedal = -1.0  # stand still
     steer = _steer(route, own, vehicle)
     throttle, brake = float(np.clip(pedal, 0, 1)), float(np.clip(-pedal, 0, 1))
-    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency)
+    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency, cause)
 
 
 def find_speed(route: Route, own: EgoMotion, share: float) -> float:
@@ -190,7 +194,7 @@ def _halt(speed: float, wanted: float, gap_m: float) -> float:
     return _follow(speed, wanted, gap_m + STANDSTILL_M, 0.0)
 
 
-def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> float:
+def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> Need:
     """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
     for stop, link in route.stops:
         gap = stop - LINE_M - own.along - half_m
@@ -199,11 +203,11 @@ def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, want
         needed = own.speed**2 / (2 * max(gap, 0.1))
         if needed > (EMERGENCY_MPS2 - 0.5 if link in seen.amber else 8.0):
             continue
-        return _halt(own.speed, wanted, gap)
-    return np.inf
+        return _halt(own.speed, wanted, gap), link
+    return np.inf, None
 
 
-def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
+def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[Need]:
     """Return the acceleration for each road user that is, or is going to be, in the way."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
@@ -211,8 +215,8 @@ def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m:
     go = _cover(own.speed, wanted, GAIN_MPS2)
     keep = own.speed * TIMES_S
     meets = find_meeting(occupied, go, half_m) | find_meeting(occupied, keep, half_m)
-    needs = []
-    for row in np.flatnonzero(present):
+    needs: list[Need] = []
+    for row in np.flatnonzero(present).tolist():
         low = occupied.low[row]
         nearest = float(np.min(low))
         place = own.along + (float(low[0]) if np.isfinite(low[0]) else nearest)
@@ -220,18 +224,18 @@ def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m:
         same_way = along_mps > SAME_WAY * float(np.hypot(*seen.velocity[row])) and along_mps > 0.5
         if np.isfinite(low[0]) and occupied.high[row, 0] > 0:  # now in the corridor, and not behind
             if occupied.low[row, 0] > -half_m:
-                needs.append(_follow(own.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)))
+                needs.append((_follow(own.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)), row))
             continue
         if not meets[row].any():
             continue
         first = int(np.argmax(meets[row]))
         if same_way:
             gap = float(low[first]) - along_mps * float(TIMES_S[first]) - half_m
-            needs.append(_follow(own.speed, wanted, max(gap, 1.0), along_mps))
+            needs.append((_follow(own.speed, wanted, max(gap, 1.0), along_mps), row))
             continue
         gap = float(np.min(low[np.isfinite(low)])) - half_m
         if gap > 0:  # otherwise it is in the way already, and leaves it
-            needs.append(_halt(own.speed, wanted, gap - 1.0))
+            needs.append((_halt(own.speed, wanted, gap - 1.0), row))
     return needs
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from flcav.driving.errors import ErrorModel, sense_model
 from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, sense_truth
 from flcav.driving.measures import DriveResult
-from flcav.driving.networks import sense_networks
+from flcav.driving.networks import Networks, name_network, sense_networks
 from flcav.driving.scenarios import DrivingScenario, StagedScenario
 from flcav.driving.seen import Coupling, Perception, Without
 from flcav.interface.progress import Report, ignore_progress
@@ -30,6 +30,12 @@ class Sensed(Record):
                 raise ValueError("a modelled perception needs its model")
             return sense_model(self.model)
         return sense_networks if self.kind == "networks" else sense_truth
+
+    def line(self) -> str:
+        """Return what perceives, in words."""
+        if self.kind == "networks":
+            return f"perception: the networks {', '.join(map(name_network, Networks._fields))}"
+        return f"perception: {'a model of the errors of networks' if self.kind == 'model' else 'ground truth'}"
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,6 @@
 """The closed loop of perception, driver and world, at ten steps a second."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,7 +14,9 @@ from flcav.driving.measures import (
     DriveResult,
     Hit,
     judge_collision,
+    list_penalties,
     measure_ttc,
+    name_cause,
     score_drive,
 )
 from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
@@ -66,19 +69,23 @@ def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop
     now, along = world.snapshot, staged.start_m
     hits: list[Hit] = []
     ttc, speeds, hard, braking, reds = [], [], 0, False, 0
+    stood: Counter[str] = Counter()  # steps, by what the vehicle stood before
     for _ in range(round(loop.lasts_s / DT_S)):
         own = find_motion(now, route, along)
         staged.act(own.along, own.speed)
         now = world.snapshot
-        controls = decide_controls(route, own, perception.look(now), body, loop.driver).controls
+        seen = perception.look(now)
+        decision = decide_controls(route, own, seen, body, loop.driver)
         ttc.append(measure_ttc(route, own, truth.look(now), size))
-        before, now = now, world.step({EGO: controls})
+        before, now = now, world.step({EGO: decision.controls})
         after = find_motion(now, route, own.along)
         slowing = (own.speed - after.speed) / DT_S > HARD_MPS2
         hard, braking = hard + (slowing and not braking), slowing
         reds += _pass_red(route, own, after, size[0], now)
         along = after.along
         speeds.append(after.speed)
+        if after.speed < STANDS_MPS:
+            stood[name_cause(decision.cause, seen, before)] += 1
         kinds = dict(zip(now.trace.actor.tolist(), now.trace.category.tolist()))
         known = {hit.other for hit in hits}
         new = [
@@ -104,6 +111,8 @@ def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop
         red_lights=reds,
         hits=tuple(hits),
         score=score_drive(progress, hits, reds),
+        penalties=list_penalties(hits, reds),
+        stood_s={cause: round(steps * DT_S, 1) for cause, steps in stood.most_common()},
     )
 
 

@@ -27,6 +27,7 @@ from flcav.perception.trajectory.rasters import RoadMap, road_map
 from flcav.perception.weather.evaluate import predict_probabilities
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.samples import reduce_picture
+from flcav.perception.weights import find_shipped, read_card
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig, car, lidar32
@@ -60,6 +61,12 @@ class Networks(NamedTuple):
 def load_networks() -> Networks:
     """Return the networks of the package."""
     return Networks(*(resolve_network(task_named(name), None) for name in Networks._fields))
+
+
+@lru_cache(maxsize=len(Networks._fields))
+def name_network(task: str) -> str:
+    """Return the name of the package's network of a task, as in "objects (small)"."""
+    return f"{task} ({read_card(find_shipped(task_named(task))).network})"
 
 
 @lru_cache(maxsize=4)
@@ -153,7 +160,15 @@ class NetworkPerception:
         told = self._following.step(self.found, snapshot.time_s, closed)
         self.followed = told
         return Seen(
-            told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, WEATHER_SPEED[self.named]
+            told.boxes,
+            told.velocity,
+            told.path,
+            told.yaw,
+            told.spread,
+            closed,
+            amber,
+            WEATHER_SPEED[self.named],
+            name_network("objects"),
         )
 
     def name_weather(self, frame: Frame) -> str:
