@@ -68,7 +68,7 @@ def drive(
     if measure is not None:
         check_writable(measure.parent)
     sensed = Sensed(perception.value, read_model(perception, errors))
-    loop = Loop(DriverSettings(margin, sigmas), lasts)
+    loop = Loop(DriverSettings(margin, sigmas, passes=True), lasts)
     if measure is not None:
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)

@@ -6,19 +6,24 @@ the corridor is wide for vehicles of up to 12 m.
 
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
-corridor at the time at which the vehicle would be there. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
+corridor at the time at which the vehicle would be there. Around vehicles that stand it looks for a way
+(`passing`), if its settings allow it. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
 with all it has. Steering is pure pursuit (Coulter, CMU-RI-TR-92-01, 1992).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from shapely.geometry.base import BaseGeometry
 
+from flcav.driving.passing import CREEPS_MPS, SLIM_M, Line, find_standing, list_lines
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
+from flcav.storage.records import WHERE_TRUE
 from flcav.world.commands import Controls
 from flcav.world.dynamics.vehicle import BodyBlueprint
 from flcav.world.map.roads import Route
@@ -37,7 +42,7 @@ class Occupied(NamedTuple):
 
 
 def find_occupied(
-    route: Route, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
+    route: Line, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
 ) -> Occupied:
     """Return what footprints cover of the corridor of a vehicle that is `along` the route [m].
 
@@ -107,6 +112,7 @@ class DriverSettings:
     margin_m: float = 0.4
     sigmas: float = 0.0  # multiple of the standard deviation of predicted positions
     most_m: float = 3.0  # the margin is never more
+    passes: Annotated[bool, WHERE_TRUE] = False  # looks for a way around vehicles that stand
 
 
 DEFAULT = DriverSettings()
@@ -137,26 +143,73 @@ Need = tuple[float, int | str | None]  # an acceleration [m/s^2], and its cause 
 
 
 def decide_controls(
-    route: Route, own: EgoMotion, seen: Seen, vehicle: BodyBlueprint, settings: DriverSettings = DEFAULT
+    route: Route,
+    own: EgoMotion,
+    seen: Seen,
+    vehicle: BodyBlueprint,
+    settings: DriverSettings = DEFAULT,
+    lanes: BaseGeometry | None = None,
 ) -> Decision:
-    """Return the controls for the next tenth of a second."""
+    """Return the controls for the next tenth of a second; a way around is looked for in the area of the `lanes`."""
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
     free = _follow(own.speed, wanted, FARTHEST_GAP_M, wanted)
     needs: list[Need] = [(free, None), _stop_at_light(route, own, seen, half, wanted)]
     margin = np.minimum(settings.margin_m + settings.sigmas * seen.spread, settings.most_m)
-    occupied = find_occupied(route, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, margin)
-    needs += _avoid(route, own, seen, occupied, half, wanted)
-    acceleration, cause = min(needs, key=lambda need: need[0])
+
+    def judge(line: Line, kept: Array) -> Need:
+        occupied = find_occupied(line, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, kept)
+        return _least([*needs, *_avoid(line, own, seen, occupied, half, wanted)])
+
+    line, (acceleration, cause) = _choose_line(route, own, seen, vehicle, wanted, margin, judge, settings, lanes)
     emergency = acceleration < -EMERGENCY_MPS2
     if emergency:
         acceleration = -vehicle.brake_mps2
     pedal = acceleration / (GAIN_MPS2 * 2 if acceleration > 0 else vehicle.brake_mps2)
     if own.speed < 0.3 and acceleration <= 0.1:
         pedal = -1.0  # stand still
-    steer = _steer(route, own, vehicle)
+    steer = _steer(line, own, vehicle)
     throttle, brake = float(np.clip(pedal, 0, 1)), float(np.clip(-pedal, 0, 1))
     return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency, cause)
+
+
+def _least(needs: Sequence[Need]) -> Need:
+    return min(needs, key=lambda need: need[0])
+
+
+def _choose_line(
+    route: Route,
+    own: EgoMotion,
+    seen: Seen,
+    vehicle: BodyBlueprint,
+    wanted: float,
+    margin: Array,
+    judge: Callable[[Line, Array], Need],
+    settings: DriverSettings,
+    lanes: BaseGeometry | None,
+) -> tuple[Line, Need]:
+    """Return the route, or the line beside it on which the vehicle gets on best past who stands, and its need.
+
+    `judge` returns the least need on a line with a margin (N, T) around the road users.
+    """
+    here = judge(route, margin)
+    standing = find_standing(seen.velocity, seen.boxes.label)
+    if not settings.passes or lanes is None or not isinstance(here[1], int) or not standing[here[1]]:
+        return route, here
+    free = min(_approach_speed(own.speed, wanted), 0.5)
+    if here[0] > free:
+        return route, here
+    _, left = route.project(own.x, own.y, own.along)
+    ways: list[Line] = [route, *list_lines(route, own.along, left, own.speed, vehicle.size[1], lanes)]
+    full = [here, *(judge(line, margin) for line in ways[1:])]
+    for line, need in zip(ways, full):
+        if need[0] > free:
+            return line, need
+    slim = np.where(standing[:, None], np.minimum(margin, SLIM_M), margin)
+    creeps = _approach_speed(own.speed, CREEPS_MPS)
+    narrow = [judge(line, slim) for line in ways]
+    best = max(range(len(ways)), key=lambda i: (min(narrow[i][0], creeps), full[i][0]))
+    return ways[best], _least([narrow[best], (max(creeps, full[best][0]), full[best][1])])
 
 
 def find_speed(route: Route, own: EgoMotion, share: float) -> float:
@@ -207,7 +260,7 @@ def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, want
     return np.inf, None
 
 
-def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[Need]:
+def _avoid(route: Line, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[Need]:
     """Return the acceleration for each road user that is, or is going to be, in the way."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
@@ -246,7 +299,7 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: Route, own: EgoMotion, vehicle: BodyBlueprint) -> float:
+def _steer(route: Line, own: EgoMotion, vehicle: BodyBlueprint) -> float:
     """Return the share of the greatest steering angle (pure pursuit)."""
     aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
     ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)

@@ -19,6 +19,7 @@ from flcav.driving.measures import (
     name_cause,
     score_drive,
 )
+from flcav.driving.passing import join_lanes
 from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
 from flcav.driving.seen import EGO, Perception, TruePerception, read_lights
 from flcav.geometry import heading_vectors
@@ -67,6 +68,7 @@ def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop
     body = world.bodies.find(EGO).blueprint
     size = (body.size[0], body.size[1])
     now, along = world.snapshot, staged.start_m
+    lanes = join_lanes(staged.town) if loop.driver.passes else None
     hits: list[Hit] = []
     ttc, speeds, hard, braking, reds = [], [], 0, False, 0
     stood: Counter[str] = Counter()  # steps, by what the vehicle stood before
@@ -75,7 +77,7 @@ def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop
         staged.act(own.along, own.speed)
         now = world.snapshot
         seen = perception.look(now)
-        decision = decide_controls(route, own, seen, body, loop.driver)
+        decision = decide_controls(route, own, seen, body, loop.driver, lanes)
         ttc.append(measure_ttc(route, own, truth.look(now), size))
         before, now = now, world.step({EGO: decision.controls})
         after = find_motion(now, route, own.along)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
+from flcav.driving.following import CERTAIN, CONFIRMED, Confirmed, FollowedTracks, Following, PathSpread
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
@@ -126,15 +126,21 @@ class NetworkPerception:
     """Perception of a drive by the networks, from its sensors."""
 
     def __init__(
-        self, staged: StagedScenario, seed: int, *, spread: PathSpread = CERTAIN, road: RoadUnits | None = None
+        self,
+        staged: StagedScenario,
+        seed: int,
+        *,
+        spread: PathSpread = CERTAIN,
+        road: RoadUnits | None = None,
+        confirmed: Confirmed | None = CONFIRMED,
     ) -> None:
-        """Take a drive, its seed, how uncertain tracks are, and the poles that send what they find, if any."""
+        """Take a drive, its seed, how uncertain tracks are, poles that send what they find, and which tracks hold."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
         self.weather = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
         self.lights = LightReader(staged.town)
-        self._following = Following(self.networks.trajectory, load_road_map(staged.town.name), spread)
+        self._following = Following(self.networks.trajectory, load_road_map(staged.town.name), spread, confirmed)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
@@ -181,3 +187,8 @@ class NetworkPerception:
 def sense_networks(staged: StagedScenario, seed: int) -> NetworkPerception:
     """Return the perception by the networks of the package, for `loop.drive`."""
     return NetworkPerception(staged, seed)
+
+
+def sense_unconfirmed(staged: StagedScenario, seed: int) -> NetworkPerception:
+    """Return the perception by the networks of the package, which believes every track of two detections."""
+    return NetworkPerception(staged, seed, confirmed=None)
