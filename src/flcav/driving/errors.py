@@ -103,7 +103,7 @@ class ModelledPerception:
         self._model = model
         self._scene = Scene(staged.town, staged.world.snapshot.trace)
         self._random = stream(seed, "errors", staged.scenario.name)
-        self._following = Following(load_networks().trajectory, load_road_map(staged.town.name), model.spread)
+        self._following = Following(load_networks().trajectory, load_road_map(staged.scenario.town), model.spread)
         self._held: dict[str, tuple[float, float]] = {}
         self._read: dict[str, tuple[float, str]] = {}
         self._signals = staged.town.signals

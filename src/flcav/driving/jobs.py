@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Annotated
 
 from flcav.driving.errors import ErrorModel, sense_model
-from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, sense_truth
+from flcav.driving.film import Camera, Film
+from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, drive_staged, sense_truth
 from flcav.driving.measures import DriveResult
 from flcav.driving.networks import Networks, name_network, sense_networks, sense_unconfirmed
 from flcav.driving.scenarios import DrivingScenario, StagedScenario
@@ -70,6 +71,29 @@ def run_job(job: DriveJob, sensed: Sensed) -> DriveResult:
         return own if job.task is None else Without(own, job.task, job.coupling)
 
     return drive_scenario(job.scenario, job.seed, sense, job.loop)
+
+
+def film_job(job: DriveJob, sensed: Sensed) -> tuple[DriveResult, Film]:
+    """Return the measures of one drive with all tasks, and its film."""
+    staged, camera = StagedScenario(job.scenario, job.seed), Camera()
+    try:
+        perception = sensed.make()(staged, job.seed)
+        own = drive_staged(staged, job.seed, perception, job.loop, camera.watch)
+        return own, camera.develop(staged, job.seed)
+    finally:
+        staged.world.close()
+
+
+def film_jobs(
+    jobs: Sequence[DriveJob], sensed: Sensed, processes: int = 1, progress: Report = ignore_progress
+) -> list[tuple[DriveResult, Film]]:
+    """Return the measures and films of drives in the order of the jobs, computed by parallel processes."""
+    found = []
+    with process_pool(processes, begin_worker) as pool:
+        for done, each in enumerate(pool.map(film_job, jobs, [sensed] * len(jobs)), start=1):
+            found.append(each)
+            progress(done, len(jobs), each[0].scenario)
+    return found
 
 
 def run_jobs(

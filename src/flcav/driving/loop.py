@@ -21,7 +21,7 @@ from flcav.driving.measures import (
 )
 from flcav.driving.passing import join_lanes
 from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
-from flcav.driving.seen import EGO, Perception, TruePerception, read_lights
+from flcav.driving.seen import EGO, Perception, Seen, TruePerception, read_lights
 from flcav.geometry import heading_vectors
 from flcav.world.map.roads import Route
 from flcav.world.snapshot import Snapshot
@@ -48,8 +48,14 @@ def sense_truth(staged: StagedScenario, seed: int) -> Perception:
     return TruePerception(staged.scenario.weather)
 
 
+Watch = Callable[[Snapshot, Seen, str], None]  # is told of every step: the world, what is seen, what it slows for
+
+
 def drive_scenario(
-    scenario: DrivingScenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP
+    scenario: DrivingScenario,
+    seed: int,
+    sense: Sensing = sense_truth,
+    loop: Loop = LOOP,
 ) -> DriveResult:
     """Return the measures of a closed-loop drive through a scenario with a seed, on the perception that `sense` makes.
 
@@ -58,12 +64,15 @@ def drive_scenario(
     """
     staged = StagedScenario(scenario, seed)
     try:
-        return _drive(staged, seed, sense(staged, seed), loop)
+        return drive_staged(staged, seed, sense(staged, seed), loop)
     finally:
         staged.world.close()
 
 
-def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop) -> DriveResult:
+def drive_staged(
+    staged: StagedScenario, seed: int, perception: Perception, loop: Loop, watch: Watch | None = None
+) -> DriveResult:
+    """Return the measures of a drive through a scenario that is under way, which the caller ends."""
     world, route, truth = staged.world, staged.route, TruePerception(staged.scenario.weather)
     body = world.bodies.find(EGO).blueprint
     size = (body.size[0], body.size[1])
@@ -78,6 +87,8 @@ def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop
         now = world.snapshot
         seen = perception.look(now)
         decision = decide_controls(route, own, seen, body, loop.driver, lanes)
+        if watch is not None:
+            watch(now, seen, name_cause(decision.cause, seen, now))
         ttc.append(measure_ttc(route, own, truth.look(now), size))
         before, now = now, world.step({EGO: decision.controls})
         after = find_motion(now, route, own.along)

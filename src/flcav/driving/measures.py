@@ -60,13 +60,21 @@ class DriveResult(Record):
         """Return the measures in words, with everything that the score is made of."""
         hits = "".join(f", {'hits' if hit.at_fault else 'is hit by'} {hit.other}" for hit in self.hits)
         reds = f", {plural(self.red_lights, 'red light')} passed" if self.red_lights else ""
-        made = "".join(f" x {factor:.2g} ({name})" for name, factor in self.penalties.items())
-        score = f"score {self.score:.2f}" + (f" = {self.progress:.2f}{made}" if made else "")
         return (
             f"{self.scenario}, seed {self.seed}: progress {self.progress:.2f}, {self.mean_speed:.1f} m/s, least time "
-            f"to collision {self.least_ttc_s:.2f} s, {plural(self.hard_brakes, 'hard brake')}{reds}{hits}, {score}"
-            f"{describe_standing(self.stood_s, self.time_s)}"
+            f"to collision {self.least_ttc_s:.2f} s, {plural(self.hard_brakes, 'hard brake')}{reds}{hits}, score "
+            f"{self.describe_score()}{describe_standing(self.stood_s, self.time_s)}"
         )
+
+    def describe_score(self) -> str:
+        """Return the score in words, with the factors that it is made of."""
+        made = "".join(f" x {factor:.2g} ({name})" for name, factor in self.penalties.items())
+        return f"{self.score:.2f}" + (f" = {self.progress:.2f}{made}" if made else "")
+
+    @property
+    def stood_in_all_s(self) -> float:
+        """Return how long the vehicle stood [s]."""
+        return round(sum(self.stood_s.values()), 1)
 
     @property
     def faults(self) -> int:

@@ -138,9 +138,10 @@ class NetworkPerception:
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
-        self.weather = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
+        drawn = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
+        self.weather = staged.scenario.sky or drawn
         self.lights = LightReader(staged.town)
-        self._following = Following(self.networks.trajectory, load_road_map(staged.town.name), spread, confirmed)
+        self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread, confirmed)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road

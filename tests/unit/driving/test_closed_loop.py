@@ -237,7 +237,7 @@ def test_a_decision_names_what_it_slows_for(closed: str) -> None:
 
 def test_unknown_scenarios_are_refused() -> None:
     assert len({each.name for each in spread_scenarios(32)}) == 32 == len(list_scenarios())
-    with pytest.raises(InputError, match="must be one of"):
+    with pytest.raises(InputError, match="flcav drive --list"):
         find_scenarios(["nowhere"])
 
 

@@ -190,7 +190,9 @@ def test_a_bucket_that_only_begins_in_the_domain_is_outside(
 ):
     domain = read_domain(odd_file(f"MODULES: {{m: {{INCLUDE_AND: {{{rule}}}}}}}"))
     document = next(iter(collect_runs(domain, drive, measure_domain(drive)).values()))
-    (item,) = (each for each in document["items"] if each["attribute"] == domain.tested[0])
+    items = document["items"]
+    assert isinstance(items, list)
+    (item,) = (each for each in items if isinstance(each, dict) and each["attribute"] == domain.tested[0])
     assert item["outside_odd"] == outside
 
 
