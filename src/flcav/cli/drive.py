@@ -60,7 +60,7 @@ def drive(
 ) -> Answer:
     """Drive through scenarios in closed loop, and print progress, every infraction, and what the vehicle stood before.
 
-    Before --list and drives comes what perceives: ground truth, unless --perception says otherwise.
+    The first line says what perceives: ground truth, unless --perception says otherwise.
     """
     from flcav.config import InputError
     from flcav.driving.driver import DriverSettings

@@ -22,7 +22,7 @@ from flcav.driving.jobs import DriveJob, Sensed, film_job
 from flcav.driving.loop import Loop
 from flcav.driving.scenario_files import read_scenarios
 from flcav.driving.scenarios import DrivingScenario, StagedScenario, find_scenarios, find_start, list_scenarios
-from flcav.driving.scripts import BEGINS_S, LANE_M, PREFIX, Script, ScriptPlayer, write_script
+from flcav.driving.scripts import BEGINS_S, LANE_M, PREFIX, Script, ScriptPlayer, Speed, write_script
 from flcav.driving.seen import EGO, WEATHER_SPEED
 from flcav.odd.domain import Domain
 from flcav.odd.openscenario import to_openscenario
@@ -176,6 +176,7 @@ def test_parameters_and_speeds_by_time_are_read(samples: dict[str, SampledScenar
     text = text.replace('dynamicsDimension="rate" value="4"', 'dynamicsDimension="time" value="2"')
     path.write_text(text)
     ((action,),) = (each.actions for each in one(path).scripts)
+    assert isinstance(action, Speed)
     assert action.target == 0.5
     assert action.rate == pytest.approx((speed - 0.5) / 2, rel=1e-4)
 
