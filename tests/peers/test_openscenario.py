@@ -6,8 +6,9 @@ from pathlib import Path
 import pytest
 from conftest import Peer
 
+from flcav.driving.scripts import write_script
 from flcav.odd.domain import read_domain
-from flcav.odd.openscenario import to_openscenario, write_script
+from flcav.odd.openscenario import to_openscenario
 from flcav.odd.sampling import CASES, SampledScenario, Space, sample_domain
 from flcav.odd.scenery import Scenery
 from flcav.world.map.town import load_town

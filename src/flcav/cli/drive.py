@@ -1,6 +1,7 @@
 """`flcav drive`: closed-loop drives through scenarios, by what perception finds."""
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -9,11 +10,25 @@ from flcav.cli.options import JOBS, check_finite, refuse_unused
 from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from flcav.driving.film import Film
+    from flcav.driving.measures import DriveResult
+
 
 @answer_json
 def drive(
     scenario: list[str] = typer.Option(
-        [], "--scenario", help="Name of a scenario; may be given several times. By default all of the package."
+        [],
+        "--scenario",
+        help="Name of a scenario, a recipe (YAML), a recording, or OpenSCENARIO (.xosc); several times. By default "
+        "all of the package.",
+    ),
+    listed: bool = typer.Option(False, "--list", help="Print the scenarios that would be driven, and drive none."),
+    night: bool = typer.Option(False, "--night", help="Drive at night, in the rain and the sight of the scenario."),
+    out: Path | None = typer.Option(
+        None, "--out", help="Folder for report.html with the film, the table drives.csv, and results.json."
     ),
     seeds: int = typer.Option(1, "--seeds", min=1, max=100, help="Seeds of each."),
     first_seed: int = FIRST_SEED,
@@ -43,18 +58,31 @@ def drive(
     ),
     jobs: int = JOBS,
 ) -> Answer:
-    """Drive through scenarios in closed loop, and print time to collision, hard brakes, progress and collisions."""
+    """Drive through scenarios in closed loop, and print progress, every infraction, and what the vehicle stood before.
+
+    The first line says what perceives: ground truth, unless --perception says otherwise.
+    """
     from flcav.config import InputError
     from flcav.driving.driver import DriverSettings
-    from flcav.driving.jobs import DriveJob, Sensed, run_jobs
+    from flcav.driving.film import Film
+    from flcav.driving.jobs import DriveJob, Sensed, film_jobs, run_jobs
     from flcav.driving.loop import Loop
-    from flcav.driving.scenarios import find_scenarios
+    from flcav.driving.measures import describe_drives
+    from flcav.driving.scenario_files import read_scenarios
+    from flcav.driving.scenarios import DrivingScenario
     from flcav.driving.studies.error_measurement import measure_errors
     from flcav.driving.studies.pole_gain import measure_pole_gain
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable, write_json
+    from flcav.storage.records import to_json
 
-    chosen, numbers = find_scenarios(scenario), range(first_seed, first_seed + seeds)
+    chosen, numbers = read_scenarios(scenario), range(first_seed, first_seed + seeds)
+    if night:
+        chosen = tuple(each.at_night() for each in chosen)
+    if listed:
+        yield {"scenarios": [to_json(each, DrivingScenario) for each in chosen]}
+        yield from (each.line() for each in chosen)
+        return
     for option, given in (("--pole", bool(pole)), ("--measure", measure is not None)):
         if given and perception != Perceives.networks:
             raise InputError(f"{option}: needs --perception networks, since sensors are simulated")
@@ -66,8 +94,12 @@ def drive(
         raise InputError("--pole: needs scenarios of one town, --scenario")
     if measure is not None:
         check_writable(measure.parent)
-    model = read_model(perception, errors)
-    loop = Loop(DriverSettings(margin, sigmas), lasts)
+    if out is not None:
+        if pole or measure is not None:
+            raise InputError("--out: writes the report of drives, without --pole and --measure")
+        check_writable(out)
+    sensed = Sensed(perception.value, read_model(perception, errors))
+    loop = Loop(DriverSettings(margin, sigmas, passes=True), lasts)
     if measure is not None:
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)
@@ -83,9 +115,28 @@ def drive(
         return
     with show_progress("drive") as report:
         tasks = [DriveJob(each, seed, loop=loop) for each in chosen for seed in numbers]
-        drives = run_jobs(tasks, Sensed(perception.value, model), jobs, report)
-    yield {"drives": [own.as_json() for own in drives]}
+        if out is None:
+            drives, films = run_jobs(tasks, sensed, jobs, report), list[Film]()
+        else:
+            drives, films = (list(each) for each in zip(*film_jobs(tasks, sensed, jobs, report), strict=True))
+    if out is not None:
+        write_drives(out, sensed.line(), drives, films)
+    yield {"perception": sensed.line(), "drives": [own.as_json() for own in drives]}
+    yield sensed.line()
     for own in drives:
         yield own.line()
-    faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
-    yield f"{len(drives)} drives: {faults} collisions at fault, {hits - faults} others"
+    yield describe_drives(drives)
+    if out is not None:
+        yield f"{out / 'report.html'}: measures with intervals, the drives, and their film"
+
+
+def write_drives(out: Path, perceives: str, drives: "Sequence[DriveResult]", films: "Sequence[Film]") -> None:
+    """Write report.html, drives.csv and results.json into a folder."""
+    from flcav.report.pages.drive_page import drive_page, tabulate_drives
+    from flcav.storage.files import write_bytes, write_json
+    from flcav.storage.records import write_any_table
+
+    out.mkdir(parents=True, exist_ok=True)
+    write_any_table(tabulate_drives(drives), out / "drives.csv")
+    write_json(out / "results.json", {"perception": perceives, "drives": [own.as_json() for own in drives]}, sort=False)
+    write_bytes(out / "report.html", drive_page(perceives, drives, films).encode())

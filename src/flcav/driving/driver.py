@@ -6,19 +6,24 @@ the corridor is wide for vehicles of up to 12 m.
 
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
-corridor at the time at which the vehicle would be there. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
+corridor at the time at which the vehicle would be there. Around vehicles that stand it looks for a way
+(`passing`), if its settings allow it. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
 with all it has. Steering is pure pursuit (Coulter, CMU-RI-TR-92-01, 1992).
 """
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
+from shapely.geometry.base import BaseGeometry
 
+from flcav.driving.passing import CREEPS_MPS, SLIM_M, Line, find_standing, list_lines
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
+from flcav.storage.records import WHERE_TRUE
 from flcav.world.commands import Controls
 from flcav.world.dynamics.vehicle import BodyBlueprint
 from flcav.world.map.roads import Route
@@ -37,7 +42,7 @@ class Occupied(NamedTuple):
 
 
 def find_occupied(
-    route: Route, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
+    route: Line, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
 ) -> Occupied:
     """Return what footprints cover of the corridor of a vehicle that is `along` the route [m].
 
@@ -107,6 +112,7 @@ class DriverSettings:
     margin_m: float = 0.4
     sigmas: float = 0.0  # multiple of the standard deviation of predicted positions
     most_m: float = 3.0  # the margin is never more
+    passes: Annotated[bool, WHERE_TRUE] = False  # looks for a way around vehicles that stand
 
 
 DEFAULT = DriverSettings()
@@ -130,29 +136,80 @@ class Decision:
     controls: Controls
     acceleration: float  # that it wants [m/s^2]
     emergency: bool
+    cause: int | str | None = None  # what it slows for: the row of `Seen`, or the light; None on a free road
+
+
+Need = tuple[float, int | str | None]  # an acceleration [m/s^2], and its cause as in `Decision`
 
 
 def decide_controls(
-    route: Route, own: EgoMotion, seen: Seen, vehicle: BodyBlueprint, settings: DriverSettings = DEFAULT
+    route: Route,
+    own: EgoMotion,
+    seen: Seen,
+    vehicle: BodyBlueprint,
+    settings: DriverSettings = DEFAULT,
+    lanes: BaseGeometry | None = None,
 ) -> Decision:
-    """Return the controls for the next tenth of a second."""
+    """Return the controls for the next tenth of a second; a way around is looked for in the area of the `lanes`."""
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
     free = _follow(own.speed, wanted, FARTHEST_GAP_M, wanted)
-    needs = [free, _stop_at_light(route, own, seen, half, wanted)]
+    needs: list[Need] = [(free, None), _stop_at_light(route, own, seen, half, wanted)]
     margin = np.minimum(settings.margin_m + settings.sigmas * seen.spread, settings.most_m)
-    occupied = find_occupied(route, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, margin)
-    needs += _avoid(route, own, seen, occupied, half, wanted)
-    acceleration = min(needs)
+
+    def judge(line: Line, kept: Array) -> Need:
+        occupied = find_occupied(line, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, kept)
+        return _least([*needs, *_avoid(line, own, seen, occupied, half, wanted)])
+
+    line, (acceleration, cause) = _choose_line(route, own, seen, vehicle, wanted, margin, judge, settings, lanes)
     emergency = acceleration < -EMERGENCY_MPS2
     if emergency:
         acceleration = -vehicle.brake_mps2
     pedal = acceleration / (GAIN_MPS2 * 2 if acceleration > 0 else vehicle.brake_mps2)
     if own.speed < 0.3 and acceleration <= 0.1:
         pedal = -1.0  # stand still
-    steer = _steer(route, own, vehicle)
+    steer = _steer(line, own, vehicle)
     throttle, brake = float(np.clip(pedal, 0, 1)), float(np.clip(-pedal, 0, 1))
-    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency)
+    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency, cause)
+
+
+def _least(needs: Sequence[Need]) -> Need:
+    return min(needs, key=lambda need: need[0])
+
+
+def _choose_line(
+    route: Route,
+    own: EgoMotion,
+    seen: Seen,
+    vehicle: BodyBlueprint,
+    wanted: float,
+    margin: Array,
+    judge: Callable[[Line, Array], Need],
+    settings: DriverSettings,
+    lanes: BaseGeometry | None,
+) -> tuple[Line, Need]:
+    """Return the route, or the line beside it on which the vehicle gets on best past who stands, and its need.
+
+    `judge` returns the least need on a line with a margin (N, T) around the road users.
+    """
+    here = judge(route, margin)
+    standing = find_standing(seen.velocity, seen.boxes.label)
+    if not settings.passes or lanes is None or not isinstance(here[1], int) or not standing[here[1]]:
+        return route, here
+    free = min(_approach_speed(own.speed, wanted), 0.5)
+    if here[0] > free:
+        return route, here
+    _, left = route.project(own.x, own.y, own.along)
+    ways: list[Line] = [route, *list_lines(route, own.along, left, own.speed, vehicle.size[1], lanes)]
+    full = [here, *(judge(line, margin) for line in ways[1:])]
+    for line, need in zip(ways, full):
+        if need[0] > free:
+            return line, need
+    slim = np.where(standing[:, None], np.minimum(margin, SLIM_M), margin)
+    creeps = _approach_speed(own.speed, CREEPS_MPS)
+    narrow = [judge(line, slim) for line in ways]
+    best = max(range(len(ways)), key=lambda i: (min(narrow[i][0], creeps), full[i][0]))
+    return ways[best], _least([narrow[best], (max(creeps, full[best][0]), full[best][1])])
 
 
 def find_speed(route: Route, own: EgoMotion, share: float) -> float:
@@ -190,7 +247,7 @@ def _halt(speed: float, wanted: float, gap_m: float) -> float:
     return _follow(speed, wanted, gap_m + STANDSTILL_M, 0.0)
 
 
-def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> float:
+def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> Need:
     """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
     for stop, link in route.stops:
         gap = stop - LINE_M - own.along - half_m
@@ -199,11 +256,11 @@ def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, want
         needed = own.speed**2 / (2 * max(gap, 0.1))
         if needed > (EMERGENCY_MPS2 - 0.5 if link in seen.amber else 8.0):
             continue
-        return _halt(own.speed, wanted, gap)
-    return np.inf
+        return _halt(own.speed, wanted, gap), link
+    return np.inf, None
 
 
-def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[float]:
+def _avoid(route: Line, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[Need]:
     """Return the acceleration for each road user that is, or is going to be, in the way."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
@@ -211,8 +268,8 @@ def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m:
     go = _cover(own.speed, wanted, GAIN_MPS2)
     keep = own.speed * TIMES_S
     meets = find_meeting(occupied, go, half_m) | find_meeting(occupied, keep, half_m)
-    needs = []
-    for row in np.flatnonzero(present):
+    needs: list[Need] = []
+    for row in np.flatnonzero(present).tolist():
         low = occupied.low[row]
         nearest = float(np.min(low))
         place = own.along + (float(low[0]) if np.isfinite(low[0]) else nearest)
@@ -220,18 +277,18 @@ def _avoid(route: Route, own: EgoMotion, seen: Seen, occupied: Occupied, half_m:
         same_way = along_mps > SAME_WAY * float(np.hypot(*seen.velocity[row])) and along_mps > 0.5
         if np.isfinite(low[0]) and occupied.high[row, 0] > 0:  # now in the corridor, and not behind
             if occupied.low[row, 0] > -half_m:
-                needs.append(_follow(own.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)))
+                needs.append((_follow(own.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)), row))
             continue
         if not meets[row].any():
             continue
         first = int(np.argmax(meets[row]))
         if same_way:
             gap = float(low[first]) - along_mps * float(TIMES_S[first]) - half_m
-            needs.append(_follow(own.speed, wanted, max(gap, 1.0), along_mps))
+            needs.append((_follow(own.speed, wanted, max(gap, 1.0), along_mps), row))
             continue
         gap = float(np.min(low[np.isfinite(low)])) - half_m
         if gap > 0:  # otherwise it is in the way already, and leaves it
-            needs.append(_halt(own.speed, wanted, gap - 1.0))
+            needs.append((_halt(own.speed, wanted, gap - 1.0), row))
     return needs
 
 
@@ -242,7 +299,7 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: Route, own: EgoMotion, vehicle: BodyBlueprint) -> float:
+def _steer(route: Line, own: EgoMotion, vehicle: BodyBlueprint) -> float:
     """Return the share of the greatest steering angle (pure pursuit)."""
     aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
     ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)

@@ -43,6 +43,7 @@ from flcav.world.snapshot import Snapshot
 EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 SHIPPED = Path(__file__).parent / "shipped" / "errors.json"
+MODELLED = "the model of errors"
 HELD_S = 1.0
 LIGHTS_S = 0.5  # between two looks at lights
 
@@ -102,7 +103,7 @@ class ModelledPerception:
         self._model = model
         self._scene = Scene(staged.town, staged.world.snapshot.trace)
         self._random = stream(seed, "errors", staged.scenario.name)
-        self._following = Following(load_networks().trajectory, load_road_map(staged.town.name), model.spread)
+        self._following = Following(load_networks().trajectory, load_road_map(staged.scenario.town), model.spread)
         self._held: dict[str, tuple[float, float]] = {}
         self._read: dict[str, tuple[float, str]] = {}
         self._signals = staged.town.signals
@@ -118,7 +119,7 @@ class ModelledPerception:
         closed = frozenset(n for n, (_, letter) in self._read.items() if letter != "G")
         amber = frozenset(n for n, (_, letter) in self._read.items() if letter == "y")
         told = self._following.step(self._detect(snapshot), snapshot.time_s, closed)
-        return Seen(told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, self._share)
+        return Seen(told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, self._share, MODELLED)
 
     def _detect(self, snapshot: Snapshot) -> Boxes:
         rows, boxes, local = find_in_field(snapshot, self._scene)

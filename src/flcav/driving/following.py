@@ -60,6 +60,33 @@ class PathSpread:
 CERTAIN = PathSpread()
 
 
+Past = deque[tuple[float, float, float, float, float]]  # of a track: time [s], x, y [m], yaw [rad], speed [m/s]
+
+
+@dataclass(frozen=True)
+class Confirmed:
+    """When a track is believed: found in `hits` of the last `sweeps`; until it has gone so far it stands."""
+
+    hits: int = 3
+    sweeps: int = 5
+    sweep_s: float = 0.1
+    drove_m: float = 1.5  # a box that is seen in part shifts by less
+    walked_m: float = 0.5
+
+    def holds(self, past: Past, time_s: float) -> bool:
+        """Return whether a track has been found often enough lately."""
+        since = time_s - (self.sweeps - 0.5) * self.sweep_s
+        return sum(each[0] > since for each in past) >= self.hits
+
+    def moves(self, past: Past, label: str) -> bool:
+        """Return whether a track has gone far enough to be believed to move."""
+        gone = float(np.hypot(past[-1][1] - past[0][1], past[-1][2] - past[0][2]))
+        return gone > (self.walked_m if label == WALKS else self.drove_m)
+
+
+CONFIRMED = Confirmed()
+
+
 @dataclass(frozen=True)
 class FollowedTracks:
     """Tracks at one instant with their forecasts, in the fields of `Seen`."""
@@ -80,7 +107,7 @@ class _Known:
     box: Boxes
     velocity: Array
     seen_s: float
-    past: deque[tuple[float, float, float, float, float]]  # time, x, y, yaw, speed
+    past: Past
     forecast: Array | None = None  # (T, 2) at `forecast_s` + TIMES_S
     forecast_s: float = -1.0
 
@@ -88,9 +115,16 @@ class _Known:
 class Following:
     """Follows detections through a drive; a network of None forecasts constant velocity for all."""
 
-    def __init__(self, network: TrajectoryNetwork | None, roads: RoadMap | None, spread: PathSpread = CERTAIN) -> None:
-        self._tracker, self._known = Tracker(), dict[int, _Known]()
-        self._network, self._roads, self._spread = network, roads, spread
+    def __init__(
+        self,
+        network: TrajectoryNetwork | None,
+        roads: RoadMap | None,
+        spread: PathSpread = CERTAIN,
+        confirmed: Confirmed | None = None,
+    ) -> None:
+        """Take the network of forecasts, the map, the uncertainty, and the rule by which tracks are believed."""
+        self._tracker, self._known = Tracker(confirm=1 if confirmed else 2), dict[int, _Known]()
+        self._network, self._roads, self._spread, self._confirmed = network, roads, spread, confirmed
 
     def step(self, found: Boxes, time_s: float, closed: frozenset[str]) -> FollowedTracks:
         """Return the tracks at `time_s` by the detections `found` (world frame) and the lights that are closed."""
@@ -109,6 +143,8 @@ class Following:
 
     def _report(self, time_s: float) -> FollowedTracks:
         numbers = sorted(self._known)
+        if self._confirmed is not None:
+            numbers = [n for n in numbers if self._confirmed.holds(self._known[n].past, time_s)]
         rows = [self._known[n] for n in numbers]
         if not rows:
             none = np.zeros((0, len(TIMES_S)))
@@ -116,6 +152,8 @@ class Following:
                 Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none, ()
             )
         boxes, velocity = concatenate([each.box for each in rows]), np.array([each.velocity for each in rows])
+        if self._confirmed is not None:
+            velocity[[not self._confirmed.moves(each.past, str(each.box.label[0])) for each in rows]] = 0.0
         path, yaw = predict_motion(boxes, velocity)
         late = time_s - np.array([each.seen_s for each in rows])
         path += (late[:, None] * velocity)[:, None]

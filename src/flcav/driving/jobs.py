@@ -3,17 +3,19 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 from flcav.driving.errors import ErrorModel, sense_model
-from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, sense_truth
+from flcav.driving.film import Camera, Film
+from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, drive_staged, sense_truth
 from flcav.driving.measures import DriveResult
-from flcav.driving.networks import sense_networks
+from flcav.driving.networks import Networks, name_network, sense_networks, sense_unconfirmed
 from flcav.driving.scenarios import DrivingScenario, StagedScenario
 from flcav.driving.seen import Coupling, Perception, Without
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.storage.kept import hash_request, keep, read_kept
-from flcav.storage.records import Record, to_json
+from flcav.storage.records import WHERE_TRUE, Record, to_json
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,7 @@ class Sensed(Record):
 
     kind: str  # "truth", "networks", "model"
     model: ErrorModel | None = None
+    unconfirmed: Annotated[bool, WHERE_TRUE] = False  # of networks: every track is believed, see `Confirmed`
 
     def make(self) -> Sensing:
         """Return the constructor of the perception; raises `ValueError` for a modelled perception without its model."""
@@ -29,7 +32,15 @@ class Sensed(Record):
             if self.model is None:
                 raise ValueError("a modelled perception needs its model")
             return sense_model(self.model)
-        return sense_networks if self.kind == "networks" else sense_truth
+        if self.kind == "networks":
+            return sense_unconfirmed if self.unconfirmed else sense_networks
+        return sense_truth
+
+    def line(self) -> str:
+        """Return what perceives, in words."""
+        if self.kind == "networks":
+            return f"perception: the networks {', '.join(map(name_network, Networks._fields))}"
+        return f"perception: {'a model of the errors of networks' if self.kind == 'model' else 'ground truth'}"
 
 
 @dataclass(frozen=True)
@@ -60,6 +71,29 @@ def run_job(job: DriveJob, sensed: Sensed) -> DriveResult:
         return own if job.task is None else Without(own, job.task, job.coupling)
 
     return drive_scenario(job.scenario, job.seed, sense, job.loop)
+
+
+def film_job(job: DriveJob, sensed: Sensed) -> tuple[DriveResult, Film]:
+    """Return the measures of one drive with all tasks, and its film."""
+    staged, camera = StagedScenario(job.scenario, job.seed), Camera()
+    try:
+        perception = sensed.make()(staged, job.seed)
+        own = drive_staged(staged, job.seed, perception, job.loop, camera.watch)
+        return own, camera.develop(staged, job.seed)
+    finally:
+        staged.world.close()
+
+
+def film_jobs(
+    jobs: Sequence[DriveJob], sensed: Sensed, processes: int = 1, progress: Report = ignore_progress
+) -> list[tuple[DriveResult, Film]]:
+    """Return the measures and films of drives in the order of the jobs, computed by parallel processes."""
+    found = []
+    with process_pool(processes, begin_worker) as pool:
+        for done, each in enumerate(pool.map(film_job, jobs, [sensed] * len(jobs)), start=1):
+            found.append(each)
+            progress(done, len(jobs), each[0].scenario)
+    return found
 
 
 def run_jobs(

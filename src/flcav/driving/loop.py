@@ -1,5 +1,6 @@
 """The closed loop of perception, driver and world, at ten steps a second."""
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -13,11 +14,14 @@ from flcav.driving.measures import (
     DriveResult,
     Hit,
     judge_collision,
+    list_penalties,
     measure_ttc,
+    name_cause,
     score_drive,
 )
+from flcav.driving.passing import join_lanes
 from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
-from flcav.driving.seen import EGO, Perception, TruePerception, read_lights
+from flcav.driving.seen import EGO, Perception, Seen, TruePerception, read_lights
 from flcav.geometry import heading_vectors
 from flcav.world.map.roads import Route
 from flcav.world.snapshot import Snapshot
@@ -44,8 +48,14 @@ def sense_truth(staged: StagedScenario, seed: int) -> Perception:
     return TruePerception(staged.scenario.weather)
 
 
+Watch = Callable[[Snapshot, Seen, str], None]  # is told of every step: the world, what is seen, what it slows for
+
+
 def drive_scenario(
-    scenario: DrivingScenario, seed: int, sense: Sensing = sense_truth, loop: Loop = LOOP
+    scenario: DrivingScenario,
+    seed: int,
+    sense: Sensing = sense_truth,
+    loop: Loop = LOOP,
 ) -> DriveResult:
     """Return the measures of a closed-loop drive through a scenario with a seed, on the perception that `sense` makes.
 
@@ -54,31 +64,41 @@ def drive_scenario(
     """
     staged = StagedScenario(scenario, seed)
     try:
-        return _drive(staged, seed, sense(staged, seed), loop)
+        return drive_staged(staged, seed, sense(staged, seed), loop)
     finally:
         staged.world.close()
 
 
-def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop) -> DriveResult:
+def drive_staged(
+    staged: StagedScenario, seed: int, perception: Perception, loop: Loop, watch: Watch | None = None
+) -> DriveResult:
+    """Return the measures of a drive through a scenario that is under way, which the caller ends."""
     world, route, truth = staged.world, staged.route, TruePerception(staged.scenario.weather)
     body = world.bodies.find(EGO).blueprint
     size = (body.size[0], body.size[1])
     now, along = world.snapshot, staged.start_m
+    lanes = join_lanes(staged.town) if loop.driver.passes else None
     hits: list[Hit] = []
     ttc, speeds, hard, braking, reds = [], [], 0, False, 0
+    stood: Counter[str] = Counter()  # steps, by what the vehicle stood before
     for _ in range(round(loop.lasts_s / DT_S)):
         own = find_motion(now, route, along)
         staged.act(own.along, own.speed)
         now = world.snapshot
-        controls = decide_controls(route, own, perception.look(now), body, loop.driver).controls
+        seen = perception.look(now)
+        decision = decide_controls(route, own, seen, body, loop.driver, lanes)
+        if watch is not None:
+            watch(now, seen, name_cause(decision.cause, seen, now))
         ttc.append(measure_ttc(route, own, truth.look(now), size))
-        before, now = now, world.step({EGO: controls})
+        before, now = now, world.step({EGO: decision.controls})
         after = find_motion(now, route, own.along)
         slowing = (own.speed - after.speed) / DT_S > HARD_MPS2
         hard, braking = hard + (slowing and not braking), slowing
         reds += _pass_red(route, own, after, size[0], now)
         along = after.along
         speeds.append(after.speed)
+        if after.speed < STANDS_MPS:
+            stood[name_cause(decision.cause, seen, before)] += 1
         kinds = dict(zip(now.trace.actor.tolist(), now.trace.category.tolist()))
         known = {hit.other for hit in hits}
         new = [
@@ -104,6 +124,8 @@ def _drive(staged: StagedScenario, seed: int, perception: Perception, loop: Loop
         red_lights=reds,
         hits=tuple(hits),
         score=score_drive(progress, hits, reds),
+        penalties=list_penalties(hits, reds),
+        stood_s={cause: round(steps * DT_S, 1) for cause, steps in stood.most_common()},
     )
 
 

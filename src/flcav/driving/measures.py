@@ -1,4 +1,4 @@
-"""Measures of a drive: time to collision, hard brakes, progress, collisions, and the driving score.
+"""Measures of a drive: time to collision, hard brakes, progress, standing, collisions, and the driving score.
 
 A collision is at fault unless the ego vehicle stood, or was run into from behind by something faster (the duty of
 the one behind: Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving cars", 2017, rule 1). The
@@ -7,19 +7,22 @@ fault (Caesar et al., 2021), and of CARLA's leaderboard for red lights.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from flcav.driving.driver import EgoMotion, find_meeting, find_occupied
-from flcav.driving.seen import EGO, TIMES_S, Seen
+from flcav.driving.seen import EGO, TIMES_S, Seen, find_around, read_lights
 from flcav.geometry import heading_vectors
+from flcav.interface.wording import plural
 from flcav.storage.records import Record
 from flcav.world.map.roads import Route
 from flcav.world.snapshot import Collision, Snapshot
 
 HARD_MPS2 = 4.0  # deceleration of a hard brake
 STANDS_MPS = 0.3
+STOOD_S = 1.0  # a shorter time is not worth a word
+FALSE_M = 3.0  # a box farther than this from everybody is a false one
 NEAR_S = 1.5  # time to collision below which a drive comes close
 PENALTY: Mapping[str, float] = {"pedestrian": 0.0, "vehicle": 0.0, "obstacle": 0.5, "red light": 0.7}
 
@@ -49,15 +52,29 @@ class DriveResult(Record):
     hard_brakes: int  # times that a deceleration of `HARD_MPS2` began
     red_lights: int  # stop lines passed at red
     hits: tuple[Hit, ...]
-    score: float  # the driving score, 0 to 1
+    score: float  # the driving score, 0 to 1: progress times all `penalties`
+    penalties: Mapping[str, float] = field(default_factory=dict)  # by infraction, of those that happened
+    stood_s: Mapping[str, float] = field(default_factory=dict)  # by what the vehicle stood before [s], longest first
 
     def line(self) -> str:
-        """Return the measures in words."""
+        """Return the measures in words, with everything that the score is made of."""
         hits = "".join(f", {'hits' if hit.at_fault else 'is hit by'} {hit.other}" for hit in self.hits)
+        reds = f", {plural(self.red_lights, 'red light')} passed" if self.red_lights else ""
         return (
             f"{self.scenario}, seed {self.seed}: progress {self.progress:.2f}, {self.mean_speed:.1f} m/s, least time "
-            f"to collision {self.least_ttc_s:.2f} s, {self.hard_brakes} hard brakes, score {self.score:.2f}{hits}"
+            f"to collision {self.least_ttc_s:.2f} s, {plural(self.hard_brakes, 'hard brake')}{reds}{hits}, score "
+            f"{self.describe_score()}{describe_standing(self.stood_s, self.time_s)}"
         )
+
+    def describe_score(self) -> str:
+        """Return the score in words, with the factors that it is made of."""
+        made = "".join(f" x {factor:.2g} ({name})" for name, factor in self.penalties.items())
+        return f"{self.score:.2f}" + (f" = {self.progress:.2f}{made}" if made else "")
+
+    @property
+    def stood_in_all_s(self) -> float:
+        """Return how long the vehicle stood [s]."""
+        return round(sum(self.stood_s.values()), 1)
 
     @property
     def faults(self) -> int:
@@ -65,10 +82,59 @@ class DriveResult(Record):
         return sum(hit.at_fault for hit in self.hits)
 
 
+def list_penalties(hits: Sequence[Hit], red_lights: int) -> dict[str, float]:
+    """Return the factor of each kind of infraction that happened: collisions at fault, and red lights passed."""
+    kinds = [hit.kind for hit in hits if hit.at_fault] + ["red light"] * red_lights
+    count = {kind: kinds.count(kind) for kind in PENALTY if kind in kinds}
+    return {plural(number, kind): PENALTY[kind] ** number for kind, number in count.items()}
+
+
 def score_drive(progress: float, hits: Sequence[Hit], red_lights: int) -> float:
     """Return the driving score: progress times the penalties of collisions at fault and of red lights."""
-    penalty = float(np.prod([PENALTY[hit.kind] for hit in hits if hit.at_fault]))
-    return progress * penalty * PENALTY["red light"] ** red_lights
+    return progress * float(np.prod(list(list_penalties(hits, red_lights).values())))
+
+
+def describe_standing(stood_s: Mapping[str, float], time_s: float) -> str:
+    """Return how long a vehicle stood of a time [s], and before what, in words; "" for less than `STOOD_S`."""
+    if sum(stood_s.values()) < STOOD_S:
+        return ""
+    before = ", ".join(f"{duration:.1f} s before {cause}" for cause, duration in stood_s.items())
+    return f"; stood {sum(stood_s.values()):.1f} of {time_s:.1f} s: {before}"
+
+
+def name_cause(cause: int | str | None, seen: Seen, snapshot: Snapshot) -> str:
+    """Return in words what a driver slows for, see `Decision.cause`, and whether it is there by the true state.
+
+    A box is a false one where nobody is within `FALSE_M`.
+    """
+    if cause is None:
+        return "an open road"
+    if isinstance(cause, str):
+        return "a red light" if cause in read_lights(snapshot)[0] else "a green light taken for red"
+    at = seen.boxes.center[cause, :2]
+    rows = find_around(snapshot, np.inf)
+    away = np.hypot(*(snapshot.trace.position[0, rows, :2] - at).T)
+    if not len(rows) or away.min() > FALSE_M:
+        return f"a false {str(seen.boxes.label[cause]).lower()} of {seen.found_by}"
+    nearest = rows[int(away.argmin())]
+    parked = "parked " if str(snapshot.trace.actor[nearest]).startswith("parked") else ""
+    return f"a {parked}{snapshot.trace.category[nearest]}"
+
+
+def describe_drives(drives: Sequence[DriveResult]) -> str:
+    """Return the infractions of all drives, and how long they stood, in words."""
+    faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
+    reds, hard = sum(own.red_lights for own in drives), sum(own.hard_brakes for own in drives)
+    stood: dict[str, float] = {}
+    for own in drives:
+        for cause, duration in own.stood_s.items():
+            stood[cause] = stood.get(cause, 0.0) + duration
+    longest = dict(sorted(stood.items(), key=lambda each: -each[1]))
+    return (
+        f"{plural(len(drives), 'drive')}: {plural(faults, 'collision')} at fault, {plural(hits - faults, 'other')}, "
+        f"{plural(reds, 'red light')} passed, {plural(hard, 'hard brake')}"
+        f"{describe_standing(longest, sum(own.time_s for own in drives))}"
+    )
 
 
 def measure_ttc(route: Route, own: EgoMotion, truth: Seen, size: tuple[float, float]) -> float:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
+from flcav.driving.following import CERTAIN, CONFIRMED, Confirmed, FollowedTracks, Following, PathSpread
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
@@ -27,6 +27,7 @@ from flcav.perception.trajectory.rasters import RoadMap, road_map
 from flcav.perception.weather.evaluate import predict_probabilities
 from flcav.perception.weather.model import Classifier
 from flcav.perception.weather.samples import reduce_picture
+from flcav.perception.weights import find_shipped, read_card
 from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig, car, lidar32
@@ -60,6 +61,12 @@ class Networks(NamedTuple):
 def load_networks() -> Networks:
     """Return the networks of the package."""
     return Networks(*(resolve_network(task_named(name), None) for name in Networks._fields))
+
+
+@lru_cache(maxsize=len(Networks._fields))
+def name_network(task: str) -> str:
+    """Return the name of the package's network of a task, as in "objects (small)"."""
+    return f"{task} ({read_card(find_shipped(task_named(task))).network})"
 
 
 @lru_cache(maxsize=4)
@@ -119,15 +126,22 @@ class NetworkPerception:
     """Perception of a drive by the networks, from its sensors."""
 
     def __init__(
-        self, staged: StagedScenario, seed: int, *, spread: PathSpread = CERTAIN, road: RoadUnits | None = None
+        self,
+        staged: StagedScenario,
+        seed: int,
+        *,
+        spread: PathSpread = CERTAIN,
+        road: RoadUnits | None = None,
+        confirmed: Confirmed | None = CONFIRMED,
     ) -> None:
-        """Take a drive, its seed, how uncertain tracks are, and the poles that send what they find, if any."""
+        """Take a drive, its seed, how uncertain tracks are, poles that send what they find, and which tracks hold."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
-        self.weather = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
+        drawn = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
+        self.weather = staged.scenario.sky or drawn
         self.lights = LightReader(staged.town)
-        self._following = Following(self.networks.trajectory, load_road_map(staged.town.name), spread)
+        self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread, confirmed)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
@@ -153,7 +167,15 @@ class NetworkPerception:
         told = self._following.step(self.found, snapshot.time_s, closed)
         self.followed = told
         return Seen(
-            told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, WEATHER_SPEED[self.named]
+            told.boxes,
+            told.velocity,
+            told.path,
+            told.yaw,
+            told.spread,
+            closed,
+            amber,
+            WEATHER_SPEED[self.named],
+            name_network("objects"),
         )
 
     def name_weather(self, frame: Frame) -> str:
@@ -166,3 +188,8 @@ class NetworkPerception:
 def sense_networks(staged: StagedScenario, seed: int) -> NetworkPerception:
     """Return the perception by the networks of the package, for `loop.drive`."""
     return NetworkPerception(staged, seed)
+
+
+def sense_unconfirmed(staged: StagedScenario, seed: int) -> NetworkPerception:
+    """Return the perception by the networks of the package, which believes every track of two detections."""
+    return NetworkPerception(staged, seed, confirmed=None)

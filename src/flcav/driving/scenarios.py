@@ -4,20 +4,25 @@ A scenario with a seed is one drive: the route is of the scenario, traffic and t
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from flcav.config import InputError, shorten
-from flcav.driving.seen import EGO
-from flcav.geometry import heading_vectors, left_vectors
+from flcav.driving.scripts import Pose, Script, ScriptPlayer, write_script
+from flcav.driving.seen import EGO, WEATHER_SPEED
+from flcav.geometry import Array, heading_vectors, left_vectors, wrap_angle
+from flcav.interface.wording import plural, suggest
 from flcav.statistics.streams import derive_seed, stream
-from flcav.world.commands import Controls, Drive, Remove, Spawn, Walk
+from flcav.storage.records import LEFT_OUT, WHERE_TRUE
+from flcav.world.commands import Controls, Drive, Push, Remove, Spawn, Walk
 from flcav.world.live import LiveWorld, Settings
 from flcav.world.map.roads import Route, draw_route, read_net
 from flcav.world.map.town import TOWNS, Town, load_town
+from flcav.world.scenarios.scenario import Kind
+from flcav.world.weather import WEATHERS, Weather, find_nearest_class
 
 Event = Literal["none", "walker", "stalled", "braking"]
 
@@ -25,6 +30,10 @@ CAR = ("car", 3)
 ROUTE_M = 500.0
 SHORTEST_M = 250.0
 TRIES = 200
+LEAST_M = 60.0  # of a route behind its start, where the start or a place is given
+BEFORE_M = 40.0  # before a place that a route passes by the drive begins
+REACHES_M = (3.0, 8.0, 15.0, 35.0)  # from the route to a place or a start, tried in this order
+SAME_RAD = np.pi / 4  # from the heading of a start to that of the route
 DT_S = 0.1
 WALKER_MPS = 1.6
 STALLED_S = 14.0  # so long a broken-down car stands
@@ -42,6 +51,35 @@ class DrivingScenario:
     weather: str  # a class of the weather task
     traffic: int  # vehicles of SUMO
     pedestrians: int
+    sky: Annotated[Weather | None, LEFT_OUT] = None  # the weather itself; None: drawn from its class
+    place: Annotated[tuple[float, float] | None, LEFT_OUT] = None  # x, y that the route passes by [m]
+    start: Annotated[Pose | None, LEFT_OUT] = None  # x, y [m] and yaw [rad] where the ego vehicle sets out
+    speed: Annotated[float, WHERE_TRUE] = 0.0  # of the ego vehicle at first [m/s]
+    case: Annotated[Kind | None, LEFT_OUT] = None  # corner case that happens, beside the event
+    scripts: Annotated[tuple[Script, ...], WHERE_TRUE] = ()  # of an OpenSCENARIO file, beside the event
+
+    def with_sky(self, sky: Weather) -> "DrivingScenario":
+        """Return the scenario in a weather; of its classes the one that is driven slowest in counts."""
+        day = find_nearest_class(sky.model_copy(update={"sun_elevation_deg": 45.0}) if sky.night else sky)
+        slow = sky.night and WEATHER_SPEED[day] >= WEATHER_SPEED["night"]
+        return replace(self, sky=sky, weather="night" if slow else day)
+
+    def at_night(self) -> "DrivingScenario":
+        """Return the scenario at night, its rain and sight as they are."""
+        sun = {name: getattr(WEATHERS["night"], name) for name in ("sun_elevation_deg", "sun_azimuth_deg")}
+        sky = (self.sky or WEATHERS[self.weather]).model_copy(update=sun)
+        return replace(self.with_sky(sky), name=f"{self.name}-night")
+
+    def line(self) -> str:
+        """Return the scenario in words."""
+        events = [self.event if self.event != "none" else "", self.case or "", "script" if self.scripts else ""]
+        seen, sky = "", self.sky
+        if sky is not None:
+            rain, sight = f"rain {sky.rain_mm_h:.1f} mm/h", f"sight {sky.visibility_m:.0f} m"
+            seen = f" (sun {sky.sun_elevation_deg:.0f} deg, {rain}, {sight})"
+        happens = " and ".join(filter(None, events)) or "no event"
+        around = f"{plural(self.traffic, 'vehicle')}, {plural(self.pedestrians, 'pedestrian')}"
+        return f"{self.name}: {self.town}, {happens}, {self.weather}{seen}, {around}"
 
 
 def list_scenarios() -> tuple[DrivingScenario, ...]:
@@ -59,7 +97,10 @@ def find_scenarios(names: Sequence[str]) -> tuple[DrivingScenario, ...]:
     """Return the scenarios of these names, or all for none; raises `InputError` for an unknown one."""
     known = {each.name: each for each in list_scenarios()}
     if odd := [name for name in names if name not in known]:
-        raise InputError(f"scenario {shorten(odd[0])}: must be one of {', '.join(known)}")
+        raise InputError(
+            f"scenario {shorten(odd[0])}: neither a file, nor one of flcav{suggest(odd[0], known)}; `flcav drive "
+            "--list` names them"
+        )
     return tuple(known[name] for name in names) or list_scenarios()
 
 
@@ -68,6 +109,22 @@ def spread_scenarios(count: int) -> tuple[DrivingScenario, ...]:
     known = list_scenarios()
     step = 7  # coprime to their number: it goes through all
     return tuple(known[(step * i) % len(known)] for i in range(count))
+
+
+def find_start(route: Route, wanted: tuple[float, ...], reach_m: float) -> float | None:
+    """Return how far along a route [m] a drive begins; None where the route does not fit.
+
+    `wanted` is the place x, y [m] that it passes by, `BEFORE_M` further on, or the pose x, y, yaw at which it begins;
+    the route comes within `reach_m` of it.
+    """
+    marks = np.arange(0.0, route.length_m, 1.0)
+    poses: Array = route.at(marks)
+    away = np.hypot(*(poses[:, :2] - wanted[:2]).T)
+    if len(wanted) > 2:
+        away = np.where(np.abs(wrap_angle(poses[:, 2] - wanted[2])) < SAME_RAD, away, np.inf)
+    nearest = int(away.argmin())
+    begins = float(marks[nearest]) - (BEFORE_M if len(wanted) == 2 else 0.0)
+    return begins if away[nearest] < reach_m and begins >= 0 else None
 
 
 class StagedScenario:
@@ -93,12 +150,19 @@ class StagedScenario:
             self._at_m = self.start_m + float(self._random.uniform(45.0, 75.0))
             self._phase, self._since_s = "waits", 0.0
             self._prepare()
+            scripts = list(scenario.scripts)
+            if scenario.case is not None:
+                scripts.append(write_script(scenario.case, self.route.limit(self.start_m)))
+            self._player = ScriptPlayer(self.world, scripts, self.route, self.start_m) if scripts else None
         except BaseException:
             self.world.close()
             raise
 
     def act(self, along_m: float, speed: float) -> None:
         """Let the event go on, when the ego vehicle is `along_m` its route [m] and drives at `speed` [m/s]."""
+        if self._player is not None:
+            at_x, at_y, _ = self.world.snapshot.trace.position[0, self.world.snapshot.row(EGO)].tolist()
+            self._player.act((at_x, at_y), DT_S)
         match self.scenario.event:
             case "walker":
                 self._walk(along_m, speed)
@@ -112,15 +176,22 @@ class StagedScenario:
                 pass
 
     def _set_out(self, random: np.random.Generator) -> tuple[Route, float]:
-        net = read_net(self.town.net)
-        for _ in range(TRIES):
-            route, along = draw_route(net, random, ROUTE_M), float(random.uniform(8.0, 15.0))
+        net, wanted = read_net(self.town.net), self.scenario.start or self.scenario.place
+        for reach_m in [0.0] * TRIES if wanted is None else np.repeat(REACHES_M, TRIES).tolist():
+            route = draw_route(net, random, ROUTE_M)
+            along = float(random.uniform(8.0, 15.0)) if wanted is None else find_start(route, wanted, reach_m)
+            if along is None or route.length_m < along + (SHORTEST_M if wanted is None else LEAST_M):
+                continue
             x, y, yaw = route.at(along).tolist()
             car = Spawn(EGO, *CAR, x, y, yaw)
-            if route.length_m > SHORTEST_M and not self.world.find_obstruction(car):
+            if not self.world.find_obstruction(car):
                 self.world.apply(car)
+                if self.scenario.speed:
+                    forward = heading_vectors(yaw) * self.scenario.speed
+                    self.world.apply(Push(EGO, (float(forward[0]), float(forward[1]), 0.0)))
                 return route, along
-        raise InputError(f"{self.town.name}: no room was found for the car in {TRIES} places")
+        where = "" if wanted is None else f" on a lane through {wanted[0]:.0f}, {wanted[1]:.0f}"
+        raise InputError(f"{self.scenario.name}: {self.town.name} has no room for the car{where}")
 
     def _prepare(self) -> None:
         event = self.scenario.event

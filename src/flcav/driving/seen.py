@@ -49,6 +49,7 @@ class Seen:
     closed: frozenset[str]  # entries of `Trace.light` that are seen not to be green
     amber: frozenset[str]  # those of them that are yellow
     speed_share: float = 1.0  # of the speed limit, for the weather
+    found_by: str = "the truth"  # what the boxes are of
 
 
 class Perception(Protocol):

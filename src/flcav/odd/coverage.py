@@ -6,6 +6,8 @@ was observed (ASAM OpenODD 1.0, section 8.3).
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from html import escape
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +16,7 @@ from openodd import CoverageCollector, CoverageReport, CoverageView, export_cods
 from flcav.config import InputError, Json, read_json
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.odd.cells import CellErrors, Trial, cells_of, find_failures, full_name, measure_cells
 from flcav.odd.domain import Domain, Value
 from flcav.odd.measure import Measurements, measure_domain
@@ -73,8 +76,44 @@ def collect_runs(
             collector.record_outcome(not failed, failed_at=failed[0] if failed else None)
         document = collector.to_dict(data.keys[measured.frames[rows[0]]].scene)
         document["odd"]["started_at"] = BEGINNING
+        for item in document["items"]:
+            item["outside_odd"] = list_outside(domain, item)
         documents[name] = document
     return documents
+
+
+def list_outside(domain: Domain, item: Mapping[str, Json]) -> list[str]:
+    """Return the buckets of an item of a coverage document that are outside a domain.
+
+    The library takes a bucket for inside where its lower edge is, so that "<= 50 km/h" had a gap [50, 70). A bucket of
+    numbers, after the first, is outside where nothing between its edges is inside; whole numbers are as the library
+    has them.
+    """
+    known = [str(each) for each in _list(item["outside_odd"])]
+    name = str(item["attribute"])
+    definition = next((each.item for each in domain.definition.attributes if each.name == name), None)
+    if definition is None or not definition.numeric or item["unit"] == "count" or name not in domain.tested:
+        return known
+    limits = domain.limits.get(name, ())
+
+    def is_outside(low: float, high: float) -> bool:
+        cuts = [low, *(limit for limit in limits if low < limit < high), high]
+        return not any(domain.can_hold({name: (a + b) / 2}) for a, b in pairwise(cuts))
+
+    spans = zip(definition.labels, definition.edges, definition.edges[1:], strict=False)
+    beyond = {label for number, (label, *edges) in enumerate(spans) if number and is_outside(*edges)}
+    return [label for label in definition.labels if label in beyond or label in known]
+
+
+def _list(value: Json) -> Sequence[Json]:
+    return value if isinstance(value, list) else []
+
+
+def count_cells(documents: Sequence[Document], x: str, y: str) -> tuple[int, int]:
+    """Return how many cells of the matrix of two attributes are covered, and how many are inside the domain."""
+    cells = [cell for row in CoverageView(list(documents)).matrix(x=x, y=y)["cells"] for cell in row]
+    inside = [cell for cell in cells if not cell["outside_odd"]]
+    return sum(cell["state"] != "unsampled" for cell in inside), len(inside)
 
 
 def merge_runs(documents: Sequence[Document]) -> CoverageReport:
@@ -123,9 +162,10 @@ def write_runs(documents: Mapping[str, Document], out: Path) -> None:
         write_json(out / "runs" / f"{name}_coverage.json", document, sort=False)
 
 
-def write_matrix(documents: Sequence[Document], x: str, y: str, title: str, path: Path) -> None:
-    """Write the HTML page of the matrix of two attributes, which drills into the cells."""
-    page = view.page(title, CoverageView(list(documents)).explorer_html(x=x, y=y, depth=1))
+def write_matrix(documents: Sequence[Document], x: str, y: str, title: str, said: Sequence[str], path: Path) -> None:
+    """Write the HTML page of the matrix of two attributes, which drills into the cells, below sentences about it."""
+    lead = "".join(f"<p>{escape(line)}</p>" for line in said)
+    page = view.page(title, lead + CoverageView(list(documents)).explorer_html(x=x, y=y, depth=1))
     write_bytes(path, page.encode())
 
 
@@ -163,6 +203,19 @@ class DomainCoverage(Record):
     attributes: tuple[Covered, ...]
     by: tuple[str, ...]  # the attributes of cells
     cells: tuple[CellErrors, ...]  # empty where no detector ran
+    covered_cells: int  # of the matrix of the first two attributes of `by`
+    inside_cells: int  # cells of it inside the domain
+
+    @property
+    def sentences(self) -> tuple[str, str]:
+        """Return the two shares in words: of buckets by attribute, and of cells of the matrix."""
+        leaves = " x ".join(name.rpartition(".")[2] for name in self.by[:2])
+        share = f"{self.covered_cells / self.inside_cells:.0%}, " if self.inside_cells else ""
+        return (
+            f"{self.domain}: {plural(self.runs, 'run')}, mean coverage {self.grade:.0%} of buckets inside, over "
+            f"{plural(len(self.attributes), 'attribute')}",
+            f"{leaves}: {share}{self.covered_cells} of {plural(self.inside_cells, 'cell')} inside",
+        )
 
 
 def cover_domain(
@@ -202,11 +255,11 @@ def cover_domain(
     covered = tuple(row for row in every if row.attribute in {*domain.tested, *axes})
     grade = float(np.mean([row.grade for row in covered])) if covered else 0.0
     cells = measure_cells(OBJECTS.measure, join_outcomes(outcomes), tested, range_m) if tested else []
-    result = DomainCoverage(
-        domain.name, domain.definition.revision, len(documents), grade, covered, tuple(axes), tuple(cells)
-    )
+    every_run, revision = list(documents.values()), domain.definition.revision
+    counts = count_cells(every_run, axes[0], axes[1])
+    result = DomainCoverage(domain.name, revision, len(documents), grade, covered, tuple(axes), tuple(cells), *counts)
     write_runs(documents, out)
-    write_matrix(list(documents.values()), axes[0], axes[1], f"{domain.name}: {' x '.join(by)}", out / MATRIX)
+    write_matrix(every_run, axes[0], axes[1], f"{domain.name}: {' x '.join(by)}", result.sentences, out / MATRIX)
     write_json(out / CELL_REPORT, result.as_json(), sort=False)
     return result
 

@@ -6,7 +6,8 @@ A domain is one of `DOMAINS`, or a stranger's OpenODD file. The library would im
 
 import logging
 import math
-from collections.abc import Iterator, Mapping
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from itertools import pairwise
@@ -26,6 +27,7 @@ from openodd import (
 
 from flcav.config import InputError, path_within, read_yaml, shorten
 from flcav.interface.wording import suggest
+from flcav.odd.ranges import has_ranges, rewrite_ranges
 
 logging.getLogger("openodd").setLevel(logging.ERROR)  # of its warnings commands say what matters in their own words
 
@@ -39,6 +41,16 @@ REFUSED = {  # keys of strangers' files
     "probes": "it brings a binding, which may name code to import",
     "measure": "it brings a binding, which may name code to import",
     "openodd": "it brings a binding, which may name code to import",
+}
+MEANT = {  # how words that people use for a domain are said in flcav's concepts
+    **dict.fromkeys(("urban", "city", "suburban", "town"), "drivable_area_type: [distributor_road, minor_road]"),
+    "residential": "drivable_area_type: [minor_road]",
+    "rural": "drivable_area_type: [radial_road, distributor_road]",
+    **dict.fromkeys(("highway", "freeway"), "drivable_area_type: [motorway]"),
+    "intersection": "junction: [t_junction, crossroad]",
+    "dark": "light: [night]",
+    "rain": 'rainfall: "> 0 mm/h"',
+    "fog": 'visibility: "<= 400 m"',
 }
 
 Value = float | str | None  # of an attribute: None is missing
@@ -112,8 +124,11 @@ def read_domain(name: str | Path) -> Domain:
                 f"file{suggest(str(name), DOMAINS)}"
             )
         _refuse_foreign(path, path.parent, set())
-    own = any("TAXONOMY" in document for document in _documents(path, path.parent))
-    domain = _load([path] if own else [path, TAXONOMY], path.stem, path)
+    documents = list(_documents(path, path.parent))
+    taxonomies = [document["TAXONOMY"] for document in documents if "TAXONOMY" in document]
+    # The one that is imported is joined first, and those that extend it later.
+    sources = [rewrite_ranges(documents[::-1])] if any(map(has_ranges, taxonomies)) else [path]
+    domain = _load(sources if taxonomies else [path, TAXONOMY], path.stem, path)
     _refuse_empty(domain, path)
     return domain
 
@@ -123,7 +138,7 @@ def everything() -> Domain:
     return _load([TAXONOMY], "taxonomy", TAXONOMY)
 
 
-def _load(sources: list[Path], name: str, origin: Path) -> Domain:
+def _load(sources: Sequence[Path | str], name: str, origin: Path) -> Domain:
     backend = _backend()
     concepts = _read(sources, {}, backend, name, origin)
     bindings = {
@@ -155,12 +170,27 @@ def _load(sources: list[Path], name: str, origin: Path) -> Domain:
 
 
 def _read(
-    sources: list[Path], bindings: Mapping[str, Mapping[str, str]], backend: Backend, name: str, origin: Path
+    sources: Sequence[Path | str], bindings: Mapping[str, Mapping[str, str]], backend: Backend, name: str, origin: Path
 ) -> OddDefinition:
     try:
         return load_openodd(*sources, bindings=bindings, backend=backend, name=name)
     except (OpenOddError, UnitError, GitSourceError) as error:
-        raise InputError(f"{origin}: not OpenODD as openodd-py reads it ({error})") from None
+        meant = _say_meant(str(error))
+        raise InputError(f"{origin}: not OpenODD as openodd-py reads it ({error}){meant}") from None
+
+
+def _say_meant(error: str) -> str:
+    """Return what was meant by a word that an attribute does not have: of another attribute, or another word."""
+    found = re.search(r"has no literal (.+?) \(literals: (.*)\)", error)
+    if found is None:
+        return ""
+    word = found[1].strip("'\"").lower()
+    for leaf, words in _literals().items():
+        if word in words:
+            return f"; {word} is a word of {leaf}: write `{leaf}: [{word}]`"
+    if word in MEANT:
+        return f"; {word} is said by another attribute: write `{MEANT[word]}`"
+    return suggest(word, found[2].split(", "))
 
 
 def _section(name: str) -> dict[str, dict[str, str]]:

@@ -8,84 +8,18 @@ is written.
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Sequence
-from dataclasses import dataclass
 
+from flcav.driving.scripts import BEGINS_S, Entity, Script, Speed, write_script
 from flcav.odd.sampling import SampledScenario
-from flcav.world.scenarios.scenario import Kind
 from flcav.world.shapes import SHAPES
 from flcav.world.weather import NO_FOG_M
 
 REVISION = (1, 2)
 DATE = "1970-01-01T00:00:00"  # the same scenario gives the same bytes
-BEGINS_S, ENDS_S = 2.0, 20.0
-LANE_M = 3.4  # from a lane's middle to that of the next
+ENDS_S = 20.0
 AXLE_M = 0.32  # height of an axle: half of a wheel's diameter
 LUX = 120_000.0  # of the sun at the zenith
 CLOUDS = ((0.125, "oneOktas"), (0.5, "fourOktas"), (0.8, "sixOktas"), (1.0, "eightOktas"))  # up to this share
-
-Pose = tuple[float, float, float]  # ahead of and left of the ego's start [m], heading to the ego's [rad]
-
-
-@dataclass(frozen=True)
-class Entity:
-    """An entity of a scenario beside the ego."""
-
-    name: str
-    category: str
-    shape: str
-    start: Pose
-    speed: float  # [m/s]
-
-
-@dataclass(frozen=True)
-class Speed:
-    """An actor goes over to a speed [m/s] at a rate [m/s^2]."""
-
-    actor: str
-    target: float
-    rate: float
-
-
-@dataclass(frozen=True)
-class Aside:
-    """A lane change of an actor: the number of lanes to the left, and the duration."""
-
-    actor: str
-    lanes: int
-    within_s: float
-
-
-@dataclass(frozen=True)
-class Script:
-    """What happens in a corner case: actors, and actions that begin together when the trigger fires."""
-
-    actors: tuple[Entity, ...]
-    actions: tuple[Speed | Aside, ...]
-    near: str | None = None  # fires when the ego is within `within_m` of this actor; None: at `BEGINS_S`
-    within_m: float = 0.0
-
-
-def write_script(case: Kind, limit: float) -> Script:
-    """Return the script of a corner case on a street with that speed limit [m/s]."""
-    back = math.pi
-    if case == "stalled_vehicle":
-        return Script((Entity("stalled", "car", "sedan", (25.0, 0.0, 0.0), limit),), (Speed("stalled", 0.0, 4.0),))
-    if case == "crash":
-        ahead, behind = (Entity(f"car_{n}", "car", "sedan", (at, 0.0, 0.0), limit) for n, at in ((1, 38.0), (2, 28.0)))
-        return Script((ahead, behind), (Speed("car_1", 0.0, 9.0),))
-    if case == "cut_in":
-        car = Entity("neighbour", "car", "hatchback", (8.0, LANE_M, 0.0), 0.9 * limit)
-        return Script((car,), (Aside("neighbour", -1, 2.2),))
-    if case == "overtaking":
-        slow = Entity("slow", "truck", "box_truck", (70.0, LANE_M, back), 0.5 * limit)
-        fast = Entity("overtaking", "car", "sedan", (85.0, LANE_M, back), limit)
-        return Script((slow, fast), (Aside("overtaking", 1, 2.5), Speed("overtaking", 1.2 * limit, 2.0)))
-    if case == "pedestrian_behind_van":
-        van = Entity("van", "van", "high_van", (24.0, -2.6, 0.0), 0.0)
-        walker = Entity("walker", "pedestrian", "child", (28.5, -3.2, math.pi / 2), 0.0)
-        return Script((van, walker), (Speed("walker", 2.6, 4.0),), near="walker", within_m=22.0)
-    runner = Entity("runner", "car", "hatchback", (48.0, -35.0, math.pi / 2), 9.0)
-    return Script((runner,), (Speed("runner", 12.0, 2.0),), near="runner", within_m=45.0)
 
 
 def to_openscenario(sample: SampledScenario, map_file: str) -> bytes:

@@ -21,7 +21,15 @@ from flcav.driving.driver import (
 )
 from flcav.driving.jobs import DriveJob, Sensed, run_job
 from flcav.driving.loop import LOOP
-from flcav.driving.measures import DriveResult, Hit, judge_collision, score_drive
+from flcav.driving.measures import (
+    DriveResult,
+    Hit,
+    describe_drives,
+    judge_collision,
+    list_penalties,
+    name_cause,
+    score_drive,
+)
 from flcav.driving.scenarios import find_scenarios, list_scenarios, spread_scenarios
 from flcav.driving.seen import TASKS, TIMES_S, Perception, Seen, leave_out, predict_motion
 from flcav.driving.studies.importance import compare_drives, kendall, weigh
@@ -29,6 +37,7 @@ from flcav.geometry import Boxes
 from flcav.world.dynamics.vehicle import make_blueprint
 from flcav.world.map.roads import Route
 from flcav.world.snapshot import Collision, Snapshot
+from flcav.world.trace import empty_trace
 
 CAR = make_blueprint("car", 3)
 HALF_M = CAR.size[0] / 2
@@ -171,9 +180,64 @@ def test_score_and_faults() -> None:
     assert score_drive(0.8, [replace(hit, at_fault=False)], 0) == pytest.approx(0.8)
 
 
+def test_every_infraction_is_in_the_line_in_the_summary_and_in_the_score() -> None:
+    walker = Hit(9.0, "walker", "pedestrian", 5.0, True)
+    tree, rammed = Hit(3.0, "tree:3", "obstacle", 5.0, True), Hit(4.0, "veh1", "vehicle", 5.0, False)
+    hits = (tree, rammed)
+    own = DriveResult("s", 2, 20.0, 0.65, 5.0, 4.0, 0.0, 1, 2, hits, 0.65 * 0.5 * 0.49, list_penalties(hits, 2))
+    assert own.penalties == pytest.approx({"1 obstacle": 0.5, "2 red lights": 0.49})
+    assert own.line() == (
+        "s, seed 2: progress 0.65, 5.0 m/s, least time to collision 4.00 s, 1 hard brake, 2 red lights passed, hits "
+        "tree:3, is hit by veh1, score 0.16 = 0.65 x 0.5 (1 obstacle) x 0.49 (2 red lights)"
+    )
+    assert list_penalties([walker], 0) == {"1 pedestrian": 0.0}
+    stood = replace(own, red_lights=1, hits=(), stood_s={"a red light": 4.0, "an open road": 0.1})
+    assert describe_drives([own, stood]) == (
+        "2 drives: 1 collision at fault, 1 other, 3 red lights passed, 2 hard brakes; stood 4.1 of 40.0 s: "
+        "4.0 s before a red light, 0.1 s before an open road"
+    )
+    assert "stood" not in replace(own, stood_s={"an open road": 0.9}).line()
+
+
+@pytest.mark.parametrize(
+    ("row", "light", "told"),
+    [
+        (0, "", "a car"),  # 2 m from where it is
+        (1, "", "a false car of objects (small)"),
+        (2, "", "a parked van"),
+        (None, "x:1", "a red light"),
+        (None, "x:0", "a green light taken for red"),
+        (None, "", "an open road"),
+    ],
+)
+def test_what_a_vehicle_stands_before_is_named_by_the_truth(row: int | None, light: str, told: str) -> None:
+    names, places = ["ego", "veh1", "parked4"], [(0.0, 0.0), (12.0, 0.0), (30.0, 3.0)]
+    count = len(names)
+    trace = replace(
+        empty_trace("grid"),
+        actor=np.array(names),
+        category=np.array(["car", "car", "van"]),
+        position=np.pad(np.array(places), ((0, 0), (0, 1)))[None],
+        velocity=np.zeros((1, count, 3)),
+        light=np.array(["x:0", "x:1"]),
+        light_state=np.array([["G", "r"]]),
+    )
+    seen = replace(see((14.0, 0, 0, 0, 0), (20.0, 0, 0, 0, 0), (30, 3, 0, 0, 0)), found_by="objects (small)")
+    snapshot = Snapshot(0, 0.0, trace, {}, ())
+    assert name_cause(light or row, seen, snapshot) == told
+
+
+@pytest.mark.parametrize("closed", ["", "x:1"])
+def test_a_decision_names_what_it_slows_for(closed: str) -> None:
+    route = straight(((100.0, "x:1"),))
+    near, far = (42.0, 0.0, 0.0, 0.0, 0.0), (70.0, 0.0, 0.0, 0.0, 0.0)
+    assert decide_controls(route, at(20.0, 6.0), see(far, near, closed=closed), CAR).cause == 1
+    assert decide_controls(route, at(84.0, 6.0), see(far, closed=closed), CAR).cause == (closed or None)
+
+
 def test_unknown_scenarios_are_refused() -> None:
     assert len({each.name for each in spread_scenarios(32)}) == 32 == len(list_scenarios())
-    with pytest.raises(InputError, match="must be one of"):
+    with pytest.raises(InputError, match="flcav drive --list"):
         find_scenarios(["nowhere"])
 
 

@@ -208,7 +208,7 @@ def test_the_gain_of_poles_is_told_with_paired_differences() -> None:
     told = gain.lines()
     assert told[1].endswith(" 0.500, with the poles 0.750, with less without +0.250 (+0.100 to +0.400)")
     assert "without poles: least time to collision 1.50 s" in told[2]
-    assert "1 collisions at fault" in told[2]
+    assert "1 collision at fault, 0 red lights passed" in told[2]
     assert "least time to collision [s] +0.500 (+0.500 to +0.500)" in told[4]
     assert "collisions at fault -0.500 (-1.000 to +0.000)" in told[4]
     assert len(replace(gain, without=tuple(without[:1]), with_poles=tuple(with_poles[:1])).lines()) == len(told) - 1

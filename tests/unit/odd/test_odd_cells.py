@@ -4,6 +4,7 @@ import csv
 import json
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import transform_points
 from flcav.odd.cells import Trial, cells_of, find_failures, measure_cell, measure_cells
 from flcav.odd.coverage import collect_runs, list_covered, load_report, merge_runs, write_cod, write_matrix, write_runs
-from flcav.odd.domain import Domain, everything
+from flcav.odd.domain import Domain, everything, read_domain
 from flcav.odd.measure import measure_domain
 from flcav.odd.scenery import Scenery
 from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError
@@ -156,17 +157,43 @@ def test_coverage_is_read_by_the_library_and_its_own_command(drive: Dataset, urb
     rows = {row.attribute: row for row in list_covered(merge_runs(list(documents.values())))}
     seen = {str(word) for word in measured.columns["junction"]}
     assert set(rows["scenery.junction"].covered) == seen & {"none", "t_junction", "crossroad", "roundabout"}
-    assert rows["scenery.speed_limit"].outside == ("[75, 100)", "[100, 130]")
+    assert rows["scenery.speed_limit"].outside == ("[55, 75)", "[75, 100)", "[100, 130]")  # at most 55 km/h
     write_runs(documents, tmp_path)
     assert load_report(tmp_path).runs == 4
-    write_matrix(list(documents.values()), "scenery.junction", "environment.light", "urban", tmp_path / "matrix.html")
-    page = (tmp_path / "matrix.html").read_text()
+    path = tmp_path / "matrix.html"
+    axes = ("scenery.junction", "environment.light")
+    write_matrix(list(documents.values()), *axes, "urban", ["4 runs & more"], path)
+    page = path.read_text()
     assert "roundabout" in page
     assert "night" in page
+    assert "<p>4 runs &amp; more</p>" in page
     assert page.startswith("<!")
     own = [sys.executable, "-c", "from openodd.report import main; raise SystemExit(main())", str(tmp_path / "runs")]
     told = subprocess.run(own, capture_output=True, text=True, check=True).stdout
     assert "scenery.junction" in told
+
+
+@pytest.mark.parametrize(
+    ("rule", "outside"),
+    [
+        ("ego_speed: '<= 50 km/h'", ["[50, 70)", "[70, 130]"]),
+        ("ego_speed: '< 50 km/h'", ["[50, 70)", "[70, 130]"]),
+        ("ego_speed: '<= 51 km/h'", ["[70, 130]"]),
+        ("ego_speed: '>= 50 km/h'", ["[0, 5)", "[5, 30)", "[30, 50)"]),
+        ("ego_speed: '[30 .. 50] km/h'", ["[0, 5)", "[5, 30)", "[50, 70)", "[70, 130]"]),
+        ("rainfall: '<= 0 mm/h'", ["[0.3, 5)", "[5, 20)", "[20, 60]"]),  # dry is in the first
+        ("lanes: '[1 .. 3] count'", []),  # 3 lanes are in the last
+    ],
+)
+def test_a_bucket_that_only_begins_in_the_domain_is_outside(
+    rule: str, outside: list[str], drive: Dataset, odd_file: Callable[[str], Path]
+):
+    domain = read_domain(odd_file(f"MODULES: {{m: {{INCLUDE_AND: {{{rule}}}}}}}"))
+    document = next(iter(collect_runs(domain, drive, measure_domain(drive)).values()))
+    items = document["items"]
+    assert isinstance(items, list)
+    (item,) = (each for each in items if isinstance(each, dict) and each["attribute"] == domain.tested[0])
+    assert item["outside_odd"] == outside
 
 
 def test_a_run_fails_at_its_first_failure_and_equal_recordings_give_equal_documents(drive: Dataset, urban: Domain):

@@ -72,7 +72,12 @@ def test_cover_writes_its_report(drive: Dataset, tmp_path: Path, capsys: pytest.
     assert len(grades) > len(by)
     assert printed["grade"] == pytest.approx(np.mean(list(grades.values())))
     assert printed["cells"] == []
-    assert (out / "matrix.html").is_file()
+    told = answer(capsys, "cover", "urban", "--data", str(drive.folder), "--out", str(out))
+    page = (out / "matrix.html").read_text()
+    cells = f"{printed['covered_cells']} / {printed['inside_cells']} cells"
+    assert f'>{printed["covered_cells"] / printed["inside_cells"]:.0%}</span><span class="oo-s">{cells}<' in page
+    for sentence in (told.splitlines()[0], told.splitlines()[-1].removeprefix(f"{out / 'matrix.html'}: ")):
+        assert f"<p>{sentence}</p>" in page
 
 
 def test_cover_says_where_the_detector_errs(drive: Dataset, tmp_path: Path, capsys: pytest.CaptureFixture[str]):

@@ -9,7 +9,7 @@ import pytest
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.odd import domain as reading
-from flcav.odd.domain import DOMAINS, everything, read_domain
+from flcav.odd.domain import DOMAINS, MEANT, everything, read_domain
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4] / "shared" / "data")) / "odd"
 Write = Callable[..., Path]
@@ -110,10 +110,81 @@ def test_a_pipe_is_not_waited_for(odd_file: Write):
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"Autoware's ODD files are not at {REAL}; set FLCAV_REAL_DATA")
-@pytest.mark.parametrize("name", ["ODD_Dense_Urban", "Domain_Concepts_Definition_ISO_34503"])
-def test_autowares_files_are_refused_in_one_sentence(name: str, capsys: pytest.CaptureFixture[str]):
+@pytest.mark.parametrize(
+    ("name", "said"),
+    [
+        ("ODD_Dense_Urban", "no literal minor_or local_roads"),  # a typing error in the file, whose word is suggested
+        ("ODD_Dense_Urban", "did you mean 'minor_or_local_roads'?"),
+        ("Domain_Concepts_Definition_ISO_34503", "has no modules"),
+        ("ODD_Taxonomy_Extended", "has no modules"),
+    ],
+)
+def test_autowares_files_are_refused_in_one_sentence(name: str, said: str, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         run(["odd", "check", str(REAL / f"{name}.yaml")])
     told = capsys.readouterr()
     assert (ended.value.code, told.out, told.err.count("\n")) == (2, "", 1)
-    assert "cannot read the type '>= 0 m'" in told.err
+    assert said in told.err
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"Autoware's ODD files are not at {REAL}; set FLCAV_REAL_DATA")
+@pytest.mark.parametrize("name", ["ODD_Taxonomy_Extended", "Domain_Concepts_Definition_ISO_34503"])
+def test_a_domain_on_autowares_concepts_is_read(name: str, odd_file: Write):
+    for path in REAL.glob("*.yaml"):
+        odd_file(path.read_text(), path.name)
+    rules = "lane_width: '[2.5 .. 4] m', rainfall_intensity: [no_rain, light_rain], speed_limit: '<= 50 km/h'"
+    found = read_domain(odd_file(f"IMPORT: [{name}.yaml]\nMODULES: {{m: {{INCLUDE_AND: {{{rules}}}}}}}"))
+    assert {each.rpartition(".")[2] for each in found.tested} == {"lane_width", "rainfall_intensity", "speed_limit"}
+    assert {found.bound[each] for each in found.tested if each in found.bound} == {"lane_width", "speed_limit"}
+    (width,) = (each for each in found.tested if each.endswith("lane_width"))
+    assert [found.can_hold({width: value}) for value in (2.4, 3.0, 4.1)] == [False, True, False]
+
+
+RAIN = """
+TAXONOMY:
+  rain:
+    intensity:
+      none: {rate: "<= 0 mm/h"}
+      light: {rate: "[0 .. 2.5] mm/h"}
+    kind: [dynamic]
+"""
+
+
+@pytest.mark.parametrize("typed", ["'>= 0 m'", '"[0 .. 20] m"', "'> 0 km'", "'<10.5 m'"])
+def test_a_range_in_place_of_a_type_is_a_number(typed: str, odd_file: Write):
+    text = f"TAXONOMY: {{lane_width: {typed}}}\nMODULES: {{m: {{INCLUDE_AND: {{lane_width: '<= 4 m'}}}}}}"
+    found = read_domain(odd_file(text))
+    (name,) = found.tested
+    assert found.bound == {name: "lane_width"}
+    assert [found.can_hold({name: value}) for value in (3.9, 4.1)] == [True, False]
+
+
+def test_classes_by_range_are_words_and_files_that_extend_others_add_theirs(odd_file: Write):
+    odd_file(RAIN, "rain.yaml")
+    more = "TAXONOMY: {rain: {kind: [convective]}}"
+    rules = "MODULES: {m: {INCLUDE_AND: {intensity: [light], kind: [convective, dynamic], rate: '<= 2 mm/h'}}}"
+    found = read_domain(odd_file(f"IMPORT: [rain.yaml]\n{more}\n{rules}"))
+    names = {each.rpartition(".")[2]: each for each in found.tested}
+    assert found.can_hold({names["intensity"]: "light", names["rate"]: 1.0})
+    assert not found.can_hold({names["intensity"]: "none"})
+    assert not found.can_hold({names["rate"]: 3.0})
+
+
+@pytest.mark.parametrize(
+    ("rule", "meant"),
+    [
+        ("zone: [urban]", "write `drivable_area_type: [distributor_road, minor_road]`"),
+        ("zone: [motorway]", "motorway is a word of drivable_area_type"),
+        ("surface_type: [wet]", "wet is a word of surface_condition"),
+        ("junction: [crossroads]", "did you mean 'crossroad'?"),
+    ],
+)
+def test_a_word_of_another_attribute_says_which_is_meant(rule: str, meant: str, odd_file: Write):
+    with pytest.raises(InputError) as refused:
+        read_domain(odd_file(f"MODULES: {{m: {{INCLUDE_AND: {{{rule}}}}}}}"))
+    assert meant in str(refused.value)
+
+
+@pytest.mark.parametrize("word", MEANT)
+def test_what_is_said_to_be_meant_is_a_domain(word: str, odd_file: Write):
+    assert read_domain(odd_file(f"MODULES: {{m: {{INCLUDE_AND: {{{MEANT[word]}}}}}}}")).unbound == ()

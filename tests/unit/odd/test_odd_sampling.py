@@ -12,10 +12,11 @@ import yaml
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
+from flcav.driving.scripts import write_script
 from flcav.odd.coverage import collect_runs, list_covered, merge_runs
 from flcav.odd.domain import Domain, read_domain
 from flcav.odd.measure import measure_domain
-from flcav.odd.openscenario import to_openscenario, write_script
+from flcav.odd.openscenario import to_openscenario
 from flcav.odd.sampling import CASE, CASES, METHODS, Axis, SampledScenario, Space, make_recipe, sample_domain
 from flcav.odd.scenery import Scenery
 from flcav.sources.recipe import load_recipe, parse_recipe

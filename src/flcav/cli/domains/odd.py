@@ -207,13 +207,13 @@ def cover(
             progress=report,
         )
     yield result.as_json()
-    yield f"{found.name}: {plural(result.runs, 'run')}, mean coverage {result.grade:.0%} of buckets inside"
+    yield result.sentences[0]
     for row in result.attributes:
         holes = f"; not covered: {', '.join(row.holes)}" if row.holes else ""
         yield f"    {row.attribute:<32}{row.grade:>4.0%}{holes}"
     for row in result.cells:
         yield _describe_cell(row)
-    yield f"{out / 'matrix.html'}: {by}"
+    yield f"{out / 'matrix.html'}: {result.sentences[1]}"
 
 
 @odd.command()

@@ -18,6 +18,7 @@ from flcav.driving.loop import Loop
 from flcav.driving.measures import DriveResult
 from flcav.driving.scenarios import DrivingScenario
 from flcav.driving.seen import FEEDS, TASKS, Coupling
+from flcav.geometry import Array
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import find_shipped, read_card
@@ -137,14 +138,24 @@ def paired_difference(
     Drives are paired; those of one scenario, the seeds, are drawn together.
     """
     off = np.array([float(getattr(b, field)) - float(getattr(a, field)) for a, b in zip(first, second, strict=True)])
+    return _mean_over(off, names, field)
 
+
+def mean_measure(drives: Sequence[DriveResult], field: str) -> Estimate:
+    """Return the mean of a measure, with its interval over scenarios (bootstrap); over seeds where there is one."""
+    names = [own.scenario for own in drives]
+    groups = names if len(set(names)) > 1 else [str(own.seed) for own in drives]
+    return _mean_over(np.array([float(getattr(own, field)) for own in drives]), groups, field)
+
+
+def _mean_over(values: Array, groups: Sequence[str], field: str) -> Estimate:
     def mean(counts: np.ndarray) -> np.ndarray:
-        return (counts @ off) / np.maximum(counts.sum(axis=1), 1)
+        return (counts @ values) / np.maximum(counts.sum(axis=1), 1)
 
-    if len(set(names)) < 2:
-        return Estimate(float(off.mean()), None, None)
-    low, high = bootstrap_over_scenes(mean, names, rng=stream(0, "importance", field))
-    return Estimate(float(off.mean()), low, high)
+    if len(set(groups)) < 2:
+        return Estimate(float(values.mean()), None, None)
+    low, high = bootstrap_over_scenes(mean, groups, rng=stream(0, "importance", field))
+    return Estimate(float(values.mean()), low, high)
 
 
 def weigh(tasks: Sequence[TaskImportance]) -> tuple[TaskImportance, ...]:

@@ -20,6 +20,7 @@ from flcav.driving.seen import EGO, EYE_M, FIELD_M, Seen, share_seen
 from flcav.driving.studies.importance import paired_difference
 from flcav.geometry import Array, Boxes, rotate
 from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
 from flcav.perception.metrics.detection import match, weighted_precision
 from flcav.perception.objects.truth import CARS
 from flcav.statistics.bootstrap import bootstrap_over_scenes
@@ -219,9 +220,10 @@ class ClosedLoopGain(Record):
                 float(np.mean([getattr(own, each) for own in drives])) for each in ("least_ttc_s", "near_share")
             )
             faults, score = sum(own.faults for own in drives), float(np.mean([own.score for own in drives]))
+            reds = plural(sum(own.red_lights for own in drives), "red light")
             lines.append(
                 f"{name}: least time to collision {ttc:.2f} s, below 1.5 s for {near:.1%} of the time, "
-                f"{faults} collisions at fault, driving score {score:.2f}"
+                f"{plural(faults, 'collision')} at fault, {reds} passed, driving score {score:.2f}"
             )
         names = [own.scenario for own in self.without]
         if len(set(names)) > 1:

@@ -1,0 +1,171 @@
+"""Closed loop: the networks of the package drive, against ground truth and against what they were before.
+
+Every arm drives the same scenarios and seeds. Before, the driver had no way around vehicles that stand and believed
+every track of two detections; now it looks for one (`driving.passing`) and a track is believed when it was found in
+three of five sweeps (`driving.following.Confirmed`). Both were tuned on seeds below 100.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from flcav.driving.driver import DriverSettings
+from flcav.driving.jobs import DriveJob, Sensed, run_jobs
+from flcav.driving.loop import Loop
+from flcav.driving.measures import DriveResult
+from flcav.driving.scenarios import spread_scenarios
+from flcav.driving.studies.importance import mean_measure, paired_difference
+from flcav.experiments.experiment import Experiment, Options, Outcome
+from flcav.interface.progress import Report, ignore_progress
+from flcav.interface.wording import plural
+from flcav.runs.provenance import Provenance, provenance
+from flcav.statistics.estimates import Estimate, score_interval
+from flcav.storage.markdown import format_table
+from flcav.storage.records import Record
+
+SCENARIOS, SEEDS, LASTS_S = 32, 1, 12.0
+FIRST_SEED = 900
+TOGETHER = 8  # drives of an arm, before those of the next
+PASSING = DriverSettings(passes=True)
+TRUTH, NOW, BEFORE = "ground truth", "networks", "networks, before"
+ARMS: Mapping[str, tuple[Sensed, DriverSettings]] = {
+    TRUTH: (Sensed("truth"), PASSING),
+    NOW: (Sensed("networks"), PASSING),
+    BEFORE: (Sensed("networks", unconfirmed=True), DriverSettings()),
+}
+PAIRS = ((NOW, TRUTH), (NOW, BEFORE))
+MEASURES = ("progress", "score", "faults", "red_lights", "hard_brakes")
+
+
+@dataclass(frozen=True)
+class ArmResult:
+    """Measures of one arm over all drives; intervals over scenarios, of collisions Wilson's."""
+
+    progress: Estimate
+    score: Estimate
+    crashed: Estimate  # share of the drives with a collision at fault
+    red_lights: int
+    hard_brakes: Estimate  # a drive
+    stood_s: Mapping[str, float]  # over all drives, by what the vehicle stood before, longest first
+
+
+@dataclass(frozen=True)
+class ClosedLoop(Record):
+    """The arms of the closed loop over the same drives."""
+
+    scenarios: int
+    drives: int  # of each arm
+    lasts_s: float
+    arms: Mapping[str, ArmResult]
+    differences: Mapping[str, Mapping[str, Estimate]]  # "networks less ground truth", ...: by field of a drive
+    provenance: Provenance
+
+    def sentences(self) -> list[str]:
+        """Return the measures in words."""
+        return [
+            f"{name}: progress {own.progress.describe()}, {per_hundred(own.crashed)} collisions at fault per hundred "
+            f"drives, {plural(own.red_lights, 'red light')} passed, stood {self.share_stood(own):.0%} of the "
+            "time"
+            for name, own in self.arms.items()
+        ]
+
+    def share_stood(self, own: ArmResult) -> float:
+        """Return the share of the time that the vehicle stood in an arm."""
+        return sum(own.stood_s.values()) / (self.drives * self.lasts_s)
+
+
+def per_hundred(share: Estimate) -> str:
+    """Return a share with its interval per hundred, in words."""
+    return f"{100 * share.mean:.1f} ({100 * (share.low or 0.0):.1f} to {100 * (share.high or 0.0):.1f})"
+
+
+def compare_perception(
+    out: Path, seeds: int = SEEDS, jobs: int = 1, progress: Report = ignore_progress, scenarios: int = SCENARIOS
+) -> ClosedLoop:
+    """Return the comparison over scenarios of the package and `seeds` seeds; drives are kept in the folder `out`.
+
+    Arms go on side by side, so that what a stopped run has kept is comparable.
+    """
+    pairs = [(each, FIRST_SEED + seed) for seed in range(seeds) for each in spread_scenarios(scenarios)]
+    drives: dict[str, list[DriveResult]] = {name: [] for name in ARMS}
+    for done in range(0, len(pairs), TOGETHER):
+        for name, (sensed, settings) in ARMS.items():
+            own = [DriveJob(*pair, loop=Loop(settings, LASTS_S)) for pair in pairs[done : done + TOGETHER]]
+            drives[name] += run_jobs(own, sensed, jobs, kept=out / "drives.jsonl")
+        progress(min(done + TOGETHER, len(pairs)), len(pairs), pairs[done][0].name)
+    return summarise_arms(drives, scenarios)
+
+
+def summarise_arms(drives: Mapping[str, Sequence[DriveResult]], scenarios: int) -> ClosedLoop:
+    """Return the comparison of the arms' drives, which are of the same scenarios and seeds."""
+    names = [own.scenario for own in drives[NOW]]
+    return ClosedLoop(
+        scenarios=scenarios,
+        drives=len(names),
+        lasts_s=LASTS_S,
+        arms={name: _summarise(own) for name, own in drives.items()},
+        differences={
+            f"{one} less {other}": {
+                measure: paired_difference(drives[other], drives[one], names, measure) for measure in MEASURES
+            }
+            for one, other in PAIRS
+        },
+        provenance=provenance(),
+    )
+
+
+def _summarise(drives: Sequence[DriveResult]) -> ArmResult:
+    stood: dict[str, float] = {}
+    for own in drives:
+        for cause, duration in own.stood_s.items():
+            stood[cause] = round(stood.get(cause, 0.0) + duration, 1)
+    return ArmResult(
+        progress=mean_measure(drives, "progress"),
+        score=mean_measure(drives, "score"),
+        crashed=score_interval(sum(own.faults > 0 for own in drives) / len(drives), len(drives)),
+        red_lights=sum(own.red_lights for own in drives),
+        hard_brakes=mean_measure(drives, "hard_brakes"),
+        stood_s=dict(sorted(stood.items(), key=lambda each: -each[1])),
+    )
+
+
+def closed_loop_tables(results: ClosedLoop) -> dict[str, str]:
+    """Return Markdown by name: arms, differences, standing."""
+    rows = [
+        [
+            name,
+            own.progress.describe(),
+            per_hundred(own.crashed),
+            str(own.red_lights),
+            own.hard_brakes.describe(),
+            f"{results.share_stood(own):.1%}",
+            own.score.describe(),
+        ]
+        for name, own in results.arms.items()
+    ]
+    columns = (
+        "perception",
+        "progress",
+        "collisions at fault per hundred drives",
+        "red lights passed",
+        "hard brakes a drive",
+        "time it stood",
+        "score",
+    )
+    gaps = [[name, *(gap[each].describe(sign=True) for each in MEASURES)] for name, gap in results.differences.items()]
+    causes = list(dict.fromkeys(cause for own in results.arms.values() for cause in own.stood_s))
+    stood = [[cause, *(f"{own.stood_s.get(cause, 0.0):.1f}" for own in results.arms.values())] for cause in causes]
+    return {
+        "arms": format_table(columns, rows),
+        "differences": format_table(("difference", *(each.replace("_", " ") for each in MEASURES)), gaps),
+        "standing": format_table(("stood before [s]", *results.arms), stood),
+    }
+
+
+def _run(out: Path, options: Options) -> Outcome[ClosedLoop]:
+    with options.show_progress(options.title) as report:
+        results = compare_perception(out, options.seeds, options.jobs, report, 2 if options.quick else SCENARIOS)
+    return Outcome(results, {}, results.sentences())
+
+
+EXPERIMENT = Experiment(ClosedLoop, _run, closed_loop_tables, seeds=SEEDS, takes=("seeds", "scale", "jobs"))
