@@ -19,8 +19,8 @@ from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
 import flcav
-from flcav.cli.help import SHOWN
 from flcav.cli.main import app
+from flcav.cli.options import SHOWN
 from flcav.storage.markdown import format_table
 
 ROOT = Path(__file__).parents[1]

@@ -20,9 +20,8 @@ from flcav.cli.domains.sampling import sample
 from flcav.cli.drive import drive
 from flcav.cli.federate import federate
 from flcav.cli.fleet import fleet
-from flcav.cli.help import add_examples
 from flcav.cli.network import radio, rounds
-from flcav.cli.options import escape_markup
+from flcav.cli.options import add_examples, escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.pictures import birdseye, camera, view
 from flcav.cli.planning.allocate import allocate, replan
