@@ -170,7 +170,7 @@ def picture(record: object) -> bytes | None:
     return None
 
 
-def tabulate(record: object) -> str | None:
+def as_table(record: object) -> str | None:
     """Return a record as an HTML table for a notebook; None for one that is displayed as a picture."""
     for name in _names(record):
         if name in TABLES:

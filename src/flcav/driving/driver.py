@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from shapely.geometry.base import BaseGeometry
 
-from flcav.driving.passing import CREEPS_MPS, SLIM_M, Line, find_standing, list_lines
+from flcav.driving.passing import CREEPS_MPS, SLIM_M, ReferenceLine, find_standing, list_lines
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
 from flcav.storage.records import WHERE_TRUE
@@ -42,7 +42,7 @@ class Occupied(NamedTuple):
 
 
 def find_occupied(
-    route: Line, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
+    route: ReferenceLine, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
 ) -> Occupied:
     """Return what footprints cover of the corridor of a vehicle that is `along` the route [m].
 
@@ -157,7 +157,7 @@ def decide_controls(
     needs: list[Need] = [(free, None), _stop_at_light(route, own, seen, half, wanted)]
     margin = np.minimum(settings.margin_m + settings.sigmas * seen.spread, settings.most_m)
 
-    def judge(line: Line, kept: Array) -> Need:
+    def judge(line: ReferenceLine, kept: Array) -> Need:
         occupied = find_occupied(line, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, kept)
         return _least([*needs, *_avoid(line, own, seen, occupied, half, wanted)])
 
@@ -184,10 +184,10 @@ def _choose_line(
     vehicle: BodyBlueprint,
     wanted: float,
     margin: Array,
-    judge: Callable[[Line, Array], Need],
+    judge: Callable[[ReferenceLine, Array], Need],
     settings: DriverSettings,
     lanes: BaseGeometry | None,
-) -> tuple[Line, Need]:
+) -> tuple[ReferenceLine, Need]:
     """Return the route, or the line beside it on which the vehicle gets on best past who stands, and its need.
 
     `judge` returns the least need on a line with a margin (N, T) around the road users.
@@ -200,7 +200,7 @@ def _choose_line(
     if here[0] > free:
         return route, here
     _, left = route.project(own.x, own.y, own.along)
-    ways: list[Line] = [route, *list_lines(route, own.along, left, own.speed, vehicle.size[1], lanes)]
+    ways: list[ReferenceLine] = [route, *list_lines(route, own.along, left, own.speed, vehicle.size[1], lanes)]
     full = [here, *(judge(line, margin) for line in ways[1:])]
     for line, need in zip(ways, full):
         if need[0] > free:
@@ -260,7 +260,9 @@ def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, want
     return np.inf, None
 
 
-def _avoid(route: Line, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float) -> list[Need]:
+def _avoid(
+    route: ReferenceLine, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float
+) -> list[Need]:
     """Return the acceleration for each road user that is, or is going to be, in the way."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
@@ -299,7 +301,7 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: Line, own: EgoMotion, vehicle: BodyBlueprint) -> float:
+def _steer(route: ReferenceLine, own: EgoMotion, vehicle: BodyBlueprint) -> float:
     """Return the share of the greatest steering angle (pure pursuit)."""
     aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
     ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)

@@ -38,7 +38,7 @@ class Film(Record):
     instants: tuple[Instant, ...]
 
 
-class Camera:
+class FilmCamera:
     """Films a drive: `watch` is called at every step."""
 
     def __init__(self) -> None:

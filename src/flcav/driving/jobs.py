@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from flcav.driving.errors import ErrorModel, sense_model
-from flcav.driving.film import Camera, Film
+from flcav.driving.film import Film, FilmCamera
 from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, drive_staged, sense_truth
 from flcav.driving.measures import DriveResult
 from flcav.driving.networks import Networks, name_network, sense_networks, sense_unconfirmed
@@ -75,7 +75,7 @@ def run_job(job: DriveJob, sensed: Sensed) -> DriveResult:
 
 def film_job(job: DriveJob, sensed: Sensed) -> tuple[DriveResult, Film]:
     """Return the measures of one drive with all tasks, and its film."""
-    staged, camera = StagedScenario(job.scenario, job.seed), Camera()
+    staged, camera = StagedScenario(job.scenario, job.seed), FilmCamera()
     try:
         perception = sensed.make()(staged, job.seed)
         own = drive_staged(staged, job.seed, perception, job.loop, camera.watch)

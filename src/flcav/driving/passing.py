@@ -25,7 +25,7 @@ CREEPS_MPS = 2.5
 STANDS_MPS = 0.5  # of a road user
 
 
-class Line(Protocol):
+class ReferenceLine(Protocol):
     """Something with a place at every distance: a route, or a line beside it."""
 
     def at(self, along: ArrayLike) -> Array:

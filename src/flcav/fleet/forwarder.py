@@ -35,10 +35,10 @@ class Forwarder:
         call = scope["path"].removeprefix(relay.FLEET)
         try:
             if scope["method"] != "POST" or scope["path"] != relay.FLEET + call or call not in relay.CALLS:
-                raise relay.RequestRefused(403, "no call of a node")
+                raise relay.RelayRefused(403, "no call of a node")
             headers = relay.choose_headers(relay.check_headers(scope["headers"]), (relay.NODE_KEY, *relay.SENT))
             body = await relay.read_body(scope, receive, relay.largest_body(call))
-        except relay.RequestRefused as refused:
+        except relay.RelayRefused as refused:
             await relay.answer(send, refused.status, refused.why)
             return
         await relay.relay(self._client, relay.FLEET + call, headers, body, send)

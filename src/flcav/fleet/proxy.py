@@ -77,7 +77,7 @@ class FleetProxy:
                 vehicle = self.find(certificate)
                 caller = vehicle.name
                 await self._answer(vehicle, scope, receive, soon)
-            except relay.RequestRefused as refused:
+            except relay.RelayRefused as refused:
                 await self._refuse(soon, refused.status, caller, refused.why)
         except TimeoutError:  # the client does not read its answer
             connection.abort()
@@ -94,9 +94,9 @@ class FleetProxy:
             return
         call = path.removeprefix(relay.FLEET)
         if scope["method"] != "POST" or path != relay.FLEET + call or call not in relay.CALLS:
-            raise relay.RequestRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
+            raise relay.RelayRefused(403, f"{scope['method']} {path[:100]} is no call of a vehicle's")
         if node_key(headers.get(relay.NODE_KEY, b"")) != vehicle.public_key:
-            raise relay.RequestRefused(401, "the node's key is not the certificate's")
+            raise relay.RelayRefused(401, "the node's key is not the certificate's")
         passed = [*relay.choose_headers(headers), relay.name_key(vehicle)]
         gone = False
         connection: ClientConnection = scope["state"][CONNECTION]
@@ -131,9 +131,9 @@ class FleetProxy:
             vehicle = find_caller(self._registry, certificate)
         except (InputError, OSError, ValueError, TypeError):
             self._close()
-            raise relay.RequestRefused(503, "the fleet's registry cannot be read") from None
+            raise relay.RelayRefused(503, "the fleet's registry cannot be read") from None
         if isinstance(vehicle, str):
-            raise relay.RequestRefused(401, vehicle)
+            raise relay.RelayRefused(401, vehicle)
         return vehicle
 
     def _close(self) -> None:
@@ -145,7 +145,7 @@ class FleetProxy:
         """Return the vehicle that a connection counts for; all without a certificate in force count as one."""
         try:
             return self.find(certificate).name
-        except relay.RequestRefused:
+        except relay.RelayRefused:
             return ""
 
     async def _take_request(self, vehicle: str, scope: Scope, receive: Receive, send: Send) -> None:
@@ -154,16 +154,16 @@ class FleetProxy:
         try:
             request = parse_request(content)
         except ValueError as error:
-            raise relay.RequestRefused(400, str(error)) from None
+            raise relay.RelayRefused(400, str(error)) from None
         now = time.time()
         if (wrong_age := check_age(request, now)) is not None:
-            raise relay.RequestRefused(400, wrong_age)
+            raise relay.RelayRefused(400, wrong_age)
         try:
             why = await asyncio.to_thread(self._keep_request, vehicle, request.nonce, content, now)
         except (InputError, OSError) as error:
-            raise relay.RequestRefused(503, f"the registry cannot be written: {error}") from None
+            raise relay.RelayRefused(503, f"the registry cannot be written: {error}") from None
         if why is not None:
-            raise relay.RequestRefused(409, why)
+            raise relay.RelayRefused(409, why)
         await relay.answer(send, 200, "the request is taken")
 
     def _keep_request(self, *about: Any) -> str | None:
@@ -273,11 +273,11 @@ async def answer_release(
         await relay.answer(send, 200, "the report is taken")
         return
     if method != "GET":
-        raise relay.RequestRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
+        raise relay.RelayRefused(403, f"{method} {scope['path'][:100]} is no call of a vehicle's")
     try:
         path = await asyncio.to_thread(find_offered, fleet, name)
     except ValueError as error:
-        raise relay.RequestRefused(403, f"{scope['path'][:100]} {error}") from None
+        raise relay.RelayRefused(403, f"{scope['path'][:100]} {error}") from None
     if path is None:
         await relay.answer(send, 404, "no such file is on offer")
     else:
@@ -288,10 +288,10 @@ async def _take_report(fleet: Path, vehicle: str, content: bytes, count: Callabl
     try:
         report = parse_report(content)
     except ValueError as error:
-        raise relay.RequestRefused(400, str(error)) from None
+        raise relay.RelayRefused(400, str(error)) from None
     if report.shadow is not None:  # the certificate determines the vehicle
         report = replace(report, shadow=replace(report.shadow, vehicle=vehicle))
     try:
         await asyncio.to_thread(KeptReport(vehicle, time.time(), count(), report).save, fleet)
     except OSError as error:
-        raise relay.RequestRefused(503, f"the report cannot be kept: {error}") from None
+        raise relay.RelayRefused(503, f"the report cannot be kept: {error}") from None

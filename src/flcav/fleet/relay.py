@@ -61,7 +61,7 @@ QUIET_S, BODY_S = 20.0, 300.0  # timeouts of a body: between two pieces, and in 
 Headers = Sequence[tuple[bytes, bytes]]
 
 
-class RequestRefused(Exception):
+class RelayRefused(Exception):
     """The refusal of a request, with an HTTP status and a sentence."""
 
     def __init__(self, status: int, why: str) -> None:
@@ -104,12 +104,12 @@ async def send_file(send: Send, path: Path, sent: Callable[[], object]) -> None:
 async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
     """Return the body of a request.
 
-    Raises `RequestRefused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than
+    Raises `RelayRefused` where it is longer than `most` bytes, pauses for more than `QUIET_S`, takes more than
     `BODY_S`, or is interrupted.
     """
     declared = next((value for name, value in scope["headers"] if name == b"content-length"), b"0")
     if int(declared) > most:
-        raise RequestRefused(400, f"the message has more than {most} bytes")
+        raise RelayRefused(400, f"the message has more than {most} bytes")
     body = bytearray()
     more = True
     try:
@@ -118,26 +118,26 @@ async def read_body(scope: Scope, receive: Receive, most: int) -> bytes:
                 async with asyncio.timeout(QUIET_S):
                     event = await receive()
                 if event["type"] == "http.disconnect":
-                    raise RequestRefused(400, "the client has left")
+                    raise RelayRefused(400, "the client has left")
                 body += event.get("body", b"")
                 if len(body) > most:
-                    raise RequestRefused(400, f"the message has more than {most} bytes")
+                    raise RelayRefused(400, f"the message has more than {most} bytes")
                 more = event.get("more_body", False)
     except TimeoutError:
-        raise RequestRefused(408, "the message does not come") from None
+        raise RelayRefused(408, "the message does not come") from None
     return bytes(body)
 
 
 def check_headers(headers: Headers) -> dict[bytes, bytes]:
-    """Return headers by lower-case name; raises `RequestRefused` for repeated headers, or a body of unknown length."""
+    """Return headers by lower-case name; raises `RelayRefused` for repeated headers, or a body of unknown length."""
     if len(headers) > MOST_HEADERS:
-        raise RequestRefused(431, f"more than {MOST_HEADERS} headers")
+        raise RelayRefused(431, f"more than {MOST_HEADERS} headers")
     name, count = Counter(name.lower() for name, _ in headers).most_common(1)[0] if headers else (b"", 0)
     if count > 1:
-        raise RequestRefused(400, f"the header {name.decode('latin-1')} comes {count} times")
+        raise RelayRefused(400, f"the header {name.decode('latin-1')} comes {count} times")
     found = {name.lower(): value for name, value in headers}
     if b"transfer-encoding" in found:
-        raise RequestRefused(411, "the length of the body is wanted before it")
+        raise RelayRefused(411, "the length of the body is wanted before it")
     return found
 
 
@@ -147,13 +147,13 @@ def largest_body(call: str) -> int:
 
 
 def choose_headers(headers: Mapping[bytes, bytes], names: Iterable[bytes] = SENT) -> list[tuple[bytes, bytes]]:
-    """Return the headers to pass on, out of `names`; raises `RequestRefused` for a value that is not plain ASCII."""
+    """Return the headers to pass on, out of `names`; raises `RelayRefused` for a value that is not plain ASCII."""
     if headers.get(b"content-type", b"") != PROTOBUF[0][1]:
-        raise RequestRefused(415, "a body of another type than application/protobuf")
+        raise RelayRefused(415, "a body of another type than application/protobuf")
     chosen = [(name, headers[name]) for name in names if name in headers]
     for name, value in chosen:
         if not VALUE.fullmatch(value):
-            raise RequestRefused(400, f"the header {name.decode()} is no plain text, or too long")
+            raise RelayRefused(400, f"the header {name.decode()} is no plain text, or too long")
     return [*PROTOBUF, *chosen]
 
 
@@ -165,21 +165,21 @@ def name_key(vehicle: RegisteredVehicle) -> tuple[bytes, bytes]:
 def check_body(call: str, body: bytes, vehicle: RegisteredVehicle) -> bytes:
     """Return the body of a vehicle's call, parsed and serialised again.
 
-    Raises `RequestRefused` where it is not of that call, or names another vehicle's node or key.
+    Raises `RelayRefused` where it is not of that call, or names another vehicle's node or key.
     """
     try:
         message_ = CALLS[call].FromString(body)
     except DecodeError:
-        raise RequestRefused(400, f"the body is none of {call}") from None
+        raise RelayRefused(400, f"the body is none of {call}") from None
     # fields unknown here might be known to another version of Flower behind the proxy
     message_.DiscardUnknownFields()
     _check_texts(message_)
     if isinstance(message_, ActivateNodeRequest):
         if message_.public_key != public_pem(vehicle.public_key):
-            raise RequestRefused(401, "the key to activate is not the certificate's")
+            raise RelayRefused(401, "the key to activate is not the certificate's")
         return message_.SerializeToString()
     if vehicle.node is None:
-        raise RequestRefused(503, "the vehicle is being enrolled")
+        raise RelayRefused(503, "the vehicle is being enrolled")
     node = message_ if isinstance(message_, DeactivateNodeRequest) else message_.node  # type: ignore[attr-defined]
     named = {node.node_id}
     if isinstance(message_, PushMessagesRequest):
@@ -187,7 +187,7 @@ def check_body(call: str, body: bytes, vehicle: RegisteredVehicle) -> bytes:
             _check_texts(message.metadata)
             named.add(message.metadata.src_node_id)
     if named != {vehicle.node}:
-        raise RequestRefused(401, "the node in the body is not the certificate's")
+        raise RelayRefused(401, "the node in the body is not the certificate's")
     return message_.SerializeToString()
 
 
@@ -196,7 +196,7 @@ def _check_texts(message: Message) -> None:
     for field, value in message.ListFields():
         texts = [value] if isinstance(value, str) else value if field.type == field.TYPE_STRING else ()
         if not all(text.isprintable() and len(text) <= LONGEST_NAME for text in texts):
-            raise RequestRefused(400, f"{field.name} is no identifier")
+            raise RelayRefused(400, f"{field.name} is no identifier")
 
 
 async def relay(client: httpx.AsyncClient, path: str, headers: Headers, body: bytes, send: Send) -> Relayed:

@@ -16,7 +16,7 @@ class Displayed:
 
     def _repr_html_(self) -> str | None:
         """Return a table as HTML; None for a record that is displayed as a picture."""
-        return import_module("flcav.plot").tabulate(self)
+        return import_module("flcav.plot").as_table(self)
 
     def _repr_png_(self) -> bytes | None:
         """Return a picture as a PNG file; None for a record that is displayed as a table."""

@@ -5,7 +5,7 @@ import asyncio
 import pytest
 
 from flcav.fleet.proxy import RELEASES, answer_release
-from flcav.fleet.relay import RequestRefused
+from flcav.fleet.relay import RelayRefused
 from flcav.fleet.releases import ReleaseOffer, find_offered
 
 
@@ -33,5 +33,5 @@ def test_releases_are_only_read(tmp_path, method: str):
         scope = {"path": f"{RELEASES}image/metadata/root.json", "method": method}
         await answer_release(tmp_path, "a", scope, None, None, lambda: 0)  # pyright: ignore
 
-    with pytest.raises(RequestRefused, match="is no call of a vehicle's"):
+    with pytest.raises(RelayRefused, match="is no call of a vehicle's"):
         asyncio.run(call())

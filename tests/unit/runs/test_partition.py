@@ -18,7 +18,7 @@ from flcav.runs.extras.partition.dealing import (
     deal_by_place,
     give_each_one,
 )
-from flcav.runs.extras.partition.rows import Holding, Partitioned
+from flcav.runs.extras.partition.rows import Partitioned, VehicleHolding
 from flcav.runs.extras.partition.samples import count_labels, deal_samples, locate_samples, name_classes
 from flcav.runs.extras.partition.settings import Partition
 from flcav.runs.recipe import RunRecipe
@@ -188,11 +188,14 @@ def test_samples_are_where_their_frames_are_also_where_a_frame_has_several_or_no
 
 
 def test_the_chart_has_a_bar_for_each_vehicle_and_class_as_long_as_what_it_holds() -> None:
-    held = {"grid/cav0": Holding(5, {"clear": 5, "fog": 0}, 0.4), "grid/cav1": Holding(4, {"clear": 1, "fog": 3}, 0.5)}
+    held = {
+        "grid/cav0": VehicleHolding(5, {"clear": 5, "fog": 0}, 0.4),
+        "grid/cav1": VehicleHolding(4, {"clear": 1, "fog": 3}, 0.5),
+    }
     figure = draw_dealt({"main · grid · weather": Partitioned("class", held)})
     (axes,) = figure.axes
     assert [bar.get_width() for bar in axes.patches if isinstance(bar, Rectangle)] == [5, 1, 0, 3]  # by class
     assert [label.get_text() for label in axes.get_yticklabels()] == ["cav0", "cav1"]
-    bare = {name: Holding(own.samples, {}, None) for name, own in held.items()}
+    bare = {name: VehicleHolding(own.samples, {}, None) for name, own in held.items()}
     (axes,) = draw_dealt({"main · grid · trajectory": Partitioned("place", bare)}).axes
     assert [bar.get_width() for bar in axes.patches if isinstance(bar, Rectangle)] == [5, 4]

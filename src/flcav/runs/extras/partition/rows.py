@@ -9,7 +9,7 @@ from flcav.storage.records import LEFT_OUT, Record
 
 
 @dataclass(frozen=True)
-class Holding(Record):
+class VehicleHolding(Record):
     """The training data that a vehicle was dealt."""
 
     samples: int
@@ -27,7 +27,7 @@ class Partitioned(Record):
     """The partition of a region's training samples."""
 
     by: str
-    vehicles: Mapping[str, Holding]  # by client
+    vehicles: Mapping[str, VehicleHolding]  # by client
 
     def describe(self) -> str:
         """Return the partition in words."""

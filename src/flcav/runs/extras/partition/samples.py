@@ -22,7 +22,7 @@ from flcav.runs.extras.partition.dealing import (
     deal_by_place,
     give_each_one,
 )
-from flcav.runs.extras.partition.rows import Holding, Partitioned
+from flcav.runs.extras.partition.rows import Partitioned, VehicleHolding
 from flcav.runs.extras.partition.settings import ALPHA, BY_AMOUNT, BY_CLASS, BY_DIRICHLET, BY_PLACE, SHARDS, Partition
 from flcav.runs.frames import Frames
 from flcav.runs.label_sources import LABEL_SOURCES
@@ -129,7 +129,7 @@ def deal_samples(
     table = np.array([[sum(counts[i].get(each, 0) for i in own) for each in classes] for own in places.values()])
     distances = label_distribution_distance(table).tolist() if table.sum() else [None] * number
     held = {
-        name: Holding(len(own), dict(zip(classes, map(int, row), strict=True)), distance)
+        name: VehicleHolding(len(own), dict(zip(classes, map(int, row), strict=True)), distance)
         for (name, own), row, distance in zip(places.items(), table, distances, strict=True)
     }
     return {name: _take([*samples.values()], own) for name, own in places.items()}, Partitioned(how.by, held)
