@@ -53,7 +53,7 @@ PLACES = {
     "RunRecipe": "flcav.runs",
     "load_run_recipe": "flcav.runs",
     "run": "flcav.runs",
-    "plot": "flcav.plot",
+    "plot": "flcav",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

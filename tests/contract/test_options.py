@@ -130,8 +130,8 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--map": ALWAYS,
         **RUNS,
     },
-    "allocate": {"--baseline": ALWAYS, "--progress": ALWAYS, "--verify": ALWAYS},
-    "replan": {"--baseline": ALWAYS, "--verify": ALWAYS},
+    "allocate": dict.fromkeys(("--baseline", "--progress", "--throughput", "--verify"), ALWAYS),
+    "replan": dict.fromkeys(("--baseline", "--throughput", "--verify"), ALWAYS),
     "place": {
         "--errors": ALWAYS,
         "--poles": ALWAYS,

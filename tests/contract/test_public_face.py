@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from importlib import import_module
+from inspect import ismodule
 from pathlib import Path
 
 import pytest
@@ -35,7 +36,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def told(name: str) -> str:
     """Return the docstring of a name; of a constant, its module's."""
     found = getattr(flcav, name)
-    return (found.__doc__ if callable(found) else import_module(f"flcav.perception.{name.lower()}").__doc__) or ""
+    if callable(found) or ismodule(found):
+        return found.__doc__ or ""
+    return import_module(f"flcav.perception.{name.lower()}").__doc__ or ""
 
 
 @pytest.mark.parametrize(

@@ -350,7 +350,7 @@ def test_a_pole_outside_the_town_of_the_map_is_named(tmp_path: Path, refused: Ca
     (tmp_path / "poles.csv").write_text("id,x,y,z\n1,30,20,6\n2,1000000000,20,6\n")
     files = ("--errors", tmp_path / "errors.csv", "--poles", tmp_path / "poles.csv")
     drawn = ("--town", "grid", "--map", tmp_path / "map.png")
-    assert "poles.csv: row 2 lies at 1e+09, 20, outside grid" in refused(
+    assert "poles.csv: row 2 lies at 1000000000, 20, outside grid" in refused(
         "place", *files, "--range", "40", "--count", "1", *drawn
     )
     assert not (tmp_path / "map.png").exists()

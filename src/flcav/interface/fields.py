@@ -84,9 +84,8 @@ def lazy_names(package: str, places: Mapping[str, str]) -> tuple[Callable[[str],
     def __getattr__(name: str) -> Any:
         if name not in places:
             raise AttributeError(f"module {package!r} has no attribute {name!r}")
-        found = import_module(places[name])
-        if places[name] != f"{package}.{name}":  # else the name is that of the module itself
-            found = getattr(found, name)
+        submodule = places[name] == package
+        found = import_module(f"{package}.{name}") if submodule else getattr(import_module(places[name]), name)
         if isinstance(found, type) and (is_dataclass(found) or hasattr(found, "model_fields")):
             document_fields(found)
         setattr(sys.modules[package], name, found)  # so that it is looked up once

@@ -303,7 +303,7 @@ def test_every_round_is_validated_with_the_network_that_the_federation_would_end
     monkeypatch.setattr(testing.Frames, "open", lambda folder: split)
     monkeypatch.setattr(testing, "load_stage_network", lambda task, folder: "round 0")
     monkeypatch.setattr(testing, "load_round_network", load)
-    monkeypatch.setattr(StageResult, "load", classmethod(lambda cls, folder: SimpleNamespace(rounds=3)))
+    monkeypatch.setattr(StageResult, "load", classmethod(lambda cls, folder: SimpleNamespace(rounds=3, kept=None)))
     monkeypatch.setattr(testing, "score_network", lambda task, network, data, frames: float(network[-1]) / 10)
     inputs = {name: tmp_path / name for name in ("start", "trained", "frames")}
     work: Any = SimpleNamespace(inputs=inputs, folder=tmp_path, report=lambda *about: None)
