@@ -41,10 +41,10 @@ class PublicNames(SphinxDirective):
 
 
 def public_names(package: str) -> tuple[str, ...]:
-    """Return the names that a package gives, in its own order."""
-    names = importlib.import_module(package).__all__
+    """Return the names that a package gives, in its own order, without the modules among them."""
+    module = importlib.import_module(package)
     whole = () if package == WHOLE else public_names(WHOLE)
-    return tuple(name for name in names if name not in whole)
+    return tuple(name for name in module.__all__ if name not in whole and not inspect.ismodule(getattr(module, name)))
 
 
 def kind_of(package: str, name: str) -> str:
