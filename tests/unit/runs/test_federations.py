@@ -345,10 +345,11 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
     network = learning.build_network()
     samples = {region: {f"{region}/cav{i}": [np.float32(i), np.float32(1)] for i in range(3)} for region in ("a", "b")}
     clients = {region: make_clients(learning, Slope(), each) for region, each in samples.items()}
-    rules = Rules.model_validate({"privacy": PRIVACY})
+    private = PRIVACY | {"seeded": True}  # by chance, secret noise can make a training diverge, which ends it as well
+    rules = Rules.model_validate({"privacy": private})
     assert rules.privacy is not None
     sixth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 6)
-    rules = Rules.model_validate({"privacy": PRIVACY | {"epsilon": sixth + 1e-6}})
+    rules = Rules.model_validate({"privacy": private | {"epsilon": sixth + 1e-6}})
     assert rules.privacy is not None
     noted: list[str] = []
 
@@ -372,7 +373,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
         return len(losses)
 
     assert (edge(3, 0), edge(9, 0), edge(9, 4)) == (3, 6, 2)
-    assert noted[-1].endswith(f"epsilon {sixth:.2f} at delta 1e-05")
+    assert f"epsilon {sixth:.2f} at delta 1e-05" in noted[-1]
     starts = {region: RegionStart(own, to_arrays(network), earlier=2) for region, own in clients.items()}
 
     def cloud(edge_rounds: int) -> int:
@@ -386,7 +387,7 @@ def test_a_privacy_budget_ends_both_stages(tmp_path: Path) -> None:
 
     assert (cloud(1), cloud(2), cloud(3)) == (4, 2, 1)
     fifth = account_epsilon(rules.privacy, rules.selection, [*clients["a"]], 5)
-    assert noted[-1].endswith(f"epsilon {fifth:.2f} at delta 1e-05")
+    assert f"epsilon {fifth:.2f} at delta 1e-05" in noted[-1]
     assert (cloud(5), edge(9, 6)) == (0, 0)  # it affords no cloud round of five edge rounds, and nothing more
 
 
