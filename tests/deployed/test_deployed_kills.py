@@ -12,6 +12,7 @@ from flwr.proto.control_pb2 import StartRunRequest
 from flwr.proto.fab_pb2 import Fab
 
 from flcav.federation.loop import Schedule, federate
+from flcav.federation.state import FederationState
 from flcav.federation.strategies import strategy_named
 from flcav.fleet.superlink import DATABASE, build_bundle
 from flcav.fleet.supervisor import read_processes
@@ -40,6 +41,28 @@ def test_killed_in_mid_round(killed, weights, deployment, tmp_path):
     assert read_processes(deployment.folder)[killed] != before
     for name, array in expected.weights.items():
         np.testing.assert_array_equal(array, ended.weights[name])
+
+
+def test_an_app_that_is_ended_before_it_answers(weights, deployment, tmp_path):
+    """Flower's SuperNode would wait for it without end."""
+    clients = {f"town/cav{n}": Walker(n + 1, tmp_path / "log", lasts_s=3.0) for n in range(3)}
+    expected = federate({n: Walker(c.samples) for n, c in clients.items()}, weights, SCHEDULE)
+    ended = []
+
+    def end():
+        while len(trainings := (tmp_path / "log").read_text().splitlines()) < 4:  # a client of the second round trains
+            threading.Event().wait(0.05)
+        ended.append(int(trainings[3].split()[1]))
+        os.kill(ended[0], signal.SIGTERM)
+
+    def start(number, _):
+        if number == 2:
+            threading.Thread(target=end, daemon=True).start()
+
+    state = FederationState()
+    found = federate(clients, weights, SCHEDULE, state=state, runtime=deployment, before_round=start)
+    assert [record.failed for record in state.records] == [{}] * 3
+    np.testing.assert_array_equal(expected.weights["w"], found.weights["w"])
 
 
 def test_a_run_that_was_begun_and_left_is_ended(weights, deployment, clients):

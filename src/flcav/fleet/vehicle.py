@@ -1,10 +1,12 @@
 """A vehicle's processes: its forwarder, Flower's SuperNode, and an executor that forks its app for every message.
 
-Flower would start a process per message, which imports everything again; the executor imports once and forks. A
+Flower would start a process per message, which imports everything again; the executor imports once and forks. Flower's
+SuperNode waits without end for the answer of an app that was ended, or could not hand it over: it is then restarted. A
 vehicle is installed with its certificate, its trusted keys, and the address of the fleet.
 """
 
 import contextlib
+import importlib
 import json
 import os
 import re
@@ -16,6 +18,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import yaml
 
@@ -27,6 +30,7 @@ from flcav.plugins import PLACE
 from flcav.storage.files import write_bytes, write_json
 
 SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # file name; environment variable of the app
+NODE_PID = "supernode.pid"  # file with the SuperNode's process id
 POLL_S = 0.1  # interval of polling for a message [s]
 
 
@@ -84,6 +88,7 @@ def run_supernode(folder: Path, settings: VehicleSettings) -> None:
     """Run `flower-supernode` in this process until it ends."""
     from flwr.supernode.cli.flower_supernode import flower_supernode
 
+    write_bytes(folder / NODE_PID, str(os.getpid()).encode())
     sys.argv = [
         "flower-supernode",
         *("--superlink", f"127.0.0.1:{settings.forwarder_port}"),
@@ -117,27 +122,35 @@ def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
                 continue
             if task.token:
                 prepare(folder)
-                os.waitpid(_fork(node, task.token), 0)
+                pid = (folder / NODE_PID).read_bytes()
+                if os.waitpid(_fork(node, task.token), 0)[1] and pid == (folder / NODE_PID).read_bytes():
+                    with contextlib.suppress(ProcessLookupError):
+                        os.kill(int(pid), signal.SIGTERM)  # its supervisor restarts it
             else:
                 time.sleep(POLL_S)
 
 
 def _fork(node: str, token: str) -> int:
-    """Fork a process that runs the app for one message; return its id."""
+    """Fork a process that runs the app for one message, and ends with 0 if an answer was handed over; return its id."""
     parent, child = os.getpid(), os.fork()
     if child:
         return child
-    code = 1
+    answered = False
     try:
         end_with_parent(parent, signal.SIGKILL)
         signal.signal(signal.SIGINT, signal.SIG_DFL)
-        from flwr.supernode.runtime.run_clientapp import run_clientapp
+        app = importlib.import_module("flwr.supernode.runtime.run_clientapp")
+        push = app.push_message
 
-        run_clientapp(node, token, True)
-    except SystemExit as end:
-        code = end.code if isinstance(end.code, int) else 1
+        def push_message(*what: Any) -> None:
+            nonlocal answered
+            push(*what)
+            answered = True
+
+        vars(app)["push_message"] = push_message
+        app.run_clientapp(node, token, True)
     finally:
-        os._exit(code)
+        os._exit(0 if answered else 1)
 
 
 def check_port(host: str, port: int) -> int:
