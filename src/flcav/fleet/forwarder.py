@@ -4,6 +4,7 @@ It only listens on the vehicle's loopback, and passes calls on with the vehicle'
 the proxy directly.
 """
 
+import contextlib
 import ssl
 from pathlib import Path
 
@@ -17,14 +18,16 @@ from flcav.fleet.keys import AUTHORITY, CERTIFICATE, KEY, LOOPBACK, LOOPBACK_KEY
 from flcav.fleet.mutual_tls import serve_https
 from flcav.interface.wording import make_printable
 
+POLL = "pull-messages"  # a SuperNode's call for a message
 LIMITS = httpx.Limits(max_connections=8)  # to the proxy, which allows a vehicle twice as many
 
 
 class Forwarder:
     """The forwarder's ASGI app, on the loopback interface of a vehicle."""
 
-    def __init__(self, client: httpx.AsyncClient) -> None:
-        self._client = client
+    def __init__(self, client: httpx.AsyncClient, polled: Path) -> None:
+        """Forward calls by `client`; the file `polled` is touched when a message is asked for."""
+        self._client, self._polled = client, polled
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Forward a node's call to the proxy."""
@@ -41,6 +44,9 @@ class Forwarder:
         except relay.RelayRefused as refused:
             await relay.answer(send, refused.status, refused.why)
             return
+        if call == POLL:
+            with contextlib.suppress(OSError):  # a full disk must not end the calls
+                self._polled.touch()
         await relay.relay(self._client, relay.FLEET + call, headers, body, send)
 
 
@@ -52,12 +58,15 @@ def vehicle_tls(folder: Path) -> ssl.SSLContext:
     return context
 
 
-def run_forwarder(folder: Path, port: int, server: str) -> None:
-    """Run the forwarder of the vehicle in `folder` until the process is ended; `server` is host:port of the proxy."""
+def run_forwarder(folder: Path, port: int, server: str, polled: Path) -> None:
+    """Run the forwarder of the vehicle in `folder` until the process is ended; `server` is host:port of the proxy.
+
+    polled: file that is touched with each of the SuperNode's calls for a message.
+    """
     client = httpx.AsyncClient(
         base_url=f"https://{server}", verify=vehicle_tls(folder), timeout=relay.TIMEOUT, trust_env=False, limits=LIMITS
     )
-    serve_https(Forwarder(client), "127.0.0.1", port, folder / LOOPBACK, folder / LOOPBACK_KEY).run()
+    serve_https(Forwarder(client, polled), "127.0.0.1", port, folder / LOOPBACK, folder / LOOPBACK_KEY).run()
 
 
 def send_request(folder: Path, server: str, request: FLRequest) -> None:

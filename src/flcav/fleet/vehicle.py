@@ -1,8 +1,10 @@
 """A vehicle's processes: its forwarder, Flower's SuperNode, and an executor that forks its app for every message.
 
 Flower would start a process per message, which imports everything again; the executor imports once and forks. Flower's
-SuperNode waits without end for the answer of an app that was ended, or could not hand it over: it is then restarted. A
-vehicle is installed with its certificate, its trusted keys, and the address of the fleet.
+SuperNode waits without end for the answer of an app that was ended or could not hand it over, and starts an app for a
+message whose run ended before it was received whole, which waits without end for the rest: the executor then ends the
+app, and lets the SuperNode be restarted. A vehicle is installed with its certificate, its trusted keys, and the address
+of the fleet.
 """
 
 import contextlib
@@ -30,8 +32,9 @@ from flcav.plugins import PLACE
 from flcav.storage.files import write_bytes, write_json
 
 SETTINGS, FOLDER = "vehicle.json", "FLCAV_VEHICLE"  # file name; environment variable of the app
-NODE_PID = "supernode.pid"  # file with the SuperNode's process id
+NODE_PID, POLLED = "supernode.pid", "polled"  # files: the SuperNode's process id; touched when it asks for a message
 POLL_S = 0.1  # interval of polling for a message [s]
+EXIT_S = 10.0  # after the SuperNode asks for the next message, before the app of the last is ended [s]
 
 
 @dataclass(frozen=True)
@@ -74,7 +77,7 @@ def vehicle_processes(
     def forward() -> None:
         from flcav.fleet.forwarder import run_forwarder
 
-        run_forwarder(folder, settings.forwarder_port, settings.server)
+        run_forwarder(folder, settings.forwarder_port, settings.server, folder / POLLED)
 
     return {
         "forwarder": forward,
@@ -123,11 +126,31 @@ def run_executor(folder: Path, node: str, prepare: Prepare) -> None:
             if task.token:
                 prepare(folder)
                 pid = (folder / NODE_PID).read_bytes()
-                if os.waitpid(_fork(node, task.token), 0)[1] and pid == (folder / NODE_PID).read_bytes():
+                if not _run_app(node, task.token, folder / POLLED) and pid == (folder / NODE_PID).read_bytes():
                     with contextlib.suppress(ProcessLookupError):
                         os.kill(int(pid), signal.SIGTERM)  # its supervisor restarts it
             else:
                 time.sleep(POLL_S)
+
+
+def _run_app(node: str, token: str, polled: Path) -> bool:
+    """Run the app for one message; return whether it handed over an answer, and ended.
+
+    It is ended soon after the SuperNode asks for another message, which shows that it does not wait for this answer.
+    """
+
+    def read_time() -> int:
+        return polled.stat().st_mtime_ns if polled.exists() else 0
+
+    before, last = read_time(), float("inf")
+    child = _fork(node, token)
+    while not (ended := os.waitpid(child, os.WNOHANG))[0]:
+        if last == float("inf") and read_time() != before:
+            last = time.monotonic() + EXIT_S
+        if time.monotonic() > last:
+            os.kill(child, signal.SIGKILL)
+        time.sleep(POLL_S)
+    return ended[1] == 0
 
 
 def _fork(node: str, token: str) -> int:

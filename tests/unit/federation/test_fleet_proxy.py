@@ -2,8 +2,10 @@
 
 import base64
 import itertools
+import os
 import ssl
 import sys
+import time
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,12 +14,13 @@ import pytest
 from cryptography import x509
 from cryptography.hazmat.primitives import serialization
 
+from flcav.fleet import vehicle as vehicle_module
 from flcav.fleet.authority import found_authority
 from flcav.fleet.forwarder import run_forwarder
 from flcav.fleet.keys import CERTIFICATE, LOOPBACK, load_key, public_der, request_certificate, take_certificate
 from flcav.fleet.proxy import describe_clock, find_caller, node_key, run_proxy
 from flcav.fleet.registry import RegisteredVehicle
-from flcav.fleet.vehicle import VehicleSettings, run_supernode
+from flcav.fleet.vehicle import POLLED, VehicleSettings, run_supernode
 
 
 @pytest.fixture
@@ -79,7 +82,7 @@ def test_servers_have_the_key_of_their_certificate(which, vehicle, tmp_path, mon
     monkeypatch.setattr(f"flcav.fleet.{which}.serve_https", start)
     VehicleSettings("127.0.0.1:3", 1, 2).save(own)
     if which == "forwarder":
-        run_forwarder(own, 1, "127.0.0.1:3")
+        run_forwarder(own, 1, "127.0.0.1:3", own / POLLED)
     else:
         run_proxy(tmp_path / "fleet", "127.0.0.1", 1, "127.0.0.1:2")
     assert started == [("127.0.0.1", 1)]
@@ -96,3 +99,22 @@ def test_a_vehicle_s_node_trusts_its_own_forwarder(vehicle, tmp_path, monkeypatc
     assert trusted == x509.load_pem_x509_certificate((own / LOOPBACK).read_bytes())
     assert (options["--superlink"], options["--port"]) == ("127.0.0.1:1", "2")
     assert serialization.load_ssh_private_key(Path(options["--auth-supernode-private-key"]).read_bytes(), None)
+
+
+@pytest.mark.parametrize(
+    ("lasts_s", "code", "polls", "answered"), [(0, 0, False, True), (0, 1, False, False), (60, 0, True, False)]
+)
+def test_an_app_is_ended_when_its_node_asks_for_another_message(lasts_s, code, polls, answered, tmp_path, monkeypatch):
+    def fork(node, token):
+        if not (child := os.fork()):
+            time.sleep(lasts_s)
+            os._exit(code)
+        if polls:
+            (tmp_path / POLLED).touch()
+        return child
+
+    monkeypatch.setattr(vehicle_module, "_fork", fork)
+    monkeypatch.setattr(vehicle_module, "EXIT_S", 0.2)
+    begun = time.monotonic()
+    assert vehicle_module._run_app("node", "token", tmp_path / POLLED) is answered
+    assert time.monotonic() < begun + 30

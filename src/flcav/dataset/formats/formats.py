@@ -19,6 +19,7 @@ EXPORTS: Mapping[str, str] = {  # name -> module:NAME, so that listing the forma
 }
 IMPORTS: Mapping[str, str] = {
     "kitti": "flcav.dataset.formats.kitti.read:IMPORT",
+    "kitti-tracking": "flcav.dataset.formats.kitti.tracking:IMPORT",
     "nuscenes": "flcav.dataset.formats.nuscenes.read:IMPORT",
     "argoverse2": "flcav.dataset.formats.argoverse2:IMPORT",
     "opv2v": "flcav.dataset.formats.opv2v.read:IMPORT",

@@ -5,6 +5,7 @@ bottom face, and the rotation about y is zero along x. Records of this module ar
 y left, z up).
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Never
@@ -23,6 +24,7 @@ LAYOUT, POINT = "4 columns of float32", "x, y, z [m], intensity 0 to 1"
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
+RENAMED = {"R_rect": "R0_rect", "Tr_velo_cam": "Tr_velo_to_cam"}
 CLASSES = frozenset({"Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc"})
 PICTURES = "image_2"
 SUFFIXES = {"calib": "txt", "velodyne": "bin", PICTURES: "png", "label_2": "txt"}
@@ -70,9 +72,12 @@ def _refuse_points(data: bytes, path: Path) -> Never:
 def read_calibration(path: Path) -> KittiCalibration:
     """Return the calibration of a frame from its file, which has the matrices in MATRICES.
 
+    Files of the tracking benchmark have the other names in RENAMED, without a colon.
+
     Raises `InputError` for a missing, malformed or singular matrix.
     """
-    rows = dict(line.split(":", 1) for line in _lines(path) if ":" in line)
+    named = (line.replace(":", " ", 1).split(None, 1) for line in read_lines(path))
+    rows = {RENAMED.get(row[0], row[0]): row[-1] for row in named}
     matrices = {}
     for name, (height, width) in MATRICES.items():
         try:
@@ -117,8 +122,15 @@ def read_objects(path: Path, calibration: KittiCalibration, *, levels: bool = Fa
     in the levels of KITTI's tracking benchmark, and converted to shares. Raises `InputError` where the file is missing
     or a line is not a label.
     """
+    return parse_objects(dict(enumerate(read_lines(path), 1)), path, calibration, levels=levels)
+
+
+def parse_objects(
+    lines: Mapping[int, str], path: Path, calibration: KittiCalibration, *, levels: bool = False
+) -> Objects:
+    """Return the labelled objects of a frame, from lines of the file at `path`, by number: see `read_objects`."""
     label, rows, unlabelled = [], [], []
-    for number, line in enumerate(_lines(path), 1):
+    for number, line in lines.items():
         kind, *fields = line.split()
         try:
             values = [float(field) for field in fields]
@@ -158,7 +170,8 @@ def _read_levels(truncation: Array) -> Array:
     return np.where(known, TRUNCATION[np.where(known, truncation, 0).astype(int)], truncation)
 
 
-def _lines(path: Path) -> list[str]:
+def read_lines(path: Path) -> list[str]:
+    """Return the lines of a text file that are not blank; raises `InputError` where it is missing or no text."""
     try:
         return [line for line in read_file(path).decode("utf-8-sig").splitlines() if line.strip()]
     except UnicodeDecodeError:

@@ -97,7 +97,7 @@ class KittiSource(LogSource):
         names = AgentNames()
         for shot in every:
             calibration = _path(shot, "calib")
-            mounted = _calibrate(read_calibration(calibration))
+            mounted = mount_sensors(read_calibration(calibration))
             self._shots[shot.scene].append(shot)
             text = "" if shot.exported else read_file(calibration).decode()
             agent = self._agent[shot] = names.of(shot.vehicle, text)
@@ -129,7 +129,8 @@ class KittiSource(LogSource):
 IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne/*.bin"))
 
 
-def _calibrate(calibrated: KittiCalibration) -> Calibration:
+def mount_sensors(calibrated: KittiCalibration) -> Calibration:
+    """Return the mounts of LiDAR and camera on a vehicle whose LiDAR is HEIGHT_M above the ground."""
     agent_from_lidar = pose(0.0, 0.0, HEIGHT_M)
     projection = calibrated.image_from_camera
     shifted = np.eye(4)  # the projection's fourth column, K t, as a translation t of the camera
@@ -150,7 +151,7 @@ def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> Linked
     objects = read_objects(label, calibrated, levels=is_drive(shot.folder)) if label.is_file() else Objects.none()
     check_objects(objects, *size, label)
     agent_from_lidar, mount = calibration.agent_from_sensor[LIDAR], calibration.agent_from_sensor[CAMERA]
-    then = _calibrate(calibrated).agent_from_sensor[CAMERA] @ inverse(mount)
+    then = mount_sensors(calibrated).agent_from_sensor[CAMERA] @ inverse(mount)
     labels = [CATEGORIES.get(name, name) for name in objects.boxes.label.tolist()]
     boxes = objects.boxes.transform(agent_from_lidar)
     return LinkedFrame(
