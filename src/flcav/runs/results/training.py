@@ -74,7 +74,7 @@ class FederatedRound(Record):
 
 @dataclass(frozen=True)
 class StatisticsScore(Record):
-    """Validation scores of a stage III network in a region, with averaged or regional batch-normalisation statistics."""
+    """Validation scores of a stage III network in a region, with averaged or regional batch-norm statistics."""
 
     region: str
     frames: int
