@@ -215,7 +215,8 @@ def _finding(
             open_, unknown = NOT_HELD, f"{unknown.removesuffix(undecided)}, but {lost}: {explain_verdict(NOT_HELD)}"
         sentence = f"{change}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
         return RunFinding(place, question, open_, sentence)
-    of = f"{over} and over retraining (standard deviation {compared.spread.sd:.3f} of {compared.spread.trainings} trainings)"
+    spread = compared.spread
+    of = f"{over} and over retraining (standard deviation {spread.sd:.3f} of {spread.trainings} trainings)"
     text = f"{change}, 95 % interval {signed(low)} to {signed(high)} over {of}"
     if judged is None:
         return RunFinding(place, question, ESTIMATE, f"{text}: an estimate, no claim{rests}.")
