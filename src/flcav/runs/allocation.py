@@ -245,7 +245,8 @@ def remake_plan(
             for name, joined in (joins[task.name] or {}).items():
                 spare_s[name] -= (len(joined) - len((new.joins or {})[name])) * task.round_s(name)
     except Infeasible:
-        made, joins = {}, {}
+        made = {}
+        joins = {}
     for name, new in made.items():
         before = tasks[name]
         assert new.predicted is not None

@@ -75,7 +75,7 @@ def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: i
     """Return the difference of two tests: in the mean of the trainings that both runs have, or of the first one."""
     folders = [(works[1] / new, works[0] / old) for new, old in zip(after.steps, before.steps, strict=False)]
     over_scenes = compare_tests(key[3], folders[0][1], folders[0][0], seed)
-    measures = np.array([test.trainings[: len(folders)] for test in (before, after)])
+    measures = np.array([test.trainings[: len(folders)] for test in (before, after)])  # (2, trainings)
     values = (over_scenes.mean, *np.diff(measures, axis=0)[0, 1:])
     mean = mean_over_trainings(key[3], over_scenes, values, folders, seed, share=False)
     if mean is not None:

@@ -142,7 +142,7 @@ def drive_rounds(
         if rules.selection.predicts:
             slow = _find_slow(fleet, links, there, number, rules.selection.deadline_s or 0.0, begins)
             outages |= {(number, name): Outage(TOO_SLOW) for name in slow}
-            there = [name for name in there if name not in slow]
+            there = [name for name in there if name not in slow]  # simulated below without the slow ones on the band
             joins |= {name: (*joins[name], number) for name in there}
         timings = _time(fleet, links, there, number, settings.rounds, begins)
         shift = now - begins

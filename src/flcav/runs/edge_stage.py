@@ -94,6 +94,7 @@ def federate_regions(
         if step in alone:
             notify(step, done, total, note)
 
+    # One federation after another: the vehicles of one use all `jobs` processes.
     run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
     found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
     trained = [federation.result for federation in found]

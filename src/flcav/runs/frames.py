@@ -68,7 +68,8 @@ def make_recording_recipe(
     for which vehicles without a GNSS receiver or an IMU get one. Raises `InputError`, naming the recording by its
     `name`, where the settings do not go together.
     """
-    place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
+    place = recipe.regions[region]
+    frames = getattr(recipe.sized_splits, split)
     changes = [as_shared(task_named(task)).recording, recipe.recording.fields(split), place.recording.fields(split)]
     how: dict[str, Any] = {"every_s": frames.every_s}
     for more in (*changes, recipe.tasks[task].recording.fields(split)):

@@ -17,7 +17,7 @@ class LabelSource:
     from_poles: bool = False  # boxes of roadside sensors
     trained: bool = False  # whether these boxes are those of a trained detector instead of an ideal one
     tracked: bool = False  # a vehicle's tracks through the sweeps that it recorded around its frames
-    averaged: bool = False  # the road average of a window's poles and vehicles, renewed before each round of stage II
+    averaged: bool = False  # the road average of a window's poles and vehicles, renewed before the rounds of stage II
     caveat: str = ""  # stated with every result that depends on them
 
     @property
@@ -42,7 +42,7 @@ LABEL_SOURCES: Mapping[str, LabelSource] = {
     "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
     "future": LabelSource(
         caveat="every vehicle knows all tracks around it, upper bound"
-    ),  # the recorded future of each track
+    ),  # the recorded future of the tracks
     **{name: LabelSource(**about) for name, about in SOURCES.items()},
 }
 

@@ -71,7 +71,8 @@ def collect_results(graph: Graph, work: Path) -> Run:
 
 
 def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
-    names, tasks = graph.names, graph.recipe.tasks
+    names = graph.names
+    tasks = graph.recipe.tasks
     plans = dict.fromkeys(names.plan(arm.name, stage) for stage in (PRETRAIN, *arm.stages))
     *earlier, plan = (Plan.load(work / name) for name in plans)
     trained = dict.fromkeys(

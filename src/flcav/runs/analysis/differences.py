@@ -103,6 +103,8 @@ def list_differences(graph: Graph, work: Path) -> list[Difference]:
                 earlier = EDGE if stage in (CLOUD, MORE_EDGE) and region in arm.regions else PRETRAIN
                 pairs.append(((arm.name, stage), (arm.name, earlier), region, task))
             if arm.name != MAIN and (region in main.regions or stage != EDGE):
+                # Central training takes as many steps as stage II; on all regions it corresponds to cloud FL, which
+                # further edge rounds replace.
                 matching = CLOUD if arm.central == ALL else {CENTRAL: EDGE, MORE_EDGE: CLOUD}.get(stage, stage)
                 pairs.append(((MAIN, matching), (arm.name, stage), region, task))
     found: dict[tuple[str, str], Difference] = {}
@@ -125,7 +127,8 @@ def _join_regions(graph: Graph, differences: Iterable[Difference]) -> Iterator[D
 
 def _join(graph: Graph, group: Sequence[Difference]) -> Difference:
     """Return the mean over regions of a difference; regions have independent test scenes."""
-    first, regions = group[0], tuple(regional.region for regional in group)
+    first = group[0]
+    regions = tuple(regional.region for regional in group)
     place = " and ".join(regions)
     over_scenes = average_estimates([regional.over_scenes for regional in group])
     values = np.mean([regional.trainings for regional in group], axis=0).tolist()

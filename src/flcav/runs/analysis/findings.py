@@ -112,9 +112,9 @@ def _name_claim(each: Difference) -> str:
     return CLOUD if each.before_stage == EDGE else ELSEWHERE
 
 
-def _is_bound(own: Setting, other: Setting, task: str) -> bool:
+def _is_bound(setting: Setting, other: Setting, task: str) -> bool:
     """Return whether an arm is an upper bound of the run: it learns from truth that the run does not have."""
-    first, second = (LABEL_SOURCES[each.labels[task]].bound or each.fault is not None for each in (own, other))
+    first, second = (LABEL_SOURCES[each.labels[task]].bound or each.fault is not None for each in (setting, other))
     return other.central in ("federate", ALL) or (second and not first)
 
 

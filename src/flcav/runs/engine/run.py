@@ -189,7 +189,7 @@ def _list_ready(runs: Sequence[_Run], running: Sequence[tuple[_Run, Step]]) -> l
 
 
 def _share_workers(ready: Sequence[tuple[_Run, Step]], free: int, *, lent: bool) -> Iterator[tuple[_Run, Step, int]]:
-    """Yield the steps that begin on `free` workers, and how many each has: one and, if `lent`, spare ones."""
+    """Yield the steps that begin on `free` workers, with their numbers of workers: one and, if `lent`, spare ones."""
     spare = max(0, free - len(ready)) if lent else 0
     for run, step in ready[:free]:
         more = min(step.workers - 1, spare)
@@ -210,7 +210,7 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
 def _settle_records(
     steps: Sequence[Step], folder: Path, stale: str, sources: Sources
 ) -> tuple[dict[str, StepRecord], set[str]]:
-    """Return the record of each finished or pending step, and the stale steps.
+    """Return the records of finished and pending steps by name, and the stale steps.
 
     "redo" removes these, and those of other arguments.
     """

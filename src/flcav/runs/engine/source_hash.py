@@ -52,7 +52,8 @@ class Sources:
     @pause_collector()  # syntax trees are all kept
     def _hash_reached(self, starts: frozenset[Place]) -> dict[str, str]:
         reached: dict[str, set[ast.stmt]] = defaultdict(set)
-        left, seen = [*starts], set[Place]()
+        left = [*starts]
+        seen = set[Place]()
         while left:
             place = name, wanted = left.pop()
             if place in seen or (module := self._module(name)) is None:

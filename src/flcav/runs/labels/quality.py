@@ -18,7 +18,7 @@ from flcav.runs.results.training import FoundTargets, LabelHistory, LabelQuality
 
 RETURNS = 5, 20, 100  # lower ends of the classes of targets by LiDAR returns, for which recall is stated separately
 TIGHT = 0.7  # IoU in 3D from which on a box is as good as an annotated one
-LABELS = "labels.json"  # quality of the labels before each round, in the folder of a stage
+LABELS = "labels.json"  # quality of the labels by round, in the folder of a stage
 
 
 def read_label_history(folder: Path) -> LabelHistory:

@@ -62,6 +62,7 @@ def track_frame(
     at_s = data.keys[i].time_s
     reported = [_classify(view.boxes, network.config) for view in views]
     others = [BoxReport(f"pole {number}", at_s, boxes) for number, boxes in enumerate(reported)]
+    # Back by the navigation's pose, not the true one: an error common to all sweeps of the vehicle cancels.
     return track_objects(sweeps, at_s, others, LEAST_SCORE).transform(inverse(known[i]))
 
 

@@ -17,24 +17,24 @@ class TaskPlan:
     samples: int
     edge_rounds: int
     cloud_rounds: int
-    wireless_mb: float  # uplink, all stages
-    wireline_mb: float
-    sample_mb: float  # of one sample
-    model_mb: float  # of one model update
-    predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
+    wireless_mb: float  # uplink of all stages [MB]
+    wireline_mb: float  # likewise [MB]
+    sample_mb: float  # size of one sample [MB]
+    model_mb: float  # size of one model update [MB]
+    predicted: Mapping[str, float] | None  # score by the learning curve, after the stage; None: a fixed plan
     joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
-        None  # by vehicle the rounds of its region that it joins, of 1 … edge rounds + k · cloud rounds; None: all
+        None  # rounds of its region that a vehicle joins, of 1 … edge rounds + k · cloud rounds; None: all join all
     )
 
     uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
-        None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
+        None  # samples to upload by vehicle of the pretraining regions; None: drawn from the frames of all
     )
 
     exchange_mb: Annotated[float | None, LEFT_OUT] = (
-        None  # what a vehicle sends to be combined in a round; None: a model update
+        None  # what a vehicle sends to be combined in a round [MB]; None: a model update
     )
     labels_mb: Annotated[float | None, LEFT_OUT] = (
-        None  # what it sends to have its samples labelled: before each round of stage II, once before stage III
+        None  # what it sends to have its samples labelled [MB]: before every round of stage II, once before stage III
     )
 
     called: Annotated[int | None, LEFT_OUT] = None  # vehicles of a group on request; None: the plan does not decide

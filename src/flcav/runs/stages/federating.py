@@ -196,7 +196,8 @@ def _open_book(work: Work, settings: StageSettings, plan: Plan) -> Ledger:
 
     In stage II a region's share of the budget is proportional to its vehicles, or to those that the plan calls.
     """
-    first, share = settings.first, share_plan_budget(plan, settings.budgets_mb, settings.learning.task)
+    first = settings.first
+    share = share_plan_budget(plan, settings.budgets_mb, settings.learning.task)
     if isinstance(settings, CloudSettings):
         edges = [inputs.edge for inputs in settings.regions.values() if inputs.edge is not None]
         return Ledger(share, read_entries(work, first.pretrain, *edges))
@@ -335,7 +336,8 @@ def _score_statistics(work: Work, settings: StageSettings, learning: Learning) -
 
 def _drive(work: Work, settings: StageSettings, federation: StageFederation, plan: TaskPlan) -> DrivenStage:
     """Simulate the rounds of a plan on the radio network."""
-    how, cloud = settings.federation, federation.cloud is not None
+    how = settings.federation
+    cloud = federation.cloud is not None
     ways_s = None
     if cloud and how.network is not None:
         ways_s = 2 * how.network.wireline.seconds(update_bytes(to_arrays(federation.network)))

@@ -130,6 +130,7 @@ class Outline:
         """
         tracked = {WINDOW_S} if self.tracks(task) else set[float]()
         windows = sorted(({average.window_s for average in self.averaging(task)} | tracked) - {0.0})
+        # Arms share the recordings of a town, which have one window; in recorded data a window is chosen when read.
         if len(windows) > 1 and len(self.recorded) < len(self.federating):
             listed = " and ".join(f"{window_s:g} s" for window_s in windows)
             why = f" (labels by tracks: {WINDOW_S:g} s)" if tracked else ""

@@ -161,6 +161,7 @@ class FederationCheckpoints:
         hashes[_ledger_name(round_)] = sha256(self.folder / _ledger_name(round_))
         records = {name: tuple(state.records) for name, state in states}
         done = (round_, len(self.book.entries), tuple(self.losses), self.identity, hashes, records)
+        # The record comes last: until it is written, the files of this round do not count, and the round is repeated.
         Checkpoint(*done, tuple(self.scores)).keep(self.folder)
         for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
             (self.folder / name).unlink(missing_ok=True)

@@ -52,7 +52,7 @@ def plan_private_rounds(
     for count in numbers:
         names = [str(number) for number in range(count)]
         most = min(most, affordable_rounds(private, rules.selection, names, most, 0))
-    if most < edge + further:
+    if most < edge + further:  # both stages are cut in proportion, stage III in whole cloud rounds
         further = most * further // (edge + further) // at_once * at_once
         edge = min(edge, most - further)
     return PrivateRounds(rules.model_copy(update={"privacy": private}), edge, further)

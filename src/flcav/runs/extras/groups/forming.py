@@ -212,7 +212,8 @@ def call_group(
         positions = {name: places[name][scene] for name in vehicles if np.isfinite(places[name][scene]).all()}
         for name, request in before.items():
             uplink.enter(name, *(message.encode() for message in taken.messages[name]))
-            positions[name] = np.array([request.x, request.y, positions[name][2] if name in positions else 0.0])
+            height_m = positions[name][2] if name in positions else 0.0  # a request states x and y alone
+            positions[name] = np.array([request.x, request.y, height_m])
         asking = [name for name in vehicles if name in asked and name in positions and name not in before]
         positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
         present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
@@ -328,7 +329,8 @@ def find_client_places(split: Frames, region: str, clients: Sequence[str]) -> di
     scenes = {scene: number for number, scene in enumerate(dict.fromkeys(keys[i].scene for i in split.vehicles))}
     found = {name: np.full((len(scenes), 3), np.nan) for name in clients}
     for i in split.vehicles:
-        name, scene = f"{region}/{keys[i].agent}", scenes[keys[i].scene]
+        name = f"{region}/{keys[i].agent}"
+        scene = scenes[keys[i].scene]
         if name in found and np.isnan(found[name][scene, 0]):
             found[name][scene] = split.data.world_from_agent(i)[:3, 3]
     return found

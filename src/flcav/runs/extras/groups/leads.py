@@ -38,7 +38,9 @@ class _LeadBook(Ledger):
         self._book.check(entry)
 
     def enter(self, entry: LedgerEntry) -> None:
-        term, up = self._term, entry.direction == "up"
+        term = self._term
+        up = entry.direction == "up"
+        # In the round of its leaving, the lead is gone from the start, or once it has received so many updates.
         if entry.round == term.left and (term.received is None or (up and self._received >= term.received)):
             raise LeadLeft
         self._book.enter(entry)

@@ -207,7 +207,8 @@ def forecast_lifelong_s(outline: Outline, task: str, rounds: int, step_s: float,
     lifelong = outline.recipe.lifelong
     if lifelong is None:
         return 0.0
-    size, steps = outline.recipe.sized_splits, outline.settings[MAIN].training[task].local_steps
+    size = outline.recipe.sized_splits
+    steps = outline.settings[MAIN].training[task].local_steps
     count = len(lifelong.conditions)
     trained = rounds * steps * sum(outline.vehicles[condition] for condition in lifelong.conditions)
     tested = count**2 * size.test.scenes * size.test.spins * size.test.cavs

@@ -20,7 +20,7 @@ def deal_by_class(labels: NDArray, vehicles: int, shards: int, rng: np.random.Ge
     `labels`: (N,) classes of the samples, of any type that can be sorted. Samples of a class are in random order.
     """
     order = np.lexsort((rng.permutation(len(labels)), labels))
-    owners = rng.permutation(vehicles * shards) % vehicles
+    owners = rng.permutation(vehicles * shards) % vehicles  # (vehicles * shards,): a vehicle owns exactly `shards`
     return _assign(np.array_split(order, vehicles * shards), owners.tolist(), len(labels))
 
 
