@@ -28,8 +28,8 @@ class Compared:
     region: str
     task: str
     measure: str
-    first: float
-    second: float
+    first: float  # value in the first run, in [0, 1] for AP and accuracy
+    second: float  # value in the second run
     difference: Estimate  # over scenes and retraining; over seeds and scenes where both runs have several seeds
     verdict: str  # on the claim that the second is better, corrected for the number of tests
     judged: Judged | None = None  # the verdict with its p-value; None for one training of unknown spread

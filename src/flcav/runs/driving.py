@@ -56,8 +56,8 @@ class Fleet:
 
     region: str
     clients: tuple[str, ...]  # "region/vehicle"
-    download_bytes: int
-    upload_bytes: int
+    download_bytes: int  # message to a vehicle in a round [bytes]
+    upload_bytes: int  # message from a vehicle in a round [bytes]
     train_s: float  # training time of a vehicle of speed 1 in a round [s]
     speeds: Mapping[str, float]  # relative computing speeds, by client; others have 1
 

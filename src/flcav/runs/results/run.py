@@ -26,16 +26,16 @@ class Spent:
     stage: str
     task: str
     link: str
-    mb: float
+    mb: float  # [MB]
 
 
 @dataclass(frozen=True)
 class LinkUse:
     """Budget, planned traffic and actual traffic of one uplink [MB]."""
 
-    budget_mb: float
-    planned_mb: float
-    used_mb: float
+    budget_mb: float  # of the recipe
+    planned_mb: float  # of the last plan, all tasks
+    used_mb: float  # in the ledger
 
 
 @dataclass(frozen=True)

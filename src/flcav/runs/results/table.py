@@ -30,8 +30,8 @@ class Row:
     server: str = ""  # of a round: region of the edge server, or "cloud"
     quantity: str  # names of the fields of results.json that lead to it, such as "arms.stages.records.loss"
     value: float
-    low: float | None = None
-    high: float | None = None
+    low: float | None = None  # lower end of the interval; None: there is none
+    high: float | None = None  # upper end of the interval
     unit: str = ""
 
     @property

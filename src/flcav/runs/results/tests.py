@@ -141,8 +141,8 @@ class HomeCost:
     region: str
     task: str
     measure: str
-    before: float  # mean over the run's trainings
-    after: float
+    before: float  # mean over the run's trainings, before federated learning
+    after: float  # mean over the run's trainings, after it
     difference: Estimate  # after - before, paired over scenes; over trainings too, where there are several
     trainings: int  # of the run itself
 

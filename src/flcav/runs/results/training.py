@@ -65,7 +65,7 @@ class FederatedRound(Record):
     samples: int  # of the clients together
     loss: float | None  # mean training loss, weighted by samples; None: no client reported one
     up_bytes: int  # of all clients' messages, on their link
-    down_bytes: int
+    down_bytes: int  # to all clients, likewise
     epsilon: float | None  # of differential privacy, of all rounds so far; None: without noise
     seconds: float | None = None  # duration on the simulated network [s]; None: without one
     divergence: Annotated[RoundDivergence | None, LEFT_OUT] = None  # of the regions; None: no cloud round of several

@@ -82,7 +82,7 @@ class FirstPlanSettings(StepSettings):
 
     rule: PlanRule
     seed: int
-    budgets_mb: Budgets
+    budgets_mb: Budgets  # of the run, both uplinks [MB]
     headroom: float  # fraction of the budgets left unspent
     limits: PlanLimits
     horizon_s: float | None  # longest time that a vehicle trains, over all rounds of all tasks [s]

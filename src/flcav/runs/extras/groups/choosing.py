@@ -66,7 +66,7 @@ def find_lead(
     """Return the lead: the nearest edge server in range of a vehicle that `asked`, or else the lowest name in range.
 
     `positions`: (3,) of the vehicles present, by client, world frame [m]. `servers`: (3,) of the edge servers, by name,
-    world frame [m].
+    world frame [m]. `range_m`: range of V2X radio [m].
     """
     distances = {
         server: min(

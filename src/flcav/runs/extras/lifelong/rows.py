@@ -41,8 +41,8 @@ class LifelongArm(Record):
     # pretrained network, row i the one after condition i
     passed: tuple[Passed, ...]
     final: float  # mean score over all conditions after the last one
-    backward: float  # see `flcav.statistics.transfer`
-    forward: float
+    backward: float  # backward transfer, see `flcav.statistics.transfer`
+    forward: float  # forward transfer
 
     @classmethod
     def of(
