@@ -275,13 +275,11 @@ def federate_stage(
 ) -> tuple[tuple[float | None, ...], int | None]:
     """Run the rounds of a stage, write weights and ledger, and return the mean training loss by round.
 
-    If the training diverges, it stops with the weights of the last sound round, whose number is returned as well; None:
-    the weights are those of the last round.
-
-    `driven`: the rounds as simulated on the radio network; a vehicle whose connection is lost is missing from its
-    round, while the cloud's rounds need all edge servers. A privacy budget may end the rounds before the schedule does,
-    and so may any budget in asynchronous rounds. Where rules make arrays personal, the weights hold the mean of the
-    regions' arrays, and the regions' models are written to the same folder, as are regional models.
+    If the training diverges, it stops with the weights of the last sound round, whose number is returned as well (None:
+    those of the last round). `driven`: the rounds as simulated on the radio network; a vehicle whose connection is lost
+    is missing from its round, while the cloud needs all edge servers. A privacy budget may end the rounds before
+    the schedule does, and so may any budget in asynchronous rounds. Where rules make arrays personal, the weights hold
+    the mean of the regions' arrays, and the regions' models are written to the same folder, as are regional models.
     """
     learning, task, cloud, rules = own.learning, own.learning.task, own.cloud, driven.rules
     state, states = FederationState(), {region: FederationState() for region in own.regions if cloud is not None}
