@@ -29,15 +29,15 @@ from flcav.runs.results.plans import Plan, TaskPlan
 
 @dataclass(frozen=True)
 class PlanRequest:
-    """One task as the planner sees it: weight, message sizes, and its learning history or fixed plan."""
+    """The planner's input for one task: weight, message sizes, and its learning history or fixed plan."""
 
     name: str
-    weight: float
+    weight: float  # of the task's error in the objective, without unit
     sizes: MessageSizes
     pool: int  # samples available for upload
     history: History | None  # None: the plan is fixed
     fixed: FixedPlan | None
-    train_s: float = 0.0  # time that a vehicle trains in one round [s]
+    train_s: float = 0.0  # time that a vehicle of speed 1 trains in one round [s]
     air_s: Mapping[str, float] = field(default_factory=dict)  # time of a round's messages on the air [s], by region
 
 
@@ -45,27 +45,27 @@ class PlanRequest:
 class PlanSettings:
     """Budgets, bounds and topology of the federation, common to the plans of all tasks."""
 
-    budgets_mb: LinkMegabytes
-    headroom: float
+    budgets_mb: LinkMegabytes  # of both uplinks [MB]
+    headroom: float  # fraction of the budgets left unspent, in [0, 1)
     limits: PlanLimits
-    edge_groups: tuple[int, ...]  # vehicles of each edge server
+    edge_groups: tuple[int, ...]  # numbers of vehicles, by edge server
     edge_rounds_per_cloud_round: int
-    group_samples: tuple[int, ...] = ()  # samples that the vehicles of each edge server hold, of each task
+    group_samples: tuple[int, ...] = ()  # samples per task that the vehicles of an edge server hold, by edge server
     horizon_s: float | None = None  # longest time that a vehicle trains, over all rounds of all tasks [s]
-    speeds: Mapping[str, float] = field(default_factory=dict)  # of every vehicle, in the order of the edge servers
+    speeds: Mapping[str, float] = field(default_factory=dict)  # relative computing speeds, by vehicle, servers in order
     called: tuple[int, int] | None = None  # least and most vehicles of a group on request; None: the plan calls nobody
-    overlap: float = 0.0  # share of a further vehicle's data that those called before it have
+    overlap: float = 0.0  # share of a further vehicle's data that the vehicles called before it already have
 
     def stage_plan(self, samples: int, edge_rounds: int, cloud_rounds: int) -> StagePlan:
-        """Return the transfers of a task with these counts."""
+        """Return the transfers of a task with these numbers of samples and rounds."""
         return StagePlan(samples, edge_rounds, cloud_rounds, self.edge_groups, self.edge_rounds_per_cloud_round)
 
 
 def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRule) -> tuple[Plan, Problem | None]:
     """Return the plan of all tasks, and the allocation problem that was solved for those without a fixed plan.
 
-    Fixed plans are paid first; the problem is None where all are fixed. Raises `InputError` where the budgets do not
-    cover the fixed plans, `Infeasible` where the rest does not cover the lower bounds of the other tasks.
+    Fixed plans are paid first; the problem is None where all plans are fixed. Raises `InputError` where the budgets do
+    not cover the fixed plans, `Infeasible` where the rest does not cover the lower bounds of the other tasks.
     """
     plans: dict[str, TaskPlan] = {}
     left = np.array([frame.budgets_mb.wireless_mb, frame.budgets_mb.wireline_mb]) * (1 - frame.headroom)
@@ -82,19 +82,19 @@ def make_plan(tasks: tuple[PlanRequest, ...], frame: PlanSettings, rule: PlanRul
     problem = _problem(learned, frame, left) if learned else None
     if problem is not None:
         allotted, shares = (baseline(problem, rule).tasks, {}) if rule != "joint" else allocate_tasks(problem)
-        for task, own in zip(learned, allotted, strict=True):
-            plans[task.name] = make_task_plan(task.sizes, own, problem, shares)
+        for task, allocation in zip(learned, allotted, strict=True):
+            plans[task.name] = make_task_plan(task.sizes, allocation, problem, shares)
     return Plan(rule, {task.name: plans[task.name] for task in tasks}), problem
 
 
 def allocate_tasks(problem: Problem) -> tuple[Sequence[TaskAllocation], Shares]:
-    """Return the best plan and, of vehicles with names, each one's share of it."""
+    """Return the optimal plan and, where vehicles are named, their shares of its rounds."""
     plan, shares = allocate_fleet(problem)
     return plan.tasks, shares
 
 
 def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarray) -> Problem:
-    """Return the allocation problem, as `flcav allocate` reads it."""
+    """Return the allocation problem, in the form that `flcav allocate` reads."""
     wireless, wireline = budgets_mb.tolist()
     values = {
         "budgets_mb": {"wireless": wireless, "wireline": wireline},
@@ -105,18 +105,19 @@ def _problem(tasks: list[PlanRequest], frame: PlanSettings, budgets_mb: np.ndarr
     problem = parse_config(Problem, values, "the run's allocation problem")
     if frame.called is None:
         return problem
-    least, most = (min(each, max(frame.edge_groups)) for each in frame.called)
+    least, most = (min(bound, max(frame.edge_groups)) for bound in frame.called)
     narrowed = (call_vehicles(task, least, most, frame.edge_rounds_per_cloud_round) for task in problem.tasks)
     return problem.model_copy(update={"tasks": tuple(narrowed)})
 
 
 def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
     assert task.history is not None
-    k, all_ = frame.edge_rounds_per_cloud_round, max(frame.edge_groups)
+    k = frame.edge_rounds_per_cloud_round
+    all_ = max(frame.edge_groups)
     found = fit(task.history, model=_choose_model(task.history, frame), group_samples=frame.group_samples, k=k)
     least, most = frame.limits.samples
     most = task.pool if most is None else min(most, task.pool)
-    measured = task.history.resources.max(axis=0)
+    measured = task.history.resources.max(axis=0)  # curves are not extrapolated beyond the rounds of the history
     edge, cloud = (
         (low, max(low, int(reached)) if cap is None else cap)
         for (low, cap), reached in zip((frame.limits.edge_rounds, frame.limits.cloud_rounds), measured[1:], strict=True)
@@ -146,7 +147,7 @@ def _task(task: PlanRequest, frame: PlanSettings) -> dict[str, Any]:
 
 
 def _choose_model(history: History, frame: PlanSettings) -> Literal["best", "effective", "federated"]:
-    """Return the model of the learning curve: the best, or where the plan calls vehicles one that knows their data."""
+    """Return the model of the learning curve: the best fit or, if vehicles are called, one that uses their data."""
     if frame.called is None:
         return "best"
     several = len(frame.group_samples) > 1 and np.ptp(history.resources[:, 2]) > 0
@@ -162,13 +163,14 @@ def _fixed(task: PlanRequest, fixed: FixedPlan, frame: PlanSettings) -> TaskPlan
 
 
 def make_task_plan(sizes: MessageSizes, own: TaskAllocation, problem: Problem, shares: Shares) -> TaskPlan:
-    """Return the plan of a task by its allocation in `problem`: scores predicted after each stage, rounds to join."""
-    task = next(each for each in problem.tasks if each.name == own.name)
-    k, counts = problem.edge_rounds_per_cloud_round, (own.samples, own.edge_rounds, own.cloud_rounds)
+    """Return the plan of a task by its allocation `own` in `problem`, with predicted scores and the rounds to join."""
+    task = next(task for task in problem.tasks if task.name == own.name)
+    k = problem.edge_rounds_per_cloud_round
+    counts = (own.samples, own.edge_rounds, own.cloud_rounds)
     curve = task.curve if own.called is None else call_vehicles(task, own.called, own.called, k).curve
     spent = {PRETRAIN: (counts[0], 0, 0), EDGE: (*counts[:2], 0), CLOUD: counts}
-    predicted = {stage: max(1 - float(curve.error(*each, k)), 0.0) for stage, each in spent.items()}
-    joins = {each.vehicle: each.rounds for each in shares[own.name]} if own.name in shares else None
+    predicted = {stage: max(1 - float(curve.error(*totals, k)), 0.0) for stage, totals in spent.items()}
+    joins = {share.vehicle: share.rounds for share in shares[own.name]} if own.name in shares else None
     return _task_plan(counts, LinkMegabytes(own.wireless_mb, own.wireline_mb), sizes, predicted, joins, own.called)
 
 
@@ -194,7 +196,7 @@ def _task_plan(
     )
 
 
-ROUNDING = 1e-6  # of a round, which there is time for all the same
+ROUNDING = 1e-6  # of a round: tolerance for floating-point error in the number of rounds that fit
 Joins = Mapping[str, tuple[int, ...]]  # rounds by vehicle
 
 
@@ -205,23 +207,24 @@ def remake_plan(
     reached: Mapping[str, float],
     used_mb: LinkMegabytes,
 ) -> Plan:
-    """Return the plan of the rest of a run after `stage`, which `plan` was carried out in; fixed plans stay.
+    """Return the plan for the rest of a run after `stage`, in which `plan` was carried out; fixed plans stay.
 
-    `problem` is that of the first plan, `reached` the score of each of its tasks now, `used_mb` what they have sent.
-    Counts are totals, including what is spent. Scores predicted of stages that are over are kept. Where what is left of
-    the budgets allows no other plan, or in any task a region's vehicles have too little time left for its rounds, the
-    plans of all tasks stay.
+    `problem` is that of the first plan, `reached` the current score by task, `used_mb` the uplink traffic so far [MB].
+    Counts are totals, including what is spent. Scores predicted for finished stages are kept. The plans of all tasks
+    stay where the remaining budgets allow no other plan, or where the vehicles of a region have too little time left
+    for the rounds of any task.
     """
-    states, tasks = {}, {**plan.tasks}
+    states = {}
+    tasks = {**plan.tasks}
     for task in problem.tasks:
-        own = tasks[task.name]
-        counts = (own.samples, own.edge_rounds if stage == EDGE else 0, 0)
+        planned = tasks[task.name]
+        counts = (planned.samples, planned.edge_rounds if stage == EDGE else 0, 0)
         predicted = float(task.curve.error(*counts, problem.edge_rounds_per_cloud_round))
         known = 0 < predicted < np.inf  # a curve without points before the first round has no error there
         states[task.name] = TaskState(
             samples=counts[0],
             edge_rounds=counts[1],
-            called=own.called if stage == EDGE else None,
+            called=planned.called if stage == EDGE else None,
             accuracy=reached[task.name] if known else None,
             ended=stage,
         )
@@ -229,28 +232,33 @@ def remake_plan(
     rest = condition_problem(problem, PlanState(tasks=states, used_mb=sent))
     try:
         allotted, shares = allocate_tasks(rest)
-        made = {own.name: make_task_plan(tasks[own.name].sizes, own, rest, shares) for own in allotted}
+        made = {
+            allocated.name: make_task_plan(tasks[allocated.name].sizes, allocated, rest, shares)
+            for allocated in allotted
+        }
         over = {name: tasks[name].edge_rounds if stage == EDGE else 0 for name in made}
         spare_s, joins = find_spare(rest, shares), {}
-        for own in rest.tasks:
-            new = made[own.name]
-            joins[own.name] = continue_joins(tasks[own.name], new, over[own.name], own, spare_s)
-            for name, joined in (joins[own.name] or {}).items():
-                spare_s[name] -= (len(joined) - len((new.joins or {})[name])) * own.round_s(name)
+        for task in rest.tasks:
+            new = made[task.name]
+            joins[task.name] = continue_joins(tasks[task.name], new, over[task.name], task, spare_s)
+            # Tasks share their vehicles' time: what this one takes beyond its share is gone for those after it.
+            for name, joined in (joins[task.name] or {}).items():
+                spare_s[name] -= (len(joined) - len((new.joins or {})[name])) * task.round_s(name)
     except Infeasible:
-        made, joins = {}, {}
+        made = {}
+        joins = {}
     for name, new in made.items():
         before = tasks[name]
         assert new.predicted is not None
         assert before.predicted is not None
         past = (PRETRAIN,) if stage == PRETRAIN else (PRETRAIN, EDGE)
-        predicted = {**new.predicted, **{each: before.predicted[each] for each in past}}
+        predicted = {**new.predicted, **{done: before.predicted[done] for done in past}}
         tasks[name] = replace(new, predicted=predicted, joins=joins[name], uploads=before.uploads)
     return Plan(plan.rule, tasks, stage, dict(reached))
 
 
 def find_spare(problem: Problem, shares: Shares) -> dict[str, float]:
-    """Return the time that each vehicle's shares of all tasks leave of the horizon [s]; inf without a horizon."""
+    """Return the time of the horizon that a vehicle's shares of all tasks leave [s], by vehicle; inf without one."""
     horizon_s = np.inf if problem.horizon_s is None else problem.horizon_s
     return {name: horizon_s - busy_s for name, busy_s in sum_busy(shares).items()}
 
@@ -258,34 +266,34 @@ def find_spare(problem: Problem, shares: Shares) -> dict[str, float]:
 def continue_joins(
     before: TaskPlan, new: TaskPlan, over: int, task: AllocationTask, spare_s: Mapping[str, float]
 ) -> Joins | None:
-    """Return the first `over` rounds that vehicles joined by the plan `before`, and the later ones by the `new` one.
+    """Return the rounds that vehicles join, by vehicle: the first `over` by the plan `before`, later ones by `new`.
 
-    spare_s: what the new plan leaves of each vehicle's time [s], as `find_spare` finds it; a round takes the `round_s`
-    of `task`. No vehicle joins more rounds in all than it has time for: where it would, the later rounds of its region
-    are dealt again, round robin, to those that have rounds left.
-    Raises `Infeasible` where these are too few for the rounds.
+    `spare_s`: time that the new plan leaves a vehicle [s], by vehicle, see `find_spare`; a round takes the `round_s` of
+    `task`. No vehicle joins more rounds in all than it has time for: where it would, the later rounds of its region are
+    dealt again, round robin, to the vehicles with time left. Raises `Infeasible` where they have too little.
     """
     if before.joins is None or new.joins is None:
         return new.joins
-    past = {name: tuple(each for each in before.joins[name] if each <= over) for name in new.joins}
-    later = {name: tuple(each for each in own if each > over) for name, own in new.joins.items()}
+    past = {name: tuple(number for number in before.joins[name] if number <= over) for name in new.joins}
+    later = {name: tuple(number for number in joined if number > over) for name, joined in new.joins.items()}
     most = {name: len(joined) + _further(spare_s[name], task.round_s(name)) for name, joined in new.joins.items()}
     for region in dict.fromkeys(name.rpartition("/")[0] for name in later):
-        own = [name for name in later if name.rpartition("/")[0] == region]
-        if any(len(past[name]) + len(later[name]) > most[name] for name in own):
-            rounds = sorted({*chain.from_iterable(later[name] for name in own)})
-            later |= _deal({name: most[name] - len(past[name]) for name in own}, rounds)
+        vehicles = [name for name in later if name.rpartition("/")[0] == region]
+        if any(len(past[name]) + len(later[name]) > most[name] for name in vehicles):
+            rounds = sorted({*chain.from_iterable(later[name] for name in vehicles)})
+            later |= _deal({name: most[name] - len(past[name]) for name in vehicles}, rounds)
     return {name: past[name] + later[name] for name in later}
 
 
 def _further(spare_s: float, round_s: float) -> int:
-    """Return the number of further rounds of `round_s` [s] that fit in the time; negative: rounds too many."""
+    """Return the number of further rounds of `round_s` [s] that fit in `spare_s` [s]; negative: rounds too many."""
     return MOST if round_s == 0 else floor(min(spare_s / round_s, MOST) + ROUNDING)
 
 
 def _deal(left: Mapping[str, int], rounds: Sequence[int]) -> dict[str, tuple[int, ...]]:
-    """Deal `rounds` to vehicles with so many `left` each, one vehicle starting where the last one ended."""
-    dealt, start = {}, 0
+    """Deal `rounds` to vehicles, round robin; `left`: rounds that a vehicle can still take, by vehicle."""
+    dealt = {}
+    start = 0
     for name, many in left.items():
         count = min(max(many, 0), len(rounds))
         dealt[name] = tuple(sorted(rounds[(start + number) % len(rounds)] for number in range(count)))

@@ -39,7 +39,7 @@ PlanRule = Literal["joint", "equal-stages", "equal-tasks", "max-throughput"]
 PLANNED = ("plan", "calls")  # fields of `Setting` that decide the plan, and the errors that sensors are placed by
 PLACED = (*PLANNED, "placement")  # those that decide where sensors stand
 PRETRAINED = (*PLANNED, "pretraining", "pretrain_repeat")  # those that decide pretraining
-OF_ROUNDS = (  # fields of `Training` of federations alone
+OF_ROUNDS = (  # fields of `Training` that only federations use
     "local_steps",
     "local_rate",
     "final_rate",
@@ -62,20 +62,20 @@ OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation w
 
 
 class CalledNumbers(NamedTuple):
-    """The numbers of vehicles that a plan chooses a group's from."""
+    """The range from which a plan chooses the number of vehicles in a group."""
 
     least: int
     most: int
-    overlap: float  # share of a further vehicle's data that those called before it have
+    overlap: float  # share of a further vehicle's data that the vehicles called before it already have
 
 
 @dataclass(frozen=True)
 class Setting:
-    """The complete settings of one arm, those it takes over from the recipe included."""
+    """The complete settings of one arm, including those inherited from the recipe."""
 
     name: str
     repeat: int  # 0: the arm itself; n: its n-th retraining
-    pretrain_repeat: int  # of its pretraining; 0 where retrainings share it
+    pretrain_repeat: int  # number of its pretraining; 0 where retrainings share it
     plan: PlanRule
     calls: CalledNumbers | None  # vehicles that the plan calls to a group; None: it does not decide
     placement: PlacementSettings
@@ -85,20 +85,20 @@ class Setting:
     federation: Federation
     training: Mapping[str, Training]  # by task
     central: Literal["pretrain", "federate", "all"] | None
-    uploads: int | None  # frames of each region that centralised training has; None: all
+    uploads: int | None  # frames per region that centralised training has; None: all
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
-    replanned: bool  # whether the rest is planned again after stages I and II, from what the run itself reached
+    replanned: bool  # whether the rest is planned again after stages I and II, from the scores of the run itself
 
     @property
     def pretraining(self) -> Mapping[str, Training]:
-        """Return the training by task without what decides federations alone."""
+        """The training by task, with defaults for the fields that only federations use."""
         of_rounds = {name: field.default for name, field in Training.model_fields.items() if name in OF_ROUNDS}
         return {task: training.model_copy(update=of_rounds) for task, training in self.training.items()}
 
     @property
     def edge_federation(self) -> Federation:
-        """Return the federation without what decides stage III alone."""
+        """The federation, with defaults for the fields that only stage III uses."""
         of_cloud = (
             "personal",
             "cloud_strategy",
@@ -114,11 +114,11 @@ class Setting:
 def resolve_settings(recipe: RunRecipe, labels: Mapping[str, str] | None = None) -> dict[str, Setting]:
     """Return the settings of the run itself and of its arms by name, the run first.
 
-    After them come those of every arm's retrainings, by `name_repeat`. `labels`: the run's kinds of labels by task;
-    None: those of the recipe, or each task's first. Raises `InputError` for labels that a task does not have.
+    After them come those of the retrainings, named by `name_repeat`. `labels`: the run's kinds of labels by task;
+    None: those of the recipe, or the task's first. Raises `InputError` for labels that a task does not have.
     """
     if labels is None:
-        labels = {task: choose_labels(task, own.labels) for task, own in recipe.tasks.items()}
+        labels = {task: choose_labels(task, entry.labels) for task, entry in recipe.tasks.items()}
     arms = {MAIN: Arm(), **recipe.arms}
     return {
         name_repeat(name, repeat): _setting(recipe, labels, name_repeat(name, repeat), repeat, arm)
@@ -160,12 +160,12 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
 
 
 def find_calls(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:
-    """Return the numbers of vehicles that a plan chooses from; None where all of a region take part."""
+    """Return the range of group sizes that a plan chooses from; None where all vehicles of a region take part."""
     return next((found for find in load_all(CALLS) if (found := find(recipe, how)) is not None), None)
 
 
 def _learns(recipe: RunRecipe, rule: PlanRule) -> bool:
-    """Return whether a plan by `rule` is optimised by learning curves; other rules divide the budgets directly."""
+    """Return whether `rule` optimises the plan by learning curves; other rules divide the budgets directly."""
     return rule == "joint" and any(task.history for task in recipe.tasks.values())
 
 
@@ -185,10 +185,10 @@ def find_strategies(how: Federation) -> tuple[Strategy, Strategy]:
 
 
 def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
-    """Raise `InputError` where an arm's strategies and rules do not go together, or not with so many vehicles.
+    """Check that the strategies and rules of all arms go together, and suit the number of vehicles.
 
-    Raises it also where a pose graph is asked for without GTSAM. The vehicles of regions of recorded data are not known
-    before their frames are dealt; and for a horizon that no plan is made by.
+    Raises `InputError` where they do not, where a pose graph is asked for without GTSAM, and for a horizon without a
+    plan to limit. Regions of recorded data are left out: their vehicles are not known before their frames are dealt.
     """
     settings = [*settings]
     if recipe.horizon_s is not None and not any(_learns(recipe, setting.plan) for setting in settings):
@@ -208,7 +208,8 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
 def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     how = setting.federation
     edge, cloud = find_strategies(how)
-    selection, privacy = how.selection, how.privacy
+    selection = how.selection
+    privacy = how.privacy
     for check in load_all(ARM_CHECKS) if setting.central is None else ():
         check(recipe, setting, edge)
     if how.network is not None and selection.rule == "importance":
@@ -247,7 +248,7 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
 
 
 def _check_imitation(setting: Setting) -> None:
-    """Raise `InputError` where an arm keeps the boxes of a task without any, or of one with another loss."""
+    """Raise `InputError` where an arm imitates the boxes of a task other than object detection."""
     for task, training in setting.training.items():
         if training.imitation and task != OBJECTS.name:
             raise InputError(f"training.imitation: it keeps boxes, and '{task}' has none; give it to 'objects' alone")
@@ -256,16 +257,18 @@ def _check_imitation(setting: Setting) -> None:
 def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
     """Raise `InputError` where an arm needs a known number of vehicles in a round, and its rounds may have any.
 
-    The numbers are known only when a region's rounds are timed, after its recordings and pretraining. Raises it also
-    for a deadline that no network predicts round times for.
+    Under a predicted deadline the numbers are known only when a region's rounds are timed, after its recordings and
+    pretraining. Raises it also for a deadline without a network to predict round times.
     """
-    how, predicted = setting.federation, setting.federation.selection.predicts
+    how = setting.federation
+    predicted = how.selection.predicts
     if predicted and how.network is None:
         raise InputError(
             "selection: a deadline needs the predicted 'seconds' of a round by client, or a federation.network"
         )
     if predicted:
-        why, instead = "federation.network: a predicted deadline leaves other numbers of vehicles to its rounds", ""
+        why = "federation.network: a predicted deadline leaves other numbers of vehicles to its rounds"
+        instead = ""
     elif how.selection.rule == "all" and plans_joiners(recipe, setting):
         why = "horizon_s: a plan by speeds or the time of messages leaves other numbers of vehicles to its rounds"
         instead = "; choose another 'selection' than all, or leave out horizon_s"
@@ -280,24 +283,24 @@ def _check_numbers(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> N
 
 
 def plans_joiners(recipe: RunRecipe, setting: Setting) -> bool:
-    """Return whether a plan says which vehicles join a round, as it does where it times each of them."""
+    """Return whether a plan decides which vehicles join a round: it does where it predicts their times."""
     speeds = any(recipe.speeds(region) for region in recipe.with_role("federate"))
     timed = recipe.federation.network is not None or speeds
     return recipe.horizon_s is not None and timed and setting.central is None and _learns(recipe, setting.plan)
 
 
 def _check_outputs(recipe: RunRecipe, setting: Setting) -> None:
-    """Raise `InputError` where vehicles cannot send class probabilities: for such a task, or on a network."""
+    """Raise `InputError` where vehicles cannot send class probabilities: tasks without them, or a radio network."""
     for name in recipe.tasks:
         if not isinstance(task_named(name), Imitates):
-            fit = " and ".join(each for each in TASKS if isinstance(task_named(each), Imitates))
+            fit = " and ".join(task for task in TASKS if isinstance(task_named(task), Imitates))
             raise InputError(f"strategy fedmd: '{name}' has no class probabilities of shared frames; {fit} have")
     if setting.federation.network is not None:
         raise InputError("federation.network: its clock knows updates of weights alone, and fedmd sends probabilities")
 
 
 def _check_arrays(task: str, network: str | None, setting: Setting) -> None:
-    """Raise `InputError` where patterns of names do not fit the arrays of a task's network."""
+    """Raise `InputError` where the recipe's patterns of names match no arrays of a task's network."""
     learned = task_named(task)
     weights = to_arrays(build_network(learned, find_configuration(learned, network), 0))
     if setting.federation.upload.layers:
@@ -309,59 +312,59 @@ def _check_arrays(task: str, network: str | None, setting: Setting) -> None:
 
 
 class Names:
-    """Names of a run's steps. Arms that agree in all settings a step depends on share it, named after the first arm."""
+    """Names of a run's steps; arms that agree in all settings a step depends on share it, named after the first arm."""
 
     def __init__(self, settings: Mapping[str, Setting]) -> None:
         self._settings = settings
 
     def recording(self, region: str, split: str, task: str) -> str:
-        """Return the step that records a split for a task; all arms share it."""
+        """Return the name of the step that records a split for a task; all arms share it."""
         return f"{region}-{split}-{task}"
 
     def plan(self, arm: str, stage: str = PRETRAIN) -> str:
-        """Return the step that allocates the budgets, in the state in which `stage` is carried out.
+        """Return the name of the step that makes the plan by which `stage` is carried out.
 
-        All arms with the same rule follow the same plan, that of the first of them: so they differ in nothing else.
+        All arms with the same rule follow the plan of the first of them, so that they differ in nothing else.
         """
         before = {EDGE: PRETRAIN, CENTRAL: PRETRAIN, CLOUD: EDGE, MORE_EDGE: EDGE}.get(stage)
         replanned = self._settings[arm].replanned and before is not None
         return "plan" + (f"-after-{before}" if replanned else "") + self._suffix(arm, PLANNED)
 
     def pretrain(self, arm: str, task: str) -> str:
-        """Return stage I of a task."""
+        """Return the name of the step that pretrains a task (stage I)."""
         return f"{PRETRAIN}-{task}" + self._suffix(arm, PRETRAINED)
 
     def errors(self, arm: str, region: str, task: str) -> str:
-        """Return the step that registers a task's errors in a region."""
+        """Return the name of the step that registers a task's errors in a region."""
         return f"{region}-errors-{task}" + self._suffix(arm, PLANNED)
 
     def place(self, arm: str, region: str) -> str:
-        """Return the step that places roadside sensors in a region."""
+        """Return the name of the step that places roadside sensors in a region."""
         return f"{region}-place" + self._suffix(arm, PLACED)
 
     def tracks(self, arm: str, region: str, task: str) -> str:
-        """Return the tracks around a task's training frames in a region."""
+        """Return the name of the step that tracks objects around a task's training frames in a region."""
         return f"{region}-tracks-{task}" + self._suffix(arm, TRACKED, task)
 
     def edge(self, arm: str, region: str, task: str) -> str:
-        """Return stage II of a task in a region."""
+        """Return the name of stage II of a task in a region."""
         return f"{region}-{EDGE}-fl-{task}" + self._suffix(arm, OF_EDGE, task)
 
     def more_edge(self, arm: str, region: str, task: str) -> str:
-        """Return the further edge rounds of a task in a region."""
+        """Return the name of the step with further edge rounds of a task in a region."""
         return f"{region}-more-{EDGE}-fl-{task}" + self._suffix(arm, OF_EDGE, task)
 
     def cloud(self, arm: str, task: str) -> str:
-        """Return stage III of a task."""
+        """Return the name of stage III of a task."""
         return f"{CLOUD}-fl-{task}" + self._suffix(arm, LEARNED, task)
 
     def central(self, arm: str, region: str, task: str) -> str:
-        """Return the centralised training of an arm in a region; all regions share it unless it uses their frames."""
+        """Return the name of an arm's centralised training; all regions share it unless it uses their frames."""
         shared = self._settings[arm].central != "federate"
         return f"{CENTRAL}-{task}-{arm}" if shared else f"{region}-{CENTRAL}-{task}-{arm}"
 
     def stage(self, arm: str, stage: str, region: str, task: str) -> str:
-        """Return the step that trained an arm's network for a region in a stage."""
+        """Return the name of the step that trained an arm's network for a region in a stage."""
         if stage == PRETRAIN:
             return self.pretrain(arm, task)
         if stage == CLOUD:
@@ -369,20 +372,20 @@ class Names:
         return {EDGE: self.edge, MORE_EDGE: self.more_edge, CENTRAL: self.central}[stage](arm, region, task)
 
     def test(self, trained: str, region: str, model: str | None = None) -> str:
-        """Return the test of a step's network in a region, or of the personal model of the region `model`."""
+        """Return the name of the test of a step's network in a region, or of the personal model of region `model`."""
         return f"test-{trained}-{region}" if model is None else f"test-{trained}-of-{model}-{region}"
 
     def rounds(self, trained: str, region: str) -> str:
-        """Return the validation of a step's network after each of its rounds in a region."""
+        """Return the name of the step that validates a step's network in a region after every round."""
         return f"rounds-{trained}-{region}"
 
     def _suffix(self, arm: str, fields: tuple[str, ...], task: str | None = None) -> str:
-        own = self._rests_on(arm, fields, task)
-        first = next(name for name in self._settings if self._rests_on(name, fields, task) == own)
+        values = self._rests_on(arm, fields, task)
+        first = next(name for name in self._settings if self._rests_on(name, fields, task) == values)
         return "" if first == MAIN else f"-{first}"
 
     def _rests_on(self, arm: str, fields: tuple[str, ...], task: str | None) -> list[object]:
-        """Return the settings that a step depends on, of the labels only those of `task`."""
+        """Return the values of the settings that a step depends on; of the labels only those of `task`."""
         setting = self._settings[arm]
         values = {name: getattr(setting, name) for name in fields}
         if task is not None:

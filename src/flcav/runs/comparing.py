@@ -28,19 +28,19 @@ class Compared:
     region: str
     task: str
     measure: str
-    first: float
-    second: float
+    first: float  # value in the first run, in [0, 1] for AP and accuracy
+    second: float  # value in the second run
     difference: Estimate  # over scenes and retraining; over seeds and scenes where both runs have several seeds
-    verdict: str  # of the claim that the second is better, corrected for the number of tests
-    judged: Judged | None = None  # with its p-value; None for one training of unknown spread
+    verdict: str  # on the claim that the second is better, corrected for the number of tests
+    judged: Judged | None = None  # the verdict with its p-value; None for one training of unknown spread
 
 
 def compare(first: Path, second: Path) -> tuple[Compared, ...]:
     """Return the paired difference of every test that both runs made, over the seeds that both have.
 
-    Its interval (95 %) for one common seed is over the trainings that both runs have; of one training a bootstrap over
-    scenes, widened by the spread of retraining in both; where that is not known, one seed decides only a loss that is
-    too large for any spread. For several seeds it is over seeds and scenes, of each seed's mean over its trainings.
+    With several common seeds the 95 % interval is over seeds and scenes, of the mean over the trainings of a seed. With
+    one it is over the trainings that both runs have. With one training it is a bootstrap over scenes, widened by the
+    spread of retraining in both; if that is not known, only a loss that is too large for any spread is decided.
     Raises `InputError` where a folder holds no finished run, and where no test was made on the same frames by both.
     """
     folders = [seed_folders(folder) for folder in (first, second)]
@@ -65,23 +65,24 @@ def _of_seed(first: Path, second: Path, seed: int) -> dict[Key, _Pair]:
     tests: list[Mapping[Key, Test]] = [{test.key: test for test in run.tested} for run in runs]
     found = {}
     for key in (key for key in tests[0] if key in tests[1]):
-        before, after = (own[key] for own in tests)
-        with suppress(InputError):  # they were made on other frames
+        before, after = (made[key] for made in tests)
+        with suppress(InputError):  # the tests are of different frames
             found[key] = _pair(key, before, after, (first / WORK, second / WORK), seed)
     return found
 
 
 def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: int) -> _Pair:
-    """Return the difference of two tests: in the mean of the trainings that both runs have, or in one of each."""
+    """Return the difference of two tests: in the mean of the trainings that both runs have, or of the first one."""
     folders = [(works[1] / new, works[0] / old) for new, old in zip(after.steps, before.steps, strict=False)]
     over_scenes = compare_tests(key[3], folders[0][1], folders[0][0], seed)
-    measures = np.array([test.trainings[: len(folders)] for test in (before, after)])
+    measures = np.array([test.trainings[: len(folders)] for test in (before, after)])  # (2, trainings)
     values = (over_scenes.mean, *np.diff(measures, axis=0)[0, 1:])
     mean = mean_over_trainings(key[3], over_scenes, values, folders, seed, share=False)
     if mean is not None:
         change, known = mean.as_estimate(), mean
     else:
-        spread, measures = combine_spreads(before.spread, after.spread), measures[:, :1]
+        spread = combine_spreads(before.spread, after.spread)
+        measures = measures[:, :1]
         change = over_scenes if spread is None else widen(over_scenes, spread)
         known = None if spread is None else of_one_training(over_scenes, after.result.scenes, spread)
     first, second = measures.mean(axis=1).tolist()
@@ -91,16 +92,18 @@ def _pair(key: Key, before: Test, after: Test, works: tuple[Path, Path], seed: i
 
 
 def _average(key: Key, pairs: Sequence[_Pair]) -> _Pair:
-    """Return the mean over seeds of a test's differences; its interval is over seeds and scenes."""
+    """Return the mean over seeds of the difference in a test; its interval is over seeds and scenes."""
     compared = [pair.compared for pair in pairs]
-    mean = mean_of_tests(key[3], [each.difference.mean for each in compared], [pair.folders for pair in pairs])
-    first, second = np.mean([(each.first, each.second) for each in compared], axis=0).tolist()
+    mean = mean_of_tests(
+        key[3], [difference.difference.mean for difference in compared], [pair.folders for pair in pairs]
+    )
+    first, second = np.mean([(difference.first, difference.second) for difference in compared], axis=0).tolist()
     whole = replace(compared[0], first=first, second=second, difference=mean)
     return replace(pairs[0], compared=whole, estimate=mean)
 
 
 def _judge(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
-    """Return the differences, judged together; of one training of unknown spread only a large loss is decided."""
+    """Judge all differences together; for one training of unknown spread only a large loss is decided."""
     judged = judge_known([None if pair.estimate is None else Claim(pair.estimate) for pair in pairs])
     return tuple(
         replace(pair.compared, verdict=_judge_unknown(pair, len(pairs)) if one is None else one.verdict, judged=one)
@@ -109,6 +112,7 @@ def _judge(pairs: Sequence[_Pair]) -> tuple[Compared, ...]:
 
 
 def _judge_unknown(pair: _Pair, family: int) -> str:
-    """Return the verdict on one training of unknown spread: a loss too large for the spread of both runs is one."""
+    """Return the verdict on one training of unknown spread: a loss that is too large for any spread of both runs."""
+    # The difference of two trainings varies by sqrt(2) of the spread of one.
     lost = tell_loss(pair.compared.difference, pair.scenes, family, LARGEST_SPREAD * 2**0.5)
     return UNDECIDED if lost is None else NOT_HELD

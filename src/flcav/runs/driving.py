@@ -1,8 +1,8 @@
 """The radio network of a run's vehicles: clients that complete a round, its duration, and a plan's prediction of both.
 
-Round n of a region is driven in one of the scenes of its training data, in turn, from the scene's first instant. The
-roadside units are on the poles of its sensors; a plan, which is made before these are placed, has one unit, on the pole
-with most traffic. With measured throughput (`flcav.network.radio.measured`) there are no scenes and no units: the
+Round n of a region is simulated in one of the scenes of its training data, in turn, from the scene's first instant. The
+roadside units are on the poles of its sensors; a plan, which is made before these are placed, assumes one unit, on the
+pole with most traffic. With measured throughput (`flcav.network.radio.measured`) there are no scenes and no units: the
 rounds of a stage follow one another on the clock of the measurement, which repeats.
 """
 
@@ -30,9 +30,9 @@ from flcav.runs.results.plans import Placed
 from flcav.storage.files import sha256
 from flcav.world.map.census import measure_traffic_density
 
-CLOCK = "clock"  # begins the names of the files of rounds on the network, by region
+CLOCK = "clock"  # prefix of the names of files with the times of rounds on the network, by region
 AWAY, TOO_SLOW = "not in the town", "predicted past the deadline"
-PATIENT = RoundRules()  # by which a round is predicted: without a deadline
+PATIENT = RoundRules()  # rules by which a round is predicted: without a deadline
 
 
 @dataclass(frozen=True)
@@ -42,36 +42,36 @@ class DrivenRounds:
     rules: Rules
     outages: Mapping[tuple[int, str], Outage]  # by round, from 1, and client
     records: tuple[RoundTiming, ...]  # on the clock of the region's rounds, from 0 s
-    buffers: Buffers | None = None  # of asynchronous rounds: which version each update began with
+    buffers: Buffers | None = None  # of asynchronous rounds: the version that an update began with
 
     @property
     def seconds(self) -> list[float]:
-        """Return the duration of each round [s]."""
+        """The durations of the rounds [s]."""
         return [record.end_s - record.start_s for record in self.records]
 
 
 @dataclass(frozen=True)
 class Fleet:
-    """The vehicles of a region in a round: what each downloads, computes and uploads."""
+    """The vehicles of a region in a round: what a vehicle downloads, computes and uploads."""
 
     region: str
     clients: tuple[str, ...]  # "region/vehicle"
-    download_bytes: int
-    upload_bytes: int
-    train_s: float  # of a vehicle of speed 1 in a round
-    speeds: Mapping[str, float]  # by client; others have 1
+    download_bytes: int  # message to a vehicle in a round [bytes]
+    upload_bytes: int  # message from a vehicle in a round [bytes]
+    train_s: float  # training time of a vehicle of speed 1 in a round [s]
+    speeds: Mapping[str, float]  # relative computing speeds, by client; others have 1
 
     def work(self, client: str) -> ClientWork:
-        """Return the work of a client in a round, by the name of its vehicle in the traffic."""
+        """Return the work of a client in a round, under the name of its vehicle in the traffic."""
         vehicle = client.removeprefix(f"{self.region}/")
         return ClientWork(vehicle, self.download_bytes, self.train_s / self.speeds.get(client, 1.0), self.upload_bytes)
 
 
 def link_scenes(split: Frames, placed: Placed, settings: NetworkSettings, most: int, seed: int) -> list[RadioLinks]:
-    """Return the links of the vehicles in the first `most` scenes of a split to the units on a region's chosen poles.
+    """Return the radio links between vehicles and roadside units in the first `most` scenes of a split.
 
-    Without chosen poles, the unit is on the pole with most traffic. Raises `InputError` where there is no pole, and as
-    `link_scene`.
+    The units are on the region's chosen poles; without any, one is on the pole with most traffic. Raises `InputError`
+    where there is no pole, and as `link_scene`.
     """
     scenes = list(dict.fromkeys(split.data.keys[i].scene for i in split.vehicles))[:most]
     if settings.throughput is not None:
@@ -91,10 +91,10 @@ def _link_measured(region: str, split: Frames, settings: NetworkSettings) -> Rad
 
 
 def fix_throughput(settings: NetworkSettings, beside: Path) -> NetworkSettings:
-    """Return settings with the file of measured rates found and its SHA-256 noted, and the wireline as measured.
+    """Return settings with the absolute path and SHA-256 of the file of measured rates, and the wireline's rate.
 
-    The wireline has the lowest mean rate of its measured ones, if there are any. Raises `InputError` where the file is
-    missing, or holds no rates.
+    The wireline has the lowest mean rate of the measured wirelines, if there are any. Raises `InputError` where the
+    file is missing from the folder `beside`, or holds no rates.
     """
     if settings.throughput is None:
         return settings
@@ -120,27 +120,30 @@ def drive_rounds(
 ) -> DrivenRounds:
     """Simulate rounds by `rules` on the radio network, after `earlier` ones in the scenes before.
 
-    seeds: of each round, which its clients are drawn by. Under deadline selection without given `seconds`
-    those take part whose round is predicted to end in time, with all that are in the town at once. A round goes on
-    without the vehicles that it loses, however many they are, unless the rules say how many it needs. Raises
-    `InputError` where the vehicles cannot be selected so.
+    `seeds`: one per round, by which its clients are drawn. Under deadline selection without given `seconds` the clients
+    of a round are those whose update is predicted to arrive in time while all vehicles in the town transmit. A round
+    goes on without the vehicles that it loses, however many, unless the rules require a number. Raises `InputError`
+    where the rules cannot select among these vehicles.
     """
     rules.selection.check_clients(fleet.clients)
     outages: dict[tuple[int, str], Outage] = {}
-    records, joins, now = [], dict.fromkeys(fleet.clients, ()), 0.0
+    records = []
+    joins = dict.fromkeys(fleet.clients, ())
+    now = 0.0  # clock of the region's rounds [s]
     for number, seed in enumerate(seeds, start=1):
         links = scenes[(earlier + number - 1) % len(scenes)]
+        # Scenes and the clock of the rounds have different origins: times of the scene are moved by `shift` below.
         begins = float(links.time_s[0]) + (now % links.period_s if links.period_s else 0.0)
         instant = int(np.searchsorted(links.time_s, begins, side="right")) - 1
         present = {name for name, here in zip(links.vehicle, links.present[instant].tolist(), strict=True) if here}
         chosen = rules.selection.choose(fleet.clients, number, seed, earlier)
-        outages |= {(number, each): Outage(AWAY) for each in chosen if fleet.work(each).client not in present}
-        there = [each for each in chosen if (number, each) not in outages]
+        outages |= {(number, name): Outage(AWAY) for name in chosen if fleet.work(name).client not in present}
+        there = [name for name in chosen if (number, name) not in outages]
         if rules.selection.predicts:
             slow = _find_slow(fleet, links, there, number, rules.selection.deadline_s or 0.0, begins)
-            outages |= {(number, each): Outage(TOO_SLOW) for each in slow}
-            there = [each for each in there if each not in slow]
-            joins |= {each: (*joins[each], number) for each in there}
+            outages |= {(number, name): Outage(TOO_SLOW) for name in slow}
+            there = [name for name in there if name not in slow]  # simulated below without the slow ones on the band
+            joins |= {name: (*joins[name], number) for name in there}
         timings = _time(fleet, links, there, number, settings.rounds, begins)
         shift = now - begins
         for client, timing in timings.items():
@@ -159,14 +162,14 @@ def _time(
 ) -> dict[str, ClientTiming]:
     if not clients:
         return {}
-    work = [fleet.work(each) for each in clients]
+    work = [fleet.work(client) for client in clients]
     return dict(zip(clients, time_round(links, work, number, begins, rules), strict=True))
 
 
 def _find_slow(
     fleet: Fleet, links: RadioLinks, clients: Sequence[str], number: int, deadline_s: float, begins: float
 ) -> set[str]:
-    """Return the clients whose update is not predicted to arrive within `deadline_s` [s] of the round's start."""
+    """Return the clients whose update is predicted to arrive later than `deadline_s` [s] after the round's start."""
     timings = _time(fleet, links, clients, number, PATIENT, begins)
     return {name for name, t in timings.items() if t.dropped or t.end_s - t.start_s > deadline_s}
 
@@ -177,37 +180,37 @@ class DrivenStage:
 
     rules: Rules
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)  # by edge round, from 1, and client
-    seconds: Mapping[str, Sequence[float]] = field(default_factory=dict)  # of each round [s], by server
+    seconds: Mapping[str, Sequence[float]] = field(default_factory=dict)  # durations of the rounds [s], by server
     buffers: Mapping[str, Buffers] = field(default_factory=dict)  # of asynchronous rounds, by region
     records: Mapping[str, tuple[RoundTiming, ...]] = field(default_factory=dict)  # of the edge rounds, by region
 
 
 def join_regions(driven: Mapping[str, DrivenRounds], k: int = 1, ways_s: float | None = None) -> DrivenStage:
-    """Return the rounds of all regions in a stage together.
+    """Join the rounds of a stage's regions.
 
-    A cloud round is `k` edge rounds of the slowest region, and a model's ways down and up by wireline, which take
-    `ways_s` [s]; None: there is no cloud, or no network.
+    A cloud round takes as long as `k` edge rounds of the slowest region, and the model's transfers down and up by
+    wireline, `ways_s` [s]; None: there is no cloud, or no network.
     """
     rules = next(iter(driven.values())).rules
-    if len(driven) > 1 and all(each.rules.selection.rule == "planned" for each in driven.values()):
-        joins = {name: rounds for each in driven.values() for name, rounds in each.rules.selection.joins.items()}
+    if len(driven) > 1 and all(drive.rules.selection.rule == "planned" for drive in driven.values()):
+        joins = {name: rounds for drive in driven.values() for name, rounds in drive.rules.selection.joins.items()}
         rules = rules.model_copy(update={"selection": Selection(rule="planned", joins=joins)})
-    seconds = {region: each.seconds for region, each in driven.items()}
+    seconds = {region: drive.seconds for region, drive in driven.items()}
     if ways_s is not None:
         rounds = range(0, len(next(iter(seconds.values()))), k)
-        seconds[CLOUD] = [ways_s + max(sum(own[first : first + k]) for own in seconds.values()) for first in rounds]
-    outages = {key: outage for each in driven.values() for key, outage in each.outages.items()}
-    buffers = {region: each.buffers for region, each in driven.items() if each.buffers is not None}
-    return DrivenStage(rules, outages, seconds, buffers, {region: each.records for region, each in driven.items()})
+        seconds[CLOUD] = [ways_s + max(sum(edge[first : first + k]) for edge in seconds.values()) for first in rounds]
+    outages = {key: outage for drive in driven.values() for key, outage in drive.outages.items()}
+    buffers = {region: drive.buffers for region, drive in driven.items() if drive.buffers is not None}
+    return DrivenStage(rules, outages, seconds, buffers, {region: drive.records for region, drive in driven.items()})
 
 
 def link_drive(
     region: str, drive: Frames, settings: NetworkSettings, range_m: float, seed: int, recorded: bool
 ) -> list[RadioLinks]:
-    """Return the links of the vehicles in the scenes of a drive to a unit on the pole with most traffic.
+    """Return the radio links between the vehicles of a drive and a unit on the pole with most traffic, by scene.
 
-    Traffic counts within `range_m` [m]. Of `recorded` data the poles are those that it was recorded from. Raises
-    `InputError` where there is none, and as `link_scene`.
+    Traffic counts within `range_m` [m] of a pole. The poles of `recorded` data are those that it was recorded from.
+    Raises `InputError` where there is none, and as `link_scene`.
     """
     if settings.throughput is not None:
         return [_link_measured(region, drive, settings)]
@@ -223,9 +226,9 @@ def link_drive(
 def measure_uplinks(
     region: str, drive: Frames, settings: NetworkSettings, range_m: float, seed: int
 ) -> dict[str, float]:
-    """Return the mean rate of the uplink [Mbit/s] of each vehicle of a drive, "region/vehicle", over all its scenes.
+    """Return the mean uplink rate [Mbit/s] over all scenes of a drive, by "region/vehicle".
 
-    Each vehicle has the whole band; where it is not in the town, its rate is 0. See `link_drive`.
+    A vehicle has the whole band; where it is not in the town, its rate is 0. See `link_drive`.
     """
     if settings.throughput is not None:
         measured = load_throughput(settings.throughput, settings.throughput_sha256)
@@ -235,13 +238,13 @@ def measure_uplinks(
     for links in link_drive(region, drive, settings, range_m, seed, recorded=drive.data.town() is None):
         for vehicle, mean in zip(links.vehicle, links.rate_bps[:, :, 0].mean(axis=0) / 1e6, strict=True):
             rates.setdefault(f"{region}/{vehicle}", []).append(float(mean))
-    return {name: float(np.mean(each)) for name, each in rates.items()}
+    return {name: float(np.mean(means)) for name, means in rates.items()}
 
 
 def predict_air_s(scenes: Sequence[RadioLinks], download_bytes: int, upload_bytes: int) -> float | None:
     """Return the mean time [s] in which a vehicle downloads and uploads so many bytes; None where none gets through.
 
-    In each scene all that are in the town begin at its first instant, and share the band.
+    All vehicles in the town begin at the first instant of a scene, and share the band.
     """
     spent = []
     for links in scenes:

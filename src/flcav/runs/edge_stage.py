@@ -1,7 +1,7 @@
-"""Stage II of a run recipe alone: the federation of each region's vehicles, with the steps that it rests on.
+"""Stage II of a run recipe alone: the federations of the regions' vehicles, with the steps that they depend on.
 
-They are the steps of `flcav run`, so that a folder of one goes on with what the other left in it, and the weights are
-the same. Here each round is validated as it ends, and vehicles train in several processes.
+The steps are those of `flcav run`: each command continues the folder of the other, and the weights are the same. Here
+every round is validated as it ends, and vehicles train in several processes.
 """
 
 import shutil
@@ -30,17 +30,18 @@ from flcav.runs.training.timing import TrainTimes, read_times, summarise_times
 from flcav.storage.files import atomic_path
 from flcav.storage.records import LEFT_OUT
 
-WORK, TRAIN_TIMES = "work", "times.json"
+WORK = "work"
+TRAIN_TIMES = "times.json"
 FEDERATE = "federate"  # in the names of the steps
 
 
 @dataclass(frozen=True)
 class RegionFederation:
-    """The federation of a region's vehicles: its result, and the scores of its network after each round."""
+    """The federation of a region's vehicles: its result, and the scores of its network after every round."""
 
     result: StageResult
-    watched: tuple[Watched, ...]  # on the validation frames of each region
-    weights: str  # file of the weights after the last round (safetensors), beside the results
+    watched: tuple[Watched, ...]  # by region of the validation frames
+    weights: str  # file of the weights after the last round (safetensors), in the folder of the results
 
 
 @dataclass(frozen=True)
@@ -66,15 +67,16 @@ def federate_regions(
     notify: Notify = print_steps,
     stale: Stale = "refuse",
 ) -> Federations:
-    """Run or finish stage II of a recipe's arm in the folder `out`; return its results, see `name_results`.
+    """Run or resume stage II of a recipe's arm in the folder `out`; return its results, see `name_results`.
 
-    In every federating region and for every task vehicles train in `jobs` processes of one thread each, or actors where
-    the `runtime`, one of `RUNTIMES`, is "ray", or on the vehicles of a deployed `fleet` (None: one that is brought up
-    for as long) where it is "flower". The weights do not depend on that, on Ray up to rounding. Others are those of
-    `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
-    `ClientFailed` where fewer vehicles are left in a round than are wanted.
+    Vehicles of all federating regions and tasks train where the `runtime` (one of `RUNTIMES`) says: in `jobs` processes
+    of one thread each, in as many actors ("ray"), or on the vehicles of a deployed `fleet` ("flower"; None: a fleet is
+    brought up for the duration). The weights do not depend on it, except for rounding on Ray. The other arguments are
+    those of `flcav.run`. Raises `InputError` where a part of the recipe cannot be used or the arm does not federate,
+    `ClientFailed` where fewer vehicles are left in a round than required.
     """
-    out, graph = Path(out), Graph(recipe, Path(beside or "."))
+    out = Path(out)
+    graph = Graph(recipe, Path(beside or "."))
     if arm not in graph.settings:
         raise InputError(f"--arm {arm}: the recipe has {', '.join(graph.settings)}")
     if graph.settings[arm].central:
@@ -92,13 +94,14 @@ def federate_regions(
         if step in alone:
             notify(step, done, total, note)
 
+    # One federation after another: the vehicles of one use all `jobs` processes.
     run_steps([*before, *alone.values()], out / WORK, jobs=1, notify=tell, stale=stale)
     found = tuple(_collect(graph, out, name, about[1]) for name, about in asked.items())
-    trained = [each.result for each in found]
+    trained = [federation.result for federation in found]
     how = graph.settings[arm].federation
-    rounds = [count_private_rounds(how, {EDGE: own}, own.region or "") for own in trained]
+    rounds = [count_private_rounds(how, {EDGE: result}, result.region or "") for result in trained]
     about = zip(trained, rounds, strict=True)
-    trainings = [PrivateTraining(own.region or "", own.clients, number, own.noise) for own, number in about]
+    trainings = [PrivateTraining(result.region or "", result.clients, number, result.noise) for result, number in about]
     spent = compose_trainings(how, trainings)
     results = Federations(recipe, arm, found, provenance(recipe.seed), spent)
     results.save(out, name_results(arm))
@@ -111,13 +114,13 @@ def name_results(arm: str) -> str:
 
 
 def measure_times(results: Federations, out: Path) -> TrainTimes:
-    """Return how long vehicles trained, and their speeds, by the trainings in the folder `out`; times.json there.
+    """Return the training times of vehicles and their speeds in the folder `out` of `results`; writes times.json there.
 
-    `results` are those in that folder. Tasks that were federated without a measurement are left out.
+    Tasks that were federated without time measurement are left out.
     """
     measured: dict[str, dict[str, list[float]]] = {}
-    for each in results.federations:
-        measured.setdefault(each.result.task, {}).update(read_times(out / WORK / Path(each.weights).stem))
+    for federation in results.federations:
+        measured.setdefault(federation.result.task, {}).update(read_times(out / WORK / Path(federation.weights).stem))
     times = summarise_times(measured)
     times.save(out, TRAIN_TIMES)
     return times
@@ -129,16 +132,17 @@ def tells_of_round(step: str, note: str) -> bool:
 
 
 def list_federations(graph: Graph, arm: str) -> dict[str, tuple[str, str, str]]:
-    """Return arm, region and task of each federation of an arm, by the name of its step."""
+    """Return the federations of an arm as (arm, region, task), by the name of the step."""
     setting = graph.settings[arm]
     named = {(region, task): f"{region}-{FEDERATE}-{task}" for task in graph.recipe.tasks for region in setting.regions}
     return {name if arm == MAIN else f"{name}-{arm}": (arm, *about) for about, name in named.items()}
 
 
 def list_needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
-    """Return those of `steps` that the steps `last` need, directly or not, in their order."""
+    """Return those of `steps` that the steps `last` need, directly or indirectly, in their order."""
     needs = {step.name: step.needs for step in steps}
-    wanted, open_ = set(), [name for step in last for name in step.needs]
+    wanted = set()
+    open_ = [name for step in last for name in step.needs]
     while open_:
         name = open_.pop()
         if name not in wanted:
@@ -148,9 +152,9 @@ def list_needed(steps: Sequence[Step], last: Iterable[Step]) -> list[Step]:
 
 
 def _federation_step(graph: Graph, arm: str, region: str, task: str, means: Mapping[str, int | str]) -> Step:
-    """Return the step of stage II as a run has it, with validation after each round, and in several processes."""
+    """Return a run's step of stage II with validation after every round, and in several processes."""
     edge = next(step for step in graph.steps if step.name == graph.names.edge(arm, region, task))
-    frames = {each: graph.names.recording(each, "validation", task) for each in graph.recipe.regions}
+    frames = {region_: graph.names.recording(region_, "validation", task) for region_ in graph.recipe.regions}
     name = next(name for name, about in list_federations(graph, arm).items() if about == (arm, region, task))
     asked: EdgeSettings = edge.arguments["settings"]
     scored = make_step(name, federate_step, asked.model_copy(update={"validation": frames}))
@@ -168,7 +172,11 @@ def _collect(graph: Graph, out: Path, step: str, region: str) -> RegionFederatio
     }
     watched = tuple(
         Watched(
-            EDGE, result.task, name, count, tuple(ScoredRound(i, each[name]) for i, each in enumerate(scores, start=1))
+            EDGE,
+            result.task,
+            name,
+            count,
+            tuple(ScoredRound(i, score[name]) for i, score in enumerate(scores, start=1)),
         )
         for name, count in frames.items()
     )

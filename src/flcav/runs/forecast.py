@@ -1,8 +1,8 @@
 """Forecast of a run before anything is spent: rounds, megabytes, epsilon, time, and effects that its tests can detect.
 
-One scene is recorded for each task, in a temporary folder, and a few steps are trained on it: sizes of samples and
-times are measured so. Plans are made as the run makes its first ones; what only a run finds out (times on the air,
-sizes of the road average's labels, new plans after a stage) is left out.
+One scene per task is recorded in a temporary folder, and a few steps are trained on it, to measure sizes of samples and
+times. Plans are made as the run makes its first ones; what only a run can measure (times on the air, sizes of the road
+average's labels, new plans after a stage) is left out.
 """
 
 import tempfile
@@ -44,20 +44,22 @@ from flcav.runs.training.private_rounds import (
 from flcav.runs.training.updates import measure_exchange, model_mb
 from flcav.storage.records import LEFT_OUT, Record
 
-STEPS = 3  # that are timed
+STEPS = 3  # training steps that are timed
 SCENE_SD = 0.1  # of a paired difference of AP50 or accuracy in one test scene: .08 to .14 in reproductions/runs
-TOLD = 1.96 + 0.84  # standard errors of a mean that a test at the level .05 tells with a power of .8, both sides
+# Smallest effect that a two-sided test at the level .05 detects with a power of .8, in standard errors of the mean:
+# the quantiles of the normal distribution at .975 and .8.
+DETECTABLE = 1.96 + 0.84
 
 
 @dataclass(frozen=True)
 class PlannedRounds(Record):
-    """The plan of a task, as far as its budgets, time and privacy afford it."""
+    """The planned samples and rounds of a task, within its budgets of traffic, time and privacy."""
 
     samples: int
     edge_rounds: int
     cloud_rounds: int
-    noise: Annotated[float | None, LEFT_OUT] = None  # that a privacy budget alone gives; None: it is given, or none is
-    round_noise: Annotated[RoundNoise | None, LEFT_OUT] = None  # where it is longest beside the updates; None: no noise
+    noise: Annotated[float | None, LEFT_OUT] = None  # multiplier found for the privacy budget; None: given, or no noise
+    round_noise: Annotated[RoundNoise | None, LEFT_OUT] = None  # largest relative to the updates; None: no noise
 
 
 @dataclass(frozen=True)
@@ -65,7 +67,7 @@ class ArmForecast(Record):
     """Forecast of an arm: rounds, uplink and privacy."""
 
     tasks: Mapping[str, PlannedRounds]
-    uplink_mb: Mapping[Link, float]
+    uplink_mb: Mapping[Link, float]  # traffic of all tasks [MB], by link
     privacy: PrivacySpent | None  # None: no noise
 
 
@@ -73,44 +75,48 @@ class ArmForecast(Record):
 class Forecast(Record):
     """Forecast of a run."""
 
-    minutes: float  # of one core
+    minutes: float  # computing time of one core [min]
     arms: Mapping[str, ArmForecast]
-    scenes: int  # of tests, in a region
-    effect: float  # smallest difference of AP50 or accuracy that these tests detect in one training
+    scenes: int  # test scenes of a region
+    effect: float  # smallest difference of AP50 or accuracy, in [0, 1], that these tests detect in one training
 
     def lines(self) -> list[str]:
-        """Return the forecast in words."""
+        """Return the forecast as lines of text."""
         lines = [
             f"about {self.minutes:.1f} minutes of one core, by one scene and {STEPS} steps of each task just timed"
         ]
         for name, arm in self.arms.items():
-            for task, own in arm.tasks.items():
-                counts = {"sample": own.samples, "edge round": own.edge_rounds, "cloud round": own.cloud_rounds}
+            for task, planned in arm.tasks.items():
+                counts = {
+                    "sample": planned.samples,
+                    "edge round": planned.edge_rounds,
+                    "cloud round": planned.cloud_rounds,
+                }
                 rounds = ", ".join(plural(count, what) for what, count in counts.items())
                 lines.append(f"{name}, {task}: {rounds}")
-                if own.round_noise is not None:
-                    lines.append(f"{name}, {task}: {own.round_noise.describe()}")
+                if planned.round_noise is not None:
+                    lines.append(f"{name}, {task}: {planned.round_noise.describe()}")
             sent = " and ".join(f"{megabytes:.1f} MB {link}" for link, megabytes in arm.uplink_mb.items())
             lines.append(f"{name}: about {sent} of uplink")
             if arm.privacy is not None:
                 lines.append(f"{name}: {arm.privacy.describe()}")
-        told = f"tell a difference of {self.effect:.2f} with a power of 0.8"
+        power = f"tell a difference of {self.effect:.2f} with a power of 0.8"
         by = f"by a standard deviation of {SCENE_SD:g} between scenes, of AP50 and accuracy in earlier runs"
-        told += f" ({by}); retraining varies besides"
-        lines.append(f"tests: of one training, {plural(self.scenes, 'scene')} of a region {told}")
+        power += f" ({by}); retraining varies besides"
+        lines.append(f"tests: of one training, {plural(self.scenes, 'scene')} of a region {power}")
         return lines
 
 
 @dataclass(frozen=True)
 class _Measured:
-    """Sizes and times of a task."""
+    """Measured message sizes and computing times of a task."""
 
-    sample_mb: float
-    exchange_mb: float | None
+    sample_mb: float  # size of an uploaded sample [MB]
+    exchange_mb: float | None  # what a vehicle sends to be combined in a round [MB]; None: a model update
     pool: int  # candidates for upload
-    frame_s: float  # to record a frame
-    step_s: float  # of training
-    test_s: float  # to test a frame
+    frame_s: float  # time to record a frame [s]
+    step_s: float  # time of a training step [s]
+    test_s: float  # time to test a frame [s]
 
 
 def forecast_run(
@@ -127,7 +133,7 @@ def forecast_run(
     arms = {name: _forecast_arm(graph, arm, plans, measured) for name, arm in graph.settings.items() if not arm.repeat}
     scenes = recipe.sized_splits.test.scenes
     minutes = sum(_list_seconds(graph, plans, measured)) / 60
-    return Forecast(minutes, arms, scenes, TOLD * SCENE_SD / float(np.sqrt(scenes)))
+    return Forecast(minutes, arms, scenes, DETECTABLE * SCENE_SD / float(np.sqrt(scenes)))
 
 
 def _measure(graph: Graph, task: str) -> _Measured:
@@ -143,11 +149,12 @@ def _measure(graph: Graph, task: str) -> _Measured:
         samples = learning.task.samples(split.data, learning.config, split.vehicles)
         (client,) = make_clients(learning, learning.config, {task: samples}).values()
         weights = to_arrays(network)
-        client.train(weights, steps=1, learning_rate=1e-4, seed=0)  # compiles
-        score_network(learning.task, network, split.data, split.vehicles)  # compiles
+        client.train(weights, steps=1, learning_rate=1e-4, seed=0)  # compiles, which must not be timed
+        score_network(learning.task, network, split.data, split.vehicles)  # as above
         began = time.process_time()
         client.train(weights, steps=STEPS, learning_rate=1e-4, seed=0)
-        trained, frames = time.process_time(), split.vehicles
+        trained = time.process_time()
+        frames = split.vehicles
         score_network(learning.task, network, split.data, frames)
         test_s = (time.process_time() - trained) / len(frames)
     return _Measured(sample_mb, exchange_mb, pool, frame_s, (trained - began) / STEPS, test_s)
@@ -155,23 +162,25 @@ def _measure(graph: Graph, task: str) -> _Measured:
 
 def _record_scene(graph: Graph, task: str, folder: Path) -> tuple[Frames, int, float]:
     """Return a scene of the candidates for upload, the number of all candidates, and the time to record a frame [s]."""
-    recipe, pools = graph.recipe, graph.pools(task)
+    recipe = graph.recipe
+    pools = graph.pools(task)
     region, name = next(iter(pools.items()))
-    own = recipe.regions[region]
-    if own.data is not None:
-        dealt = deal_frames(graph.find_data(own, "pool"), "pool", own.role, recipe.seed, isinstance(own.data, Mapping))
+    place = recipe.regions[region]
+    if place.data is not None:
+        path, whole = graph.find_data(place, "pool"), isinstance(place.data, Mapping)
+        dealt = deal_frames(path, "pool", place.role, recipe.seed, whole)
         dealt.save(folder)
         split = Frames.open(folder)
         return split, len(split.vehicles) * len(pools), 0.0
-    asked = make_recording_recipe(recipe, region, "pool", task, name)
-    first = asked.model_copy(update={"scenes": 1, "spins_per_scene": 1, "cavs": 1, "frames": None})
+    recording = make_recording_recipe(recipe, region, "pool", task, name)
+    first = recording.model_copy(update={"scenes": 1, "spins_per_scene": 1, "cavs": 1, "frames": None})
     with tempfile.TemporaryDirectory() as unused:  # compiles what the recording calls
         record_frames(first, graph.beside, Path(unused) / "first", ignore_progress)
     began = time.perf_counter()
-    record_frames(asked.model_copy(update={"scenes": 1}), graph.beside, folder, ignore_progress).save(folder)
+    record_frames(recording.model_copy(update={"scenes": 1}), graph.beside, folder, ignore_progress).save(folder)
     split = Frames.open(folder)
     took_s = time.perf_counter() - began
-    return split, len(split.vehicles) * asked.scenes * len(pools), took_s / len(split.data)
+    return split, len(split.vehicles) * recording.scenes * len(pools), took_s / len(split.data)
 
 
 def _plan_settings(graph: Graph, arm: str) -> FirstPlanSettings:
@@ -181,27 +190,31 @@ def _plan_settings(graph: Graph, arm: str) -> FirstPlanSettings:
 
 def _plan_arm(graph: Graph, arm: Setting, measured: Mapping[str, _Measured]) -> dict[str, PlannedRounds]:
     """Return the plan of an arm's tasks, with the rounds that its privacy budget affords."""
-    settings, asked = _plan_settings(graph, arm.name), []
-    for name, own in settings.tasks.items():
+    settings = _plan_settings(graph, arm.name)
+    requests = []
+    for name, task in settings.tasks.items():
         sizes = _size_messages(settings, name, measured[name])
-        history = None if own.history is None else parse_history(name, own.history, name)
-        asked.append(PlanRequest(name, own.weight, sizes, measured[name].pool, history, own.fixed, own.train_s))
-    plan, _ = make_plan(tuple(asked), frame_plan(settings), settings.rule)
+        history = None if task.history is None else parse_history(name, task.history, name)
+        requests.append(PlanRequest(name, task.weight, sizes, measured[name].pool, history, task.fixed, task.train_s))
+    plan, _ = make_plan(tuple(requests), frame_plan(settings), settings.rule)
     planned = {}
-    for name, own in plan.tasks.items():
-        further = own.cloud_rounds * (k := arm.federation.edge_rounds_per_cloud_round)
+    for name, entry in plan.tasks.items():
+        further = entry.cloud_rounds * (k := arm.federation.edge_rounds_per_cloud_round)
         vehicles = [graph.vehicles[region] for region in arm.regions]
         private = plan_private_rounds(
-            arm.federation, vehicles, own.edge_rounds, further if arm.stages[-1] in (CLOUD, MORE_EDGE) else 0, k
+            arm.federation, vehicles, entry.edge_rounds, further if arm.stages[-1] in (CLOUD, MORE_EDGE) else 0, k
         )
         found = find_budget_noise(arm.federation, private.rules)
-        counts = (own.samples, private.edge, private.further // k)
+        counts = (entry.samples, private.edge, private.further // k)
         planned[name] = PlannedRounds(*counts, found, measure_noise(graph, arm, name, private.rules))
     return planned
 
 
 def measure_noise(graph: Graph, arm: Setting, task: str, rules: Federation) -> RoundNoise | None:
-    """Return the noise of a round of an arm in the region with the fewest vehicles in a round; None without noise."""
+    """Return the noise of a round of an arm in the region with the fewest vehicles in a round; None without noise.
+
+    Noise hides one vehicle, whatever the number of them: it is largest relative to the mean update of the fewest.
+    """
     if rules.privacy is None or arm.central:
         return None
     weights = to_arrays(graph.learning(arm, task).resolve().build_network())
@@ -211,13 +224,13 @@ def measure_noise(graph: Graph, arm: Setting, task: str, rules: Federation) -> R
     if isinstance(strategy, FedBuff):
         return measure_round_noise(rules.privacy, strategy.buffer, values)
     names = ([str(number) for number in range(graph.vehicles[region])] for region in arm.regions)
-    fewest = min(expected_clients(rules.selection, each) for each in names)
+    fewest = min(expected_clients(rules.selection, vehicles) for vehicles in names)
     return measure_round_noise(rules.privacy, fewest, values)
 
 
-def _size_messages(settings: FirstPlanSettings, task: str, own: _Measured) -> MessageSizes:
+def _size_messages(settings: FirstPlanSettings, task: str, measured: _Measured) -> MessageSizes:
     network = settings.tasks[task].network
-    return MessageSizes(own.sample_mb, model_mb(task_named(task), network, settings.updates), own.exchange_mb)
+    return MessageSizes(measured.sample_mb, model_mb(task_named(task), network, settings.updates), measured.exchange_mb)
 
 
 def _forecast_arm(
@@ -226,18 +239,20 @@ def _forecast_arm(
     plans: Mapping[str, Mapping[str, PlannedRounds]],
     measured: Mapping[str, _Measured],
 ) -> ArmForecast:
-    settings, k = _plan_settings(graph, arm.name), arm.federation.edge_rounds_per_cloud_round
-    groups, uplink_mb = tuple(graph.vehicles[region] for region in arm.regions), np.zeros(2)
-    for task, own in plans[arm.name].items():
-        cloud = own.cloud_rounds if CLOUD in arm.stages else 0
-        edge = 0 if arm.central else own.edge_rounds + (own.cloud_rounds * k if MORE_EDGE in arm.stages else 0)
-        samples = own.samples + (arm.uploads or 0) * len(groups)
+    settings = _plan_settings(graph, arm.name)
+    k = arm.federation.edge_rounds_per_cloud_round
+    groups = tuple(graph.vehicles[region] for region in arm.regions)
+    uplink_mb = np.zeros(2)  # wireless, wireline
+    for task, planned in plans[arm.name].items():
+        cloud = planned.cloud_rounds if CLOUD in arm.stages else 0
+        edge = 0 if arm.central else planned.edge_rounds + (planned.cloud_rounds * k if MORE_EDGE in arm.stages else 0)
+        samples = planned.samples + (arm.uploads or 0) * len(groups)
         sent = price(StagePlan(samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
         uplink_mb += (sent.wireless_mb, sent.wireline_mb)
     trainings = [
-        PrivateTraining(region, graph.vehicles[region], own.edge_rounds + own.cloud_rounds * k, own.noise)
+        PrivateTraining(region, graph.vehicles[region], planned.edge_rounds + planned.cloud_rounds * k, planned.noise)
         for repeat in range(1 + graph.recipe.retrainings)
-        for own in plans[arm.name].values()
+        for planned in plans[arm.name].values()
         for region in arm.regions
     ]
     spent = None if arm.central else compose_trainings(arm.federation, trainings)
@@ -247,25 +262,26 @@ def _forecast_arm(
 def _list_seconds(
     graph: Graph, plans: Mapping[str, Mapping[str, PlannedRounds]], measured: Mapping[str, _Measured]
 ) -> Iterator[float]:
-    """Yield the time of each recording, training and test [s]; steps that arms share count once."""
+    """Yield the times of all recordings, trainings and tests [s]; steps that arms share count once."""
     recipe, names, steps = graph.recipe, graph.names, {step.name for step in graph.steps}
-    size, counted = recipe.sized_splits, set[str]()
+    size = recipe.sized_splits
+    counted = set[str]()
 
     def once(step: str, seconds: float) -> float:
         new = step in steps and step not in counted
         counted.add(step)
         return seconds if new else 0.0
 
-    for task, own in measured.items():
-        for region, about in recipe.regions.items():
-            for split in SPLITS_OF[about.role]:
-                asked = getattr(size, split)
-                frames = asked.scenes * asked.spins * (graph.vehicles[region] if split == EDGE else asked.cavs)
-                yield once(names.recording(region, split, task), 0.0 if about.data else frames * own.frame_s)
+    for task, times in measured.items():
+        for region, place in recipe.regions.items():
+            for split in SPLITS_OF[place.role]:
+                sizes = getattr(size, split)
+                frames = sizes.scenes * sizes.spins * (graph.vehicles[region] if split == EDGE else sizes.cavs)
+                yield once(names.recording(region, split, task), 0.0 if place.data else frames * times.frame_s)
         for arm in graph.settings.values():
             plan, training = plans[arm.name][task], arm.training[task]
-            yield once(names.pretrain(arm.name, task), training.steps * own.step_s)
-            per_round = {region: graph.vehicles[region] * training.local_steps * own.step_s for region in arm.regions}
+            yield once(names.pretrain(arm.name, task), training.steps * times.step_s)
+            per_round = {region: graph.vehicles[region] * training.local_steps * times.step_s for region in arm.regions}
             k = arm.federation.edge_rounds_per_cloud_round
             rounds = {EDGE: plan.edge_rounds, CENTRAL: plan.edge_rounds, MORE_EDGE: plan.cloud_rounds * k}
             for stage in arm.stages:
@@ -278,13 +294,13 @@ def _list_seconds(
             for stage, region, tested in graph.tested(arm):
                 if tested == task:
                     trained = names.stage(arm.name, stage, region, task)
-                    yield once(names.test(trained, region, None), frames * own.test_s)
+                    yield once(names.test(trained, region, None), frames * times.test_s)
         watched = size.validation.scenes * size.validation.spins * size.validation.cavs
         main = plans[MAIN][task]
         for stage, region, tested in graph.watched():
             if tested == task:
                 rounds_done = {PRETRAIN: 0, EDGE: main.edge_rounds, CLOUD: main.cloud_rounds}.get(stage, 0)
                 trained = names.stage(MAIN, stage, region, task)
-                yield once(names.rounds(trained, region), (1 + rounds_done) * watched * own.test_s)
+                yield once(names.rounds(trained, region), (1 + rounds_done) * watched * times.test_s)
         for further in load_all(FORECASTS):
-            yield further(graph, task, plans[MAIN][task].edge_rounds, own.step_s, own.test_s)
+            yield further(graph, task, plans[MAIN][task].edge_rounds, times.step_s, times.test_s)

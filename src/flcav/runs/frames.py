@@ -1,4 +1,4 @@
-"""Data splits of a run: recorded in a town, or divided by scenes out of a recorded dataset."""
+"""Data splits of a run: recorded in a town, or taken by scenes from a recorded dataset."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -24,8 +24,8 @@ from flcav.storage.files import sha256
 from flcav.world.map.town import PACKAGED
 
 DATA = "data"
-SLACK_S = 1e-6  # of times that are compared with the ends of a window
-SHORTEST_S = 10.0  # shortest scene for tracks: it takes a past, a future, and several presents
+SLACK_S = 1e-6  # tolerance of times that are compared with the ends of a window [s]
+SHORTEST_S = 10.0  # shortest scene for trajectories [s]: it must hold a past, a future, and several presents
 SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's scenes
     "pretrain": {"pool": 0.7, "validation": 0.15, "test": 0.15},
     "federate": {"validation": 0.15, "registry": 0.2, "edge": 0.4, "test": 0.25},
@@ -35,21 +35,21 @@ SHARES: Mapping[Role, Mapping[SplitName, float]] = {  # fractions of a dataset's
 
 @dataclass(frozen=True)
 class Recorded(Saved):
-    """A data split: the folder of its dataset, and its frames by who recorded them."""
+    """A data split on disk: the folder of its dataset, and its frames by agent."""
 
-    folder: str  # relative to the step's own, or absolute
-    vehicles: tuple[int, ...]  # numbers of the vehicles' frames, without those of windows around them
-    poles: Mapping[int, tuple[int, ...]]  # numbers of each roadside sensor's frames, by pole
+    folder: str  # relative to the step's folder, or absolute
+    vehicles: tuple[int, ...]  # frame numbers of all vehicles, without those of windows around them
+    poles: Mapping[int, tuple[int, ...]]  # frame numbers of the roadside sensors, by pole
     scenes: int
 
 
 @dataclass(frozen=True)
 class Frames:
-    """A data split, open for reading, with its frames by who recorded them."""
+    """A data split, open for reading, with its frames by agent."""
 
     data: Dataset
     vehicles: tuple[int, ...]  # frame numbers of all vehicles, without those of windows around them
-    poles: Mapping[int, tuple[int, ...]]  # frame numbers of each roadside sensor, by pole
+    poles: Mapping[int, tuple[int, ...]]  # frame numbers of the roadside sensors, by pole
 
     @classmethod
     def open(cls, folder: Path) -> "Frames":
@@ -63,12 +63,13 @@ def make_recording_recipe(
 ) -> Recipe:
     """Return the recording recipe of a split in a region's town, without poles.
 
-    Settings of the task, the run, the region, and the run's entry of the task override each other in this order.
-    window: fields of `Recipe` of what is recorded for labels: spins around others, and navigation logs, for which
-    vehicles without a GNSS receiver or an IMU get one. Raises `InputError`, naming the recording by its `name`, where
-    they do not go together.
+    Settings of the task, the run, the region, and the run's entry of the task override one another in this order.
+    `window`: fields of `Recipe` for what is recorded for labels: further spins around the frames, and navigation logs,
+    for which vehicles without a GNSS receiver or an IMU get one. Raises `InputError`, naming the recording by its
+    `name`, where the settings do not go together.
     """
-    place, frames = recipe.regions[region], getattr(recipe.sized_splits, split)
+    place = recipe.regions[region]
+    frames = getattr(recipe.sized_splits, split)
     changes = [as_shared(task_named(task)).recording, recipe.recording.fields(split), place.recording.fields(split)]
     how: dict[str, Any] = {"every_s": frames.every_s}
     for more in (*changes, recipe.tasks[task].recording.fields(split)):
@@ -94,7 +95,10 @@ def make_recording_recipe(
 
 
 def list_window(split: Frames, frames: Sequence[int], window_s: float) -> tuple[int, ...]:
-    """Return, ascending, `frames` of vehicles and what the same vehicle recorded within `window_s` of each [s]."""
+    """Return `frames` of vehicles and what the same vehicle recorded within `window_s` [s] of one, in ascending order.
+
+    A vehicle's frames are matched within a scene only.
+    """
     middle: dict[tuple[str, str], list[float]] = {}
     for i in frames:
         middle.setdefault((split.data.keys[i].scene, split.data.keys[i].agent), []).append(split.data.keys[i].time_s)
@@ -121,24 +125,25 @@ def deal_frames(path: Path, split: SplitName, role: Role, seed: int, whole: bool
     if whole:
         return group_frames(data, str(path))
     scenes = sorted({key.scene for key in data.keys})
-    least = len(SPLITS_OF[role]) + 1  # one of each split, and two of test
+    least = len(SPLITS_OF[role]) + 1  # one per split, and two for tests
     if len(scenes) < least:
         raise InputError(f"{path}: {len(scenes)} scenes; at least {least} are wanted to deal to a region to {role}")
     order = stream(seed, "deal").permutation(len(scenes))
-    return group_frames(data, str(path), {scenes[number] for number in order[_own_part(split, role, len(scenes))]})
+    return group_frames(data, str(path), {scenes[number] for number in order[_slice_split(split, role, len(scenes))]})
 
 
 def count_training_frames(path: Path, seed: int, whole: bool) -> dict[str, int]:
-    """Return vehicle -> number of its training frames, for a region to federate of the dataset at `path`.
+    """Return the number of training frames by vehicle, for a federating region with the dataset at `path`.
 
     Raises `InputError` as `deal_frames` does.
     """
-    dealt, keys = deal_frames(path, "edge", "federate", seed, whole), Dataset.open(path).keys
+    dealt = deal_frames(path, "edge", "federate", seed, whole)
+    keys = Dataset.open(path).keys
     return dict(sorted(Counter(keys[i].agent for i in dealt.vehicles).items()))
 
 
-def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
-    """Return the slice of the shuffled scenes that is a split's: one scene (test: two) and its share of the rest."""
+def _slice_split(split: SplitName, role: Role, scenes: int) -> slice:
+    """Return the slice of the shuffled scenes that a split gets: one scene (test: two) and its share of the rest."""
     shares = SHARES[role]
     least = {name: 2 if name == "test" else 1 for name in shares}
     free = scenes - sum(least.values())
@@ -152,9 +157,9 @@ def _own_part(split: SplitName, role: Role, scenes: int) -> slice:
 def group_frames(
     data: Dataset, folder: str, scenes: set[str] | None = None, spins: Sequence[int] | None = None
 ) -> Recorded:
-    """Group the frames of these scenes (None: all) by who recorded them; raises `InputError` for no vehicle's.
+    """Group the frames of these scenes (None: all) by agent; raises `InputError` where there is none of a vehicle.
 
-    spins: numbers of those that the vehicles' frames are of (None: all); others are of windows around them.
+    `spins`: numbers of the spins whose frames are the vehicles' (None: all); the other spins are windows around them.
     """
     frames = data.select(scenes=scenes)
     middle = frames if spins is None else [i for i in frames if data.keys[i].index in set(spins)]
@@ -167,13 +172,13 @@ def group_frames(
         if kind_of(data.keys[i].agent) == POLE and number.isdigit():
             poles.setdefault(int(number), []).append(i)
     count = len({data.keys[i].scene for i in frames})
-    return Recorded(folder, vehicles, {pole: tuple(own) for pole, own in poles.items()}, count)
+    return Recorded(folder, vehicles, {pole: tuple(numbers) for pole, numbers in poles.items()}, count)
 
 
 def hash_town(town: str, beside: Path) -> dict[str, str]:
-    """Return the SHA-256 of each file of a user's own town, by file name; nothing for a town of the package.
+    """Return the SHA-256 of the files of a user's town, by file name; empty for a town of the package.
 
-    Raises `InputError` where there is no such town.
+    Raises `InputError` where there is no such town in the folder `beside`.
     """
     if town in PACKAGED:
         return {}

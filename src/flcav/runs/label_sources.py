@@ -11,23 +11,23 @@ from flcav.runs.registry import SOURCES
 
 @dataclass(frozen=True)
 class LabelSource:
-    """A source of labels."""
+    """A source of labels for the vehicles' frames."""
 
-    from_detections: bool = False  # pseudo-labels of the frozen stage I network
+    from_detections: bool = False  # pseudo-labels by the frozen network of stage I
     from_poles: bool = False  # boxes of roadside sensors
-    trained: bool = False  # these boxes are a trained detector's, not an ideal one's
-    tracked: bool = False  # each vehicle's tracks, from the sweeps that it recorded around its frames
-    averaged: bool = False  # the road average of a window's poles and vehicles, renewed before each round of stage II
+    trained: bool = False  # whether these boxes are those of a trained detector instead of an ideal one
+    tracked: bool = False  # a vehicle's tracks through the sweeps that it recorded around its frames
+    averaged: bool = False  # the road average of a window's poles and vehicles, renewed before the rounds of stage II
     caveat: str = ""  # stated with every result that depends on them
 
     @property
     def placed(self) -> bool:
-        """Return whether labels reach a vehicle's frames by its poses."""
+        """Whether labels are placed in a vehicle's frames by its estimated poses."""
         return self.from_poles or self.tracked
 
     @property
     def bound(self) -> bool:
-        """Return whether the labels are ground truth, or rest on it: figures with them are upper bounds."""
+        """Whether the labels are, or depend on, ground truth: figures with them are upper bounds."""
         return not self.from_detections or (self.from_poles and not self.trained)
 
 
@@ -42,13 +42,13 @@ LABEL_SOURCES: Mapping[str, LabelSource] = {
     "annotated": LabelSource(caveat="ground truth as labels, upper bound"),
     "future": LabelSource(
         caveat="every vehicle knows all tracks around it, upper bound"
-    ),  # the recorded future of each track
+    ),  # the recorded future of the tracks
     **{name: LabelSource(**about) for name, about in SOURCES.items()},
 }
 
 
 def choose_labels(task: str, asked: str | None) -> str:
-    """Return the kind of labels of a task (None: its first); raises `InputError` for one the task does not have."""
+    """Return the kind of labels of a task (None: its first); raises `InputError` for one that it does not have."""
     known = [kind for kind in as_shared(task_named(task)).labels if kind in LABEL_SOURCES]
     if asked is not None and asked not in known:
         raise InputError(f"labels of '{task}': '{asked}' is none of {', '.join(known)}")

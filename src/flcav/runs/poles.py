@@ -1,4 +1,4 @@
-"""Placement of roadside sensors by VRCSP, by traffic density, at random or as named."""
+"""Placement of roadside sensors: by VRCSP, by traffic density, at random, or on given poles."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -23,12 +23,12 @@ from flcav.world.trace import Trace
 class Sites:
     """The candidate sites of a region's roadside sensors: its poles."""
 
-    number: NDArray[np.int64]  # (P,) of the pole
-    position: NDArray[np.float64]  # (P, 3) of the sensor's mount, world [m]
+    number: NDArray[np.int64]  # (P,) numbers of the poles
+    position: NDArray[np.float64]  # (P, 3) positions of the sensors' mounts, world frame [m]
 
 
 def find_sites(drive: Frames, edge: Frames | None) -> Sites:
-    """Return the candidate sites: the town's poles or, of recorded data (`edge`), the poles whose sweeps it holds."""
+    """Return the candidate sites: the town's poles or, for recorded data (`edge`), the poles with recorded sweeps."""
     town = drive.data.town()
     if edge is None:
         return (
@@ -51,12 +51,12 @@ def place_sensors(
     seed: int = 0,
     passed: NDArray[np.bool_] | None = None,
 ) -> Placed:
-    """Place a region's sensors by the rule in `how`: VRCSP over errors, the densest traffic, at random, or as named.
+    """Place a region's sensors by the rule in `how`: VRCSP over errors, densest traffic, at random, or on given poles.
 
-    `errors` and `weights` are by task: an error weighs its own weight times its task's. `traces` give the traffic.
-    Random poles are a stream of `seed` and the region: fewer are the first of more. Of poles that are not named, only
-    those are chosen that vehicles have `passed` (P,), if there are any (None: all). Raises `InputError` for a named
-    pole that the region does not have.
+    `errors` and `weights` are by task: the weight of an error is multiplied by that of its task. `traces` give the
+    traffic. Random poles are drawn from a stream of `seed` and the region: a smaller draw is a prefix of a larger one.
+    Except by the rule "fixed", only poles that vehicles have `passed` (P,) are chosen, if there are any (None: all).
+    Raises `InputError` for a given pole that the region does not have.
     """
     every = [replace(error, weight=error.weight * weights[task]) for task in how.tasks for error in errors[task]]
     xyz = np.array([(error.x, error.y, error.z) for error in every]).reshape(-1, 3)
@@ -69,6 +69,7 @@ def place_sensors(
     count = min(how.count, int(usable.sum()))
     chosen: list[int] = []
     if how.rule == "vrcsp" and len(xyz):  # without errors there is nothing to cover
+        # Over all poles first, and over the passed ones alone only if the optimum includes a pole that nobody passes.
         for rows in (np.arange(len(usable)), np.flatnonzero(usable)):
             chosen = rows[list(place(xyz, sites.position[rows], how.range_m, count, weight=weight).chosen)].tolist()
             if usable[chosen].all():
@@ -96,14 +97,14 @@ def place_sensors(
 
 
 def find_passed(sites: Sites, drive: Frames, range_m: float) -> NDArray[np.bool_]:
-    """Return (P,) whether a vehicle comes within `range_m` of each site, in the plane, in some frame of a drive."""
+    """Return whether a vehicle comes within `range_m` [m] of a site in any frame of a drive (P,), in the x-y plane."""
     places = np.array([drive.data.world_from_agent(i)[:2, 3] for i in drive.vehicles]).reshape(-1, 2)
     apart = np.linalg.norm(sites.position[:, None, :2] - places, axis=2)
     return (apart <= range_m).any(axis=1)
 
 
 def read_traces(data: Dataset, frames: Sequence[int]) -> list[Trace]:
-    """Return the recorded traffic of the frames' scenes; scenes without a trace are left out."""
+    """Read the recorded traffic of the frames' scenes; scenes without a trace are left out."""
     scenes = sorted({data.keys[i].scene for i in frames})
     return [trace for scene in scenes if (trace := data.trace(scene)) is not None]
 
@@ -111,6 +112,6 @@ def read_traces(data: Dataset, frames: Sequence[int]) -> list[Trace]:
 def _find_row(region: str, sites: Sites, pole: int) -> int:
     known = sites.number.tolist()
     if pole not in known:
-        told = ", ".join(map(str, known))
-        raise InputError(f"placement.poles: {pole} is none of the candidate poles of region '{region}': {told}")
+        listed = ", ".join(map(str, known))
+        raise InputError(f"placement.poles: {pole} is none of the candidate poles of region '{region}': {listed}")
     return known.index(pole)

@@ -1,4 +1,4 @@
-"""Provenance of results: git revision, versions, kind of processor, threads and seed; no times."""
+"""Provenance of results: git revision, versions, kind of processor, threads and seed, but no times."""
 
 import functools
 import platform
@@ -11,7 +11,7 @@ from pathlib import Path
 import flcav
 from flcav.dataset.layout import PACKAGES, package_versions
 
-LEARNING = ("flwr", "scipy", "torch")  # packages that affect results, beside those that affect recordings
+LEARNING = ("flwr", "scipy", "torch")  # packages that affect results, besides those that affect recordings
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Provenance:
     revision: str | None  # of git; None without a checkout
     uncommitted: bool  # whether the package's files have changed since that revision
     versions: Mapping[str, str]
-    processor: str  # kind of, see `flcav.perception.device`
+    processor: str  # kind of processor, see `flcav.perception.device`
     threads: int
     seed: int | None
 

@@ -132,7 +132,7 @@ class Stragglers(Config):
 
 
 def draw_stragglers(how: Stragglers, vehicles: Sequence[str], seed: int, region: str) -> dict[str, float]:
-    """Return the speed of each straggler among a region's vehicles; others have 1."""
+    """Draw the stragglers among a region's vehicles; return their relative speeds by vehicle; others have 1."""
     drawn: list[int] = stream(seed, "stragglers", region).permutation(len(vehicles)).tolist()
     return {vehicles[number]: 1 / how.slower for number in sorted(drawn[: round(how.share * len(vehicles))])}
 
@@ -477,9 +477,9 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
             (Federation, self.federation, "federation"),
             *((Training, self.training_of(task), "training") for task in self.tasks),
         ]
-        for model, own, part in parts:
+        for model, given, part in parts:
             try:
-                parse_config(model, own.model_dump() | dict(getattr(arm, part)), f"arms.{name}.{part}")
+                parse_config(model, given.model_dump() | dict(getattr(arm, part)), f"arms.{name}.{part}")
             except InputError as error:
                 raise ValueError(str(error)) from None
 
@@ -489,20 +489,21 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
 
     @property
     def sized_splits(self) -> Splits:
-        """Return the sizes of the splits: the recipe's own, or those of the preset `size`."""
+        """The sizes of the splits: those given, or those of the preset `size`."""
         return self.splits or SIZES[self.size][0]
 
     def training_of(self, task: str) -> Training:
-        """Return a task's training schedule: its own, else the run's, else that of the preset `size`."""
+        """Return a task's training schedule: that of the task, else of the run, else of the preset `size`."""
         return self.tasks[task].training or self.training or SIZES[self.size][1]
 
     def speeds(self, region: str) -> Mapping[str, float]:
-        """Return the speeds of a region's vehicles, its own and those of stragglers; others have 1."""
-        own, drawn = self.regions[region], dict[str, float]()
-        if self.stragglers is not None and own.role == "federate" and own.data is None:
+        """Return the relative speeds of a region's vehicles: given ones, and those of stragglers; others have 1."""
+        place = self.regions[region]
+        drawn = dict[str, float]()
+        if self.stragglers is not None and place.role == "federate" and place.data is None:
             names = [f"cav{number}" for number in range(self.vehicles(region))]
             drawn = draw_stragglers(self.stragglers, names, self.seed, region)
-        return {**drawn, **own.speed}
+        return {**drawn, **place.speed}
 
     def vehicles(self, region: str) -> int:
         """Return the number of vehicles of a federating region's edge server."""
@@ -510,7 +511,7 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
 
 
 def load_run_recipe(path: Path | str) -> RunRecipe:
-    """Return the run recipe (YAML) at `path`; raises `InputError` naming the field, the value and what is allowed.
+    """Load the run recipe (YAML) at `path`; raises `InputError` naming the field, the value and what is allowed.
 
     Towns, datasets and histories named by a relative path are looked for in the folder `beside` of `run`.
 

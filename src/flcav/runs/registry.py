@@ -1,9 +1,9 @@
-"""The extras of a run, registered here alone: to take one out, delete its folder in `extras` and its lines below
+"""Registry of the extras of a run: to take one out, delete its folder in `extras` and its lines below
 (what else goes with it: CONTRIBUTING.md).
 
-An extra adds fields to the recipe and to the results (the bases of the four classes), and functions where a run calls
-them: `load_all` returns those of a table. They are named as `module:NAME`, since their modules import the stages that
-call them; so the hash of a step's code follows the names, too.
+An extra adds fields to the recipe and to the results (the bases of the four classes), and functions that a run calls:
+`load_all` returns those of a table. They are named as `module:NAME`, since their modules import the stages that call
+them; the hash of a step's code follows these names, too.
 """
 
 import functools
@@ -128,6 +128,6 @@ class PageSection:
 
 @functools.cache
 def load_all(places: Sequence[str]) -> tuple[Any, ...]:
-    """Return the functions of a table, in its order."""
+    """Import and return the functions of a table, in its order."""
     named = [place.partition(":") for place in places]
     return tuple(getattr(importlib.import_module(module), name) for module, _, name in named)

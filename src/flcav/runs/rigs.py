@@ -1,4 +1,4 @@
-"""Sensor rigs of recorded datasets in a run, where they differ from those that its networks are trained with."""
+"""Comparison of the sensor rigs of recorded datasets with those that a run's networks are trained with."""
 
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
@@ -15,26 +15,26 @@ from flcav.runs.frames import make_recording_recipe
 from flcav.runs.recipe import SPLITS_OF
 from flcav.runs.stages.outline import Outline
 
-RIG = "rig"  # reported in the place of a step
+RIG = "rig"  # reported in place of a step's name
 
 
 def tell_rigs(outlines: Iterable[Outline], notify: Notify) -> None:
-    """Report by `notify`, as notes of `RIG`, what `compare_rigs` finds in any of several runs, each sentence once."""
-    for sentence in dict.fromkeys(told for outline in outlines for told in compare_rigs(outline)):
+    """Report what `compare_rigs` finds in several runs by `notify`, without repeats, as notes of `RIG`."""
+    for sentence in dict.fromkeys(difference for outline in outlines for difference in compare_rigs(outline)):
         notify(RIG, 0, 0, sentence)
 
 
 def compare_rigs(outline: Outline) -> tuple[str, ...]:
-    """Return how the rigs of recorded datasets differ from those of the networks' training, by region and task.
+    """Describe how the rigs of recorded datasets differ from those that the networks are trained with.
 
-    Each is a sentence that begins with the region and the task, such as "street, objects: unlike in the network's
-    training the LiDAR has 64 beams, not 32". Regions that are recorded in the run itself have none.
+    A sentence begins with region and task, such as "street, objects: unlike in the network's training the LiDAR has 64
+    beams, not 32". There is none for regions that are recorded in the run itself.
     """
     found = (
         f"{region}, {task}: {rig}"
-        for region, own in outline.recipe.regions.items()
-        if own.data is not None
-        for folder in dict.fromkeys(outline.find_data(own, split) for split in SPLITS_OF[own.role])
+        for region, place in outline.recipe.regions.items()
+        if place.data is not None
+        for folder in dict.fromkeys(outline.find_data(place, split) for split in SPLITS_OF[place.role])
         for task in outline.recipe.tasks
         if (rig := _compare(outline, folder, task))
     )
@@ -42,7 +42,7 @@ def compare_rigs(outline: Outline) -> tuple[str, ...]:
 
 
 def _compare(outline: Outline, folder: Path, name: str) -> str:
-    """Return how the vehicles' rig in a dataset differs from the one that a task's network is trained with."""
+    """Describe how the vehicles' rig in a dataset differs from the one that a task's network is trained with."""
     task = task_named(name)
     known = join_lidars([find_recorded_lidar(recipe) for recipe in _list_pools(outline, name)])
     config = find_configuration(task, outline.recipe.tasks[name].network)
@@ -50,10 +50,10 @@ def _compare(outline: Outline, folder: Path, name: str) -> str:
 
 
 def _list_pools(outline: Outline, task: str) -> Iterator[Mapping[str, Json]]:
-    """Yield the recording recipes of the data that a task is or was pretrained on."""
+    """Yield the recording recipes of a task's pretraining data."""
     for region, step in outline.pools(task).items():
-        own = outline.recipe.regions[region]
-        if own.data is not None:
-            yield read_manifest(outline.find_data(own, "pool")).recipe
+        place = outline.recipe.regions[region]
+        if place.data is not None:
+            yield read_manifest(outline.find_data(place, "pool")).recipe
         else:
             yield make_recording_recipe(outline.recipe, region, "pool", task, step).model_dump(mode="json")

@@ -102,9 +102,9 @@ def run_seeds(
     runtime: str = "embedded",
     fleet: Path | None = None,
 ) -> tuple[tuple[Run, ...], Summary]:
-    """Run or finish a recipe with `seeds` consecutive seeds, its own first; return all runs and their summary.
+    """Run or finish a recipe with `seeds` consecutive seeds, from the recipe's; return all runs and their summary.
 
-    Each seed has a folder in `out`, beside summary.json and a common history.csv. Raises as `run`.
+    A seed has a folder in `out`, next to summary.json and a common history.csv. Raises as `run`.
 
     Args:
         recipe: of the runs, but for their seeds.
@@ -140,7 +140,7 @@ def run_several(
     runtime: str = "embedded",
     fleet: Path | None = None,
 ) -> tuple[Run, ...]:
-    """Run or finish several recipes side by side, each in the folder of its name in `out`; return their results.
+    """Run or finish several recipes in parallel, in the folders of their names in `out`; return their results.
 
     They have a common history.csv in `out`. Other arguments are those of `run`.
     """
@@ -168,9 +168,9 @@ def _save_results(graph: Graph, out: Path, history: Path, elapsed_s: float, name
 
 
 def seed_folders(folder: Path) -> dict[int, Path]:
-    """Return the folders of a run, or of each of its seeds, by seed; raises `InputError` where there is no run."""
-    own = [folder] if (folder / RESULTS).is_file() else sorted(folder.glob("seed*"))
-    found = {Run.load(each).recipe.seed: each for each in own if (each / RESULTS).is_file()}
+    """Return the folders of a run, or of its seeds, by seed; raises `InputError` where there is no finished run."""
+    candidates = [folder] if (folder / RESULTS).is_file() else sorted(folder.glob("seed*"))
+    found = {Run.load(candidate).recipe.seed: candidate for candidate in candidates if (candidate / RESULTS).is_file()}
     if not found:
         raise InputError(f"{folder}: no finished run, it has no {RESULTS}")
     return found

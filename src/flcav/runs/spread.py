@@ -3,7 +3,7 @@
 Initial weights, the order of batches and augmentation are redrawn; recordings, the plan, uploaded samples and
 roadside sensors stay. A run with `retrainings` measures the spread and writes it as a table (spread.csv), which the
 recipe of another run names (`spread`), or the package holds. Runs of the same recipe on other kinds of processor are
-further trainings, whose sensors are placed by their own network's errors (tools/ship_spreads.py).
+further trainings, whose sensors are placed by the errors of those trainings' networks (tools/ship_spreads.py).
 """
 
 import csv
@@ -34,31 +34,31 @@ class SpreadRow:
     stage: str
     before_arm: str  # empty for a measure
     before_stage: str  # empty for a measure
-    sd: float
+    sd: float  # standard deviation over trainings, in units of the measure
     trainings: int
     run: str
 
 
 def test_key(task: str, region: str, arm: str, stage: str) -> Key:
-    """Return the key of a measure."""
+    """Return the key of a test's measure in `Spreads`."""
     return task, region, arm, stage, "", ""
 
 
 def figure_key(each: Test | Difference) -> Key:
-    """Return the key of a test's measure, or of a difference."""
+    """Return the key of a test's measure, or of a difference, in `Spreads`."""
     arm, stage = (each.before_arm, each.before_stage) if isinstance(each, Difference) else ("", "")
     return each.task, each.region, each.arm, each.stage, arm, stage
 
 
 def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[SpreadRow]:
-    """Return the spread of each figure of a run with retrainings; `name` is the run's.
+    """Return the spreads of all measures and differences of the run `name` with retrainings.
 
-    `further`: runs of the same recipe, frames and test scenes, each one more training of every figure.
+    `further`: runs of the same recipe, frames and test scenes, which count as one more training of every figure.
     """
-    others = [list_figures(each) for each in further]
+    others = [list_figures(figure) for figure in further]
     rows = []
-    for key, each in list_figures(run).items():
-        spread = measure_spread([*each.trainings, *(other[key].trainings[0] for other in others)])
+    for key, figure in list_figures(run).items():
+        spread = measure_spread([*figure.trainings, *(other[key].trainings[0] for other in others)])
         if spread is not None:
             rows.append(SpreadRow(*key, spread.sd, spread.trainings, name))
     return rows
@@ -66,14 +66,15 @@ def list_spreads(run: Run, name: str, further: Sequence[Run] = ()) -> list[Sprea
 
 def list_figures(run: Run) -> dict[Key, Test | Difference]:
     """Return the tests and differences of a run by key, in this order."""
-    return {figure_key(each): each for each in (*run.tested, *run.differences)}
+    return {figure_key(figure): figure for figure in (*run.tested, *run.differences)}
 
 
 def widen_anew(run: Run, spreads: Spreads) -> Run:
-    """Return a run of one training with intervals by `spreads`, which may be newer than those of its results."""
+    """Return a run of one training with its intervals widened by `spreads`, which may be newer than its results."""
 
     def anew(figure: FigureT) -> FigureT:
-        spread, alone = spreads.get(figure_key(figure)), figure.over_scenes
+        spread = spreads.get(figure_key(figure))
+        alone = figure.over_scenes
         widened = alone if spread is None else (widen_share if isinstance(figure, Test) else widen)(alone, spread)
         return replace(figure, estimate=widened, spread=spread)
 
@@ -81,14 +82,14 @@ def widen_anew(run: Run, spreads: Spreads) -> Run:
 
 
 def read_spreads(name: str, beside: Path) -> Spreads:
-    """Return the spreads in a table of the package, or in a file below `beside`; those of several runs are pooled.
+    """Read the spreads from a table of the package, or from a file in the folder `beside`, pooled over runs.
 
     Raises `InputError` where there is no such table, or a row is not a spread.
     """
     table = io.StringIO(read_named_table("spread", name, "spread", "spreads", beside))
     try:
         rows = list(csv.DictReader(table))
-    except csv.Error as error:  # of a cell that is longer than any
+    except csv.Error as error:  # a cell beyond the size limit of the module csv
         raise InputError(f"{name}: not a CSV table ({error})") from None
     spreads: dict[Key, list[Spread]] = {}
     for number, row in enumerate(rows, start=1):
@@ -102,4 +103,4 @@ def read_spreads(name: str, beside: Path) -> Spreads:
             raise InputError(f"{name}: row {number}: sd must be from 0 to 1, trainings 2 or more")
         key = (row["task"], row["region"], row["arm"], row["stage"], row["before_arm"], row["before_stage"])
         spreads.setdefault(key, []).append(spread)
-    return {key: pool_spreads(own) for key, own in spreads.items()}
+    return {key: pool_spreads(measured) for key, measured in spreads.items()}

@@ -21,14 +21,14 @@ from flcav.optimization.curves.history import History, parse_histories
 
 
 def read_named_table(field: str, name: str, noun: str, folder: str, beside: Path) -> str:
-    """Return the text of a table: one of the package by its name, in `folder`, or a file below `beside`.
+    """Read the text of a table: one of the package by its name, in `folder`, or a file in the folder `beside`.
 
-    Raises `InputError`, naming the recipe's `field` and the table by its `noun`, where there is none.
+    Raises `InputError`, naming the recipe's `field` and the kind of table (`noun`), where there is none.
     """
-    own = resources.files("flcav.runs") / folder
-    known = sorted(entry.name.removesuffix(".csv") for entry in own.iterdir() if ".csv" in entry.name)
+    packaged = resources.files("flcav.runs") / folder
+    known = sorted(entry.name.removesuffix(".csv") for entry in packaged.iterdir() if ".csv" in entry.name)
     if name in known:
-        return (own / f"{name}.csv").read_text(encoding="utf-8-sig")
+        return (packaged / f"{name}.csv").read_text(encoding="utf-8-sig")
     path = find_path(name, beside)
     if path is None or not path.is_file():
         raise InputError(
@@ -54,11 +54,11 @@ def append_records(path: Path, records: Sequence["DataclassInstance"]) -> None:
     if path.exists():
         with path.open(newline="", encoding="utf-8-sig") as file:
             held = list(csv.DictReader(file))
-    told = [{name: _cell(value) for name, value in asdict(record).items()} for record in records]
+    rows = [{name: _cell(value) for name, value in asdict(record).items()} for record in records]
     with atomic_path(path) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(told[0]), lineterminator="\n")
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
-        writer.writerows([*(row for row in held if row.get("run") not in {new["run"] for new in told}), *told])
+        writer.writerows([*(row for row in held if row.get("run") not in {new["run"] for new in rows}), *rows])
 
 
 def _cell(value: object) -> str:
@@ -67,20 +67,20 @@ def _cell(value: object) -> str:
 
 @dataclass(frozen=True)
 class HistoryPoint:
-    """A point of the learning history that a run writes: what a task spent, and the score it reached."""
+    """A point of a learning history: samples and rounds that a task spent, and the score it reached."""
 
     task: str
     samples: int
     edge_rounds: int
     cloud_rounds: int
-    accuracy: float
-    weight: int  # validation frames
+    accuracy: float  # validation score in [0, 1]
+    weight: int  # number of validation frames
     run: str
     seed: int
 
 
 def read_history(task: str, name: str, beside: Path) -> str:
-    """Return the text of a task's learning history (CSV): one of the package by its name, or a file below `beside`.
+    """Read the text of a task's learning history (CSV): one of the package, or a file in the folder `beside`.
 
     Raises `InputError` where there is no such table, or it has no rows of the task.
     """
@@ -90,7 +90,7 @@ def read_history(task: str, name: str, beside: Path) -> str:
 
 
 def parse_history(task: str, text: str, origin: str) -> History:
-    """Return the task's points in a history (CSV); raises `InputError`, naming `origin`, where there are none."""
+    """Parse a task's points from a history (CSV); raises `InputError`, naming `origin`, where there are none."""
     table = read_csv(io.BytesIO(text.encode()), origin=origin)
     found = parse_histories(table.to_pydict(), origin, task)
     if task not in found:
@@ -99,5 +99,5 @@ def parse_history(task: str, text: str, origin: str) -> History:
 
 
 def load_known_history(name: str) -> History:
-    """Return the package's learning history of the task `name`."""
+    """Load the package's learning history of the task `name`."""
     return parse_history(name, read_history(name, name, Path()), name)

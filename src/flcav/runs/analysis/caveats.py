@@ -16,12 +16,12 @@ PLACED_BARE = "vehicles send the places of their errors as they are: neither noi
 
 
 def list_caveats(recipe: RunRecipe, labels: Iterable[str], settings: Iterable[Setting]) -> tuple[str, ...]:
-    """Return the caveats of the kinds `labels`, of privacy, and of a road detector in a town that it was trained in.
+    """Return the caveats of the kinds of `labels`, of a road detector in the towns of its training, and of privacy.
 
-    settings: those of all arms.
+    `settings`: those of all arms.
     """
     settings = [*settings]
-    own = dict.fromkeys(LABEL_SOURCES[kind].caveat for kind in labels)
+    general = dict.fromkeys(LABEL_SOURCES[kind].caveat for kind in labels)
     labelled = {
         region
         for setting in settings
@@ -31,13 +31,15 @@ def list_caveats(recipe: RunRecipe, labels: Iterable[str], settings: Iterable[Se
     known = [
         region for region in recipe.with_role("federate") if region in labelled and _was_trained_in(recipe, region)
     ]
-    told = f"the road detector was trained in {' and '.join(known)}, so that its labels are better there than elsewhere"
+    trained = (
+        f"the road detector was trained in {' and '.join(known)}, so that its labels are better there than elsewhere"
+    )
     bare = [PLACED_BARE] if any(_places_bare(setting) for setting in settings) else []
-    return (*filter(None, own), *([told] if known else []), *bare)
+    return (*filter(None, general), *([trained] if known else []), *bare)
 
 
 def list_unreached(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting], range_m: float) -> tuple[str, ...]:
-    """Return a caveat for each region that has sensors, but no vehicle within `range_m` of one in stage II."""
+    """Return a caveat per region that has sensors, but no vehicle within `range_m` [m] of one in stage II."""
     found = {
         stage.region
         for name, arm in arms.items()
@@ -45,13 +47,13 @@ def list_unreached(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting
         if stage.stage == EDGE and LABEL_SOURCES[settings[name].labels[stage.task]].from_poles and not stage.poles
         if any(placed.region == stage.region and placed.chosen for placed in arm.placed)
     }
-    told = "so that all took part, without labels from the road"
+    consequence = "so that all took part, without labels from the road"
     where = f"within {range_m:g} m (placement.group_range_m) of a sensor in the frames of stage II"
-    return tuple(f"no vehicle of '{region}' came {where}, {told}" for region in sorted(filter(None, found)))
+    return tuple(f"no vehicle of '{region}' came {where}, {consequence}" for region in sorted(filter(None, found)))
 
 
 def list_diverged(arms: Mapping[str, ArmResult]) -> tuple[str, ...]:
-    """Return a caveat for each arm and task whose training diverged, with its first and last loss."""
+    """Return a caveat per arm and task whose training diverged, with its first and last loss."""
     found = []
     for name, arm in arms.items():
         first: dict[str, float | None] = {}  # by task
@@ -61,25 +63,25 @@ def list_diverged(arms: Mapping[str, ArmResult]) -> tuple[str, ...]:
             known = [loss for loss in losses if loss is not None]
             if diverges(losses) or stage.kept is not None:
                 at = f"{stage.task} in {_name_stage(name, stage)}"
-                told = f"{DIVERGING}: {at}, its loss went from {known[0]:.3g} to {known[-1]:.3g}"
+                sentence = f"{DIVERGING}: {at}, its loss went from {known[0]:.3g} to {known[-1]:.3g}"
                 if stage.kept is not None:
                     weights = f"after round {stage.kept}" if stage.kept else "that it began with"
-                    told += f"; it stopped in round {stage.rounds}, and has the weights {weights}"
-                    further = any(each.stage in (CLOUD, MORE_EDGE) for each in arm.stages)
-                    told += "; no rounds follow" if stage.stage == EDGE and further else ""
-                found.append(told)
+                    sentence += f"; it stopped in round {stage.rounds}, and has the weights {weights}"
+                    further = any(later.stage in (CLOUD, MORE_EDGE) for later in arm.stages)
+                    sentence += "; no rounds follow" if stage.stage == EDGE and further else ""
+                found.append(sentence)
     return tuple(found)
 
 
 def list_cut(arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> tuple[str, ...]:
-    """Return a caveat for each arm and task of whose planned rounds the privacy budget afforded fewer."""
+    """Return a caveat per arm and task for which the privacy budget afforded fewer rounds than planned."""
     found = []
     for name, arm in arms.items():
         privacy = settings[name].federation.privacy
         for stage in arm.stages if privacy is not None and privacy.epsilon is not None else ():
             plan = arm.plan.tasks[stage.task]
             planned = plan.cloud_rounds if stage.stage == CLOUD else plan.edge_rounds
-            stopped = any(each.kept is not None for each in arm.stages if each.task == stage.task)
+            stopped = any(result.kept is not None for result in arm.stages if result.task == stage.task)
             if stage.stage in (EDGE, CLOUD) and stage.rounds < planned and not stopped:
                 at = _name_stage(name, stage)
                 found.append(f"privacy affords {stage.rounds} of {planned} planned rounds of {stage.task} in {at}")
@@ -91,12 +93,12 @@ def _name_stage(arm: str, stage: StageResult) -> str:
 
 
 def _places_bare(setting: Setting) -> bool:
-    """Return whether vehicles whose updates noise or masks hide send the places of their errors as they are."""
+    """Return whether vehicles send the places of their errors unprotected, while noise or masks hide their updates."""
     hidden = setting.federation.privacy is not None or setting.federation.secure is not None
     return hidden and setting.central is None and bool(setting.placement.tasks)
 
 
 def _was_trained_in(recipe: RunRecipe, region: str) -> bool:
-    own = recipe.regions[region]
-    town = own.town or region
-    return own.data is None and HILLY.get(town, town) in TRAINED_IN
+    place = recipe.regions[region]
+    town = place.town or region
+    return place.data is None and HILLY.get(town, town) in TRAINED_IN

@@ -32,7 +32,7 @@ from flcav.runs.training.private_rounds import PrivateTraining, compose_training
 
 
 def collect_results(graph: Graph, work: Path) -> Run:
-    """Collect the results of the finished steps in `work`, and write each arm's ledger to `ledgers` next to it."""
+    """Collect the results of the finished steps in `work`; writes the arms' ledgers to `ledgers` next to it."""
     recipe, names, main = graph.recipe, graph.names, graph.settings[MAIN]
     settings = {name: setting for name, setting in graph.settings.items() if not setting.repeat}
     tests = [
@@ -71,7 +71,8 @@ def collect_results(graph: Graph, work: Path) -> Run:
 
 
 def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
-    names, tasks = graph.names, graph.recipe.tasks
+    names = graph.names
+    tasks = graph.recipe.tasks
     plans = dict.fromkeys(names.plan(arm.name, stage) for stage in (PRETRAIN, *arm.stages))
     *earlier, plan = (Plan.load(work / name) for name in plans)
     trained = dict.fromkeys(
@@ -87,7 +88,7 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
         books = [Ledger.load(work / names.cloud(arm.name, task) / LEDGER) for task in tasks]  # they include the others
     budgets = graph.recipe.budgets_mb
     wireline = budgets.wireline if arm.uploads is None else COUNTED_MB  # as when they were sent
-    book = Ledger(LinkMegabytes(budgets.wireless, wireline), (entry for each in books for entry in each.entries))
+    book = Ledger(LinkMegabytes(budgets.wireless, wireline), (entry for ledger in books for entry in ledger.entries))
     book.save(work.parent / "ledgers" / f"{arm.name}.parquet")
     stages = tuple(StageResult.load(work / step) for step in trained)
     return ArmResult(
@@ -116,7 +117,7 @@ def _arm(graph: Graph, work: Path, arm: Setting) -> ArmResult:
 
 
 def list_trainings(graph: Graph, work: Path, arm: Setting) -> Iterator[PrivateTraining]:
-    """Yield the trainings of every task with a region's vehicles, an arm's retrainings included."""
+    """Yield the trainings of every task with a region's vehicles, including an arm's retrainings."""
     for name in (name_repeat(arm.name, number) for number in (0, *number_retrainings(graph))):
         for region in arm.regions:
             for task in graph.recipe.tasks:

@@ -27,7 +27,7 @@ from flcav.storage.records import select
 
 
 def list_arm_costs(run: Run) -> tuple[ArmCost, ...]:
-    """Return a row for each arm and task that was tested after federating, or after training centrally."""
+    """Return a row per arm and task that was tested after federated or centralised training."""
     rows = []
     for name, arm in run.arms.items():
         for task in run.recipe.tasks:
@@ -46,11 +46,12 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
         link: sum(row.mb for row in select(arm.spent, task=task, link=link, stage=(EDGE, CLOUD))) for link in arm.links
     }
     rounds = {
-        stage: max((each.rounds for each in select(arm.stages, task=task, stage=stage)), default=0)
+        stage: max((result.rounds for result in select(arm.stages, task=task, stage=stage)), default=0)
         for stage in (EDGE, CLOUD)
     }
     after = average_estimates([test.estimate for test in tests])
-    gain, uplink_mb = after.mean - before, sum(sent.values())
+    gain = after.mean - before
+    uplink_mb = sum(sent.values())
     return ArmCost(
         arm=name,
         task=task,
@@ -70,25 +71,30 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
 
 
 def tell_gain(run: Run) -> tuple[str, ...]:
-    """Return sentences for each task: what the run gained, for how many megabytes, and at what cost at home."""
-    told, home, arm = [], list_home_costs(run), run.arms[MAIN]
+    """Describe the run's gain by task, the megabytes that it took, and what it cost in the towns of pretraining."""
+    sentences = []
+    home = list_home_costs(run)
+    arm = run.arms[MAIN]
     for cost in select(list_arm_costs(run), arm=MAIN):
         links = [f"{arm.sent_mb(cost.task, link):.1f} MB of {link} uplink" for link in arm.links]
-        told.append(
+        sentences.append(
             f"Federated learning took {cost.measure} of {cost.task} from {cost.before:.3f} to {cost.after.mean:.3f} on "
             f"{' and '.join(cost.regions)}, for {' and '.join(links)}, pretraining included."
         )
-        for region in dict.fromkeys(each.region for each in select(home, task=cost.task)):
+        for region in dict.fromkeys(change.region for change in select(home, task=cost.task)):
             changes = [
-                f"{each.measure} from {each.before:.3f} to {each.after:.3f}"
-                for each in select(home, region=region, task=cost.task)
+                f"{change.measure} from {change.before:.3f} to {change.after:.3f}"
+                for change in select(home, region=region, task=cost.task)
             ]
-            told.append(f"On {region}, where it was pretrained, it took {' and '.join(changes)}.")
-    return tuple(told)
+            sentences.append(f"On {region}, where it was pretrained, it took {' and '.join(changes)}.")
+    return tuple(sentences)
 
 
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
-    """Return the costs at home by the tasks' further measures, such as AP70; `Difference` has the main measure."""
+    """Collect the costs in the towns of pretraining in the tasks' further measures, such as AP70.
+
+    A `Difference` has the main measure.
+    """
     return tuple(
         _cost(graph, work, (stage, region, task), name, measure)
         for stage, region, task in graph.tested(graph.settings[MAIN])
@@ -101,38 +107,41 @@ def _cost(graph: Graph, work: Path, tested: tuple[str, str, str], name: str, mea
     stage, region, task = tested
     arms = [name_repeat(MAIN, number) for number in (0, *number_retrainings(graph))]
     pairs = [
-        [Outcomes.load(work / test_folder(graph, arm, each, region, task) / OUTCOMES) for each in (PRETRAIN, stage)]
+        [Outcomes.load(work / test_folder(graph, arm, at, region, task) / OUTCOMES) for at in (PRETRAIN, stage)]
         for arm in arms
     ]
-    own, seed = task_named(task), graph.recipe.seed
+    learned = task_named(task)
+    seed = graph.recipe.seed
     values = [[count_once(measure, outcomes) for outcomes in pair] for pair in pairs]
     first, last = pairs[0]
-    found = Estimate(*difference(own, first, last, seed, measure))
+    found = Estimate(*difference(learned, first, last, seed, measure))
     if len(pairs) > 1 and found.low is not None:
-        shared = share_test_scenes(own, pairs, lambda pair: pair[1] - pair[0], seed, measure)
+        shared = share_test_scenes(learned, pairs, lambda pair: pair[1] - pair[0], seed, measure)
         found = mean_over_seeds([after - before for before, after in values], shared=shared).as_estimate()
     before, after = np.mean(values, axis=0).tolist()
     return HomeCost(region, task, name, before, after, found, len(pairs))
 
 
 def list_home_costs(run: Run) -> list[HomeCost]:
-    """Return the cost of federated learning in the towns of pretraining, by each task's main and further measures.
+    """Return the costs of federated learning in the towns of pretraining, in the tasks' main and further measures.
 
-    Results that were collected before further measures had intervals give those of the first training without one.
+    In results of earlier versions, further measures are those of the first training and have no interval.
     """
     tests = {test.key: test for test in run.tested}
     costs = []
     towns = run.recipe.with_role("pretrain")
-    for each in select(run.differences, arm=MAIN, before_arm=MAIN, before_stage=PRETRAIN, region=towns):
-        pair = [tests[MAIN, stage, each.region, each.task] for stage in (PRETRAIN, each.stage)]
+    for at_home in select(run.differences, arm=MAIN, before_arm=MAIN, before_stage=PRETRAIN, region=towns):
+        pair = [tests[MAIN, stage, at_home.region, at_home.task] for stage in (PRETRAIN, at_home.stage)]
         before, after = (test.estimate.mean for test in pair)
-        trainings = len(each.trainings)
-        costs.append(HomeCost(each.region, each.task, pair[0].result.measure, before, after, each.estimate, trainings))
-        kept = select(run.home or (), region=each.region, task=each.task)
-        for name in () if kept else further_measures(task_named(each.task)):
+        trainings = len(at_home.trainings)
+        costs.append(
+            HomeCost(at_home.region, at_home.task, pair[0].result.measure, before, after, at_home.estimate, trainings)
+        )
+        kept = select(run.home or (), region=at_home.region, task=at_home.task)
+        for name in () if kept else further_measures(task_named(at_home.task)):
             before, after = (test.result.numbers.get(name) for test in pair)
             if before is not None and after is not None:
                 change = Estimate(after - before, None, None)
-                kept.append(HomeCost(each.region, each.task, name, before, after, change, 1))
+                kept.append(HomeCost(at_home.region, at_home.task, name, before, after, change, 1))
         costs += kept
     return costs

@@ -1,4 +1,4 @@
-"""Tests of a run's networks, with intervals over scenes and retrainings, and their paired differences."""
+"""Tests of a run's networks and their paired differences, with intervals over scenes and retrainings."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
@@ -24,11 +24,11 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
     step = test_folder(graph, arm, stage, region, task)
     result = Tested.load(work / step)
     again = [test_folder(graph, name_repeat(arm, n), stage, region, task) for n in number_retrainings(graph)]
-    again = [each for each in again if each != step]  # all of them, unless retrainings share this network
-    retrained = tuple(Tested.load(work / each).estimate.mean for each in again)
+    again = [name for name in again if name != step]  # drops those that share this network
+    retrained = tuple(Tested.load(work / name).estimate.mean for name in again)
     values = (result.estimate.mean, *retrained)
     spread = measure_spread(values) or graph.spreads.get(test_key(task, region, arm, stage))
-    folders = [(work / each,) for each in (step, *again)]
+    folders = [(work / name,) for name in (step, *again)]
     mean = mean_over_trainings(task, result.estimate, values, folders, graph.recipe.seed, share=True)
     estimate = result.estimate
     if mean is not None:
@@ -43,7 +43,7 @@ def mean_over_trainings(
 ) -> MeanOverSeeds | None:
     """Return `mean_of_tests` of the trainings of one run, which share all test scenes.
 
-    `first`: that of the first training over its scenes. None for one training, and where scenes give no interval.
+    `first`: estimate of the first training over its scenes. None for one training, and where scenes give no interval.
     """
     if len(values) < 2 or first.low is None:
         return None
@@ -53,12 +53,13 @@ def mean_over_trainings(
 def mean_of_tests(
     task: str, values: Sequence[float], tests: Sequence[Sequence[Path]], seed: int = 0, *, share: bool = False
 ) -> MeanOverSeeds:
-    """Return the mean over trainings of a measure, or of the difference of two: over seeds, or of one run.
+    """Return the mean over trainings, of one run or of several seeds, of a measure or of the difference of two.
 
-    `tests`: for each training the folder of the test, or of the later and the earlier one. `seed`: of the draws of
-    scenes. `share`: a number in [0, 1].
+    `values`: the number by training. `tests`: by training the folder of the test, or of the later and the earlier one.
+    `seed`: of the bootstrap over scenes. `share`: whether the number is a share in [0, 1], whose interval is on the
+    scale of log-odds.
     """
-    outcomes = [[Outcomes.load(folder / OUTCOMES) for folder in own] for own in tests]
+    outcomes = [[Outcomes.load(folder / OUTCOMES) for folder in folders] for folders in tests]
     shared = share_test_scenes(task_named(task), outcomes, _subtract, seed)
     return mean_over_seeds(values, shared=shared, share=share)
 
@@ -73,12 +74,12 @@ def number_retrainings(graph: Graph) -> range:
 
 
 def test_folder(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
-    """Return the name of the step, and of its folder, that tested an arm's network after a stage."""
+    """Return the name of the step, and so of the folder, that tested an arm's network after a stage."""
     return graph.names.test(graph.names.stage(arm, stage, region, task), region)
 
 
 def collect_regional_tests(graph: Graph, work: Path, arm: Setting) -> tuple[RegionalTest, ...]:
-    """Return the tests of the models that an arm's regions keep for themselves."""
+    """Collect the tests of the personalised models of an arm's regions."""
     found = []
     for stage, region, task in graph.tested(arm):
         trained = graph.names.stage(arm.name, stage, region, task)
@@ -90,9 +91,9 @@ def collect_regional_tests(graph: Graph, work: Path, arm: Setting) -> tuple[Regi
 
 
 def list_differences(graph: Graph, work: Path) -> list[Difference]:
-    """Return each stage minus the one before it, and the run itself minus each other arm at the same stage.
+    """List the differences of the stages to the ones before, and of the run itself to its arms at the same stage.
 
-    Those that a primary claim is of come first, in the mean over regions.
+    The differences of primary claims come first, as means over regions.
     """
     main = graph.settings[MAIN]
     pairs: list[tuple[tuple[str, str], tuple[str, str], str, str]] = []
@@ -102,8 +103,10 @@ def list_differences(graph: Graph, work: Path) -> list[Difference]:
                 earlier = EDGE if stage in (CLOUD, MORE_EDGE) and region in arm.regions else PRETRAIN
                 pairs.append(((arm.name, stage), (arm.name, earlier), region, task))
             if arm.name != MAIN and (region in main.regions or stage != EDGE):
-                own = CLOUD if arm.central == ALL else {CENTRAL: EDGE, MORE_EDGE: CLOUD}.get(stage, stage)
-                pairs.append(((MAIN, own), (arm.name, stage), region, task))
+                # Central training takes as many steps as stage II; on all regions it corresponds to cloud FL, which
+                # further edge rounds replace.
+                matching = CLOUD if arm.central == ALL else {CENTRAL: EDGE, MORE_EDGE: CLOUD}.get(stage, stage)
+                pairs.append(((MAIN, matching), (arm.name, stage), region, task))
     found: dict[tuple[str, str], Difference] = {}
     for after, before, region, task in pairs:
         steps = test_folder(graph, *after, region, task), test_folder(graph, *before, region, task)
@@ -113,21 +116,22 @@ def list_differences(graph: Graph, work: Path) -> list[Difference]:
 
 
 def _join_regions(graph: Graph, differences: Iterable[Difference]) -> Iterator[Difference]:
-    """Yield the mean over regions of each difference that the recipe's primary claims are of."""
+    """Yield the means over regions of the differences of the recipe's primary claims."""
     groups: dict[tuple[str, ...], list[Difference]] = {}
-    for each in differences:
-        if is_joint(each, graph.recipe, graph.settings):
-            groups.setdefault(pair_of(each), []).append(each)
+    for regional in differences:
+        if is_joint(regional, graph.recipe, graph.settings):
+            groups.setdefault(pair_of(regional), []).append(regional)
     for group in groups.values():
         yield _join(graph, group)
 
 
 def _join(graph: Graph, group: Sequence[Difference]) -> Difference:
-    """Return the mean over regions of a difference in each, whose test scenes are independent."""
-    first, regions = group[0], tuple(each.region for each in group)
+    """Return the mean over regions of a difference; regions have independent test scenes."""
+    first = group[0]
+    regions = tuple(regional.region for regional in group)
     place = " and ".join(regions)
-    over_scenes = average_estimates([each.over_scenes for each in group])
-    values = np.mean([each.trainings for each in group], axis=0).tolist()
+    over_scenes = average_estimates([regional.over_scenes for regional in group])
+    values = np.mean([regional.trainings for regional in group], axis=0).tolist()
     joint = replace(
         first,
         name=first.name.replace(first.region, place, 1),
@@ -139,9 +143,9 @@ def _join(graph: Graph, group: Sequence[Difference]) -> Difference:
         over_trainings=None,
         regions=regions,
     )
-    trained = [each.over_trainings for each in group if each.over_trainings is not None]
+    trained = [regional.over_trainings for regional in group if regional.over_trainings is not None]
     if len(trained) == len(group):
-        mean = mean_over_seeds(values, shared=average_shared([each.shared for each in trained]))
+        mean = mean_over_seeds(values, shared=average_shared([regional.shared for regional in trained]))
         return replace(joint, estimate=mean.as_estimate(), over_trainings=mean)
     return _widen(joint, graph.spreads.get(figure_key(joint)))
 
@@ -162,8 +166,8 @@ def _difference(
     values = (over_scenes.mean, *retrained)
     folders = [(folder(after, n), folder(before, n)) for n in range(len(values))]
     trained = mean_over_trainings(task, over_scenes, values, folders, graph.recipe.seed, share=False)
-    told = [name_stage(_owner(graph, *each, region, task), each[1]) for each in (after, before)]
-    name = f"{region}, {task}: {' - '.join(told)}"
+    stages = [name_stage(_owner(graph, *at, region, task), at[1]) for at in (after, before)]
+    name = f"{region}, {task}: {' - '.join(stages)}"
     found = Difference(name, *after, *before, region, task, over_scenes, over_scenes, measure_spread(values), retrained)
     if trained is not None:
         return replace(found, estimate=trained.as_estimate(), over_trainings=trained)
@@ -171,7 +175,7 @@ def _difference(
 
 
 def _widen(found: Difference, known: Spread | None) -> Difference:
-    """Return a difference whose interval includes its spread of retraining, or else a `known` spread."""
+    """Widen the interval of a difference by its spread of retraining, or else by a `known` spread."""
     spread = found.spread or known
     return found if spread is None else replace(found, estimate=widen(found.over_scenes, spread), spread=spread)
 
@@ -183,6 +187,6 @@ def _owner(graph: Graph, arm: str, stage: str, region: str, task: str) -> str:
 
 
 def compare_tests(task: str, before: Path, after: Path, seed: int) -> Estimate:
-    """Return the paired difference `after` - `before` of two test folders' measure, by bootstrap over scenes."""
+    """Return the paired difference `after` - `before` of the measure in two test folders, by bootstrap over scenes."""
     first, second = (Outcomes.load(folder / OUTCOMES) for folder in (before, after))
     return Estimate(*difference(task_named(task), first, second, seed))

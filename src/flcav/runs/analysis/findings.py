@@ -1,15 +1,14 @@
-"""Findings of a run: verdicts on its claims, and what it loses to upper bounds, with the numbers behind them.
+"""Findings of a run: verdicts on its claims, and its losses to upper bounds, with the numbers behind them.
 
-A claim says that a difference of a measure is positive. Of a run with retrainings it is judged by the mean over its
-trainings, which share their test scenes. Of one training the 95 % interval is a paired bootstrap over scenes, widened
-by the spread of retraining, and the p-value is that of this interval. A claim held, or did not hold, if its corrected
-p-value (Holm) is at most 0.05. It is undecided else, and where the spread is not known: another training on the same
-frames might say otherwise. Only a loss that is too large for any spread is one without it (`tell_loss`).
+A claim says that a difference of a measure is positive. In a run with retrainings it is judged by the mean over its
+trainings, which share their test scenes. With one training the 95 % interval is a paired bootstrap over scenes, widened
+by the spread of retraining, and the p-value is that of this interval. A claim held, or did not hold, if its p-value,
+corrected by Holm's method, is at most 0.05. Otherwise it is undecided. Without a known spread another training on the
+same frames might show the opposite, so that only a loss that is too large for any spread is decided (`tell_loss`).
 
-A recipe may name its primary claims (`primary_claims`) before it is run. Each is of the mean over the regions that
-federate. They are corrected for one another, and all others, exploratory ones, apart from them. Nobody claims that the
-run beats an upper bound, such as an arm with an ideal road detector: there the difference is an estimate of what is
-lost.
+A recipe may name its primary claims (`primary_claims`) before it is run. They concern means over the federating
+regions, and are corrected for one another; all other claims are exploratory and corrected separately. No claim is made
+that the run beats an upper bound, such as an arm with an ideal road detector: there the difference estimates the loss.
 """
 
 from collections import Counter
@@ -42,19 +41,19 @@ Kind = Literal["claim", "primary", "secondary", "loss"]
 
 @dataclass(frozen=True)
 class ClaimQuestion:
-    """The question that a difference answers, and what it is to the run: a claim, or an estimate of a loss."""
+    """The question that a difference answers, and its kind: a claim, or an estimate of a loss."""
 
     question: str
     kind: Kind  # claim: one of a recipe that names no primary claims
 
     @property
     def named(self) -> str | None:
-        """Return "primary" or "secondary"; None for other kinds."""
+        """The kind "primary" or "secondary"; None for others."""
         return self.kind if self.kind in ("primary", "secondary") else None
 
 
 def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> ClaimQuestion:
-    """Return the question that a difference of the run itself answers; `settings`: those of each arm, by name."""
+    """Return the question that a difference of the run itself answers; `settings`: those of all arms, by name."""
     question = _question(each, recipe, settings)
     if each.before_arm != MAIN and _is_bound(settings[MAIN], settings[each.before_arm], each.task):
         return ClaimQuestion(question, "loss")
@@ -66,24 +65,24 @@ def ask(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) ->
 def ask_all(
     differences: Sequence[Difference], recipe: RunRecipe, settings: Mapping[str, Setting]
 ) -> list[ClaimQuestion]:
-    """Return the question of each difference; a region's is secondary if the mean over regions is primary."""
+    """Return the questions of differences; a region's is secondary if that of the mean over regions is primary."""
     joint = {pair_of(each) for each in differences if each.regions is not None}
-    asked = [ask(each, recipe, settings) for each in differences]
+    questions = [ask(each, recipe, settings) for each in differences]
     return [
-        replace(own, kind="secondary")
-        if own.kind == "primary" and each.regions is None and pair_of(each) in joint
-        else own
-        for each, own in zip(differences, asked, strict=True)
+        replace(question, kind="secondary")
+        if question.kind == "primary" and each.regions is None and pair_of(each) in joint
+        else question
+        for each, question in zip(differences, questions, strict=True)
     ]
 
 
 def pair_of(each: Difference) -> tuple[str, ...]:
-    """Return both arms and stages and the task of a difference, without its region."""
+    """Return the key of a difference without its region: both arms and stages, and the task."""
     return each.arm, each.stage, each.before_arm, each.before_stage, each.task
 
 
 def is_joint(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> bool:
-    """Return whether a primary claim is of the mean over regions of this difference, which is that of one of them."""
+    """Return whether a primary claim concerns the mean over regions of a regional difference."""
     arms = (settings[MAIN], settings[each.before_arm])
     federating = [region for region in arms[0].regions if region in arms[1].regions]
     named = each.arm == MAIN and _name_claim(each) in recipe.primary_claims
@@ -91,21 +90,21 @@ def is_joint(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting
 
 
 def judge_asked(asked: Sequence[ClaimQuestion], means: Sequence[MeanOverSeeds | None]) -> list[Judged | None]:
-    """Return the verdict on each claim; primary ones are judged together, others together.
+    """Return the verdicts on claims; primary ones are judged jointly, and so are the others.
 
-    None for what is no claim, and where there is no number (None) to judge.
+    None for an estimate of a loss, and where the mean to judge is None.
     """
     found: list[Judged | None] = [None] * len(asked)
     for kind in ("claim", "primary", "secondary"):
-        own = [
+        claims = [
             None if mean is None or each.kind != kind else Claim(mean) for each, mean in zip(asked, means, strict=True)
         ]
-        found = [one or old for one, old in zip(judge_known(own), found, strict=True)]
+        found = [one or old for one, old in zip(judge_known(claims), found, strict=True)]
     return found
 
 
 def _name_claim(each: Difference) -> str:
-    """Return the name by which a recipe's `primary_claims` call a difference's claim."""
+    """Return the name of a difference's claim in a recipe's `primary_claims`."""
     if each.before_arm != MAIN:
         return each.before_arm
     if each.stage == EDGE:
@@ -113,9 +112,9 @@ def _name_claim(each: Difference) -> str:
     return CLOUD if each.before_stage == EDGE else ELSEWHERE
 
 
-def _is_bound(own: Setting, other: Setting, task: str) -> bool:
+def _is_bound(setting: Setting, other: Setting, task: str) -> bool:
     """Return whether an arm is an upper bound of the run: it learns from truth that the run does not have."""
-    first, second = (LABEL_SOURCES[each.labels[task]].bound or each.fault is not None for each in (own, other))
+    first, second = (LABEL_SOURCES[each.labels[task]].bound or each.fault is not None for each in (setting, other))
     return other.central in ("federate", ALL) or (second and not first)
 
 
@@ -127,14 +126,14 @@ def _question(each: Difference, recipe: RunRecipe, settings: Mapping[str, Settin
             return "Does cloud FL add to edge FL?"
         home = recipe.regions[each.region].role == "pretrain"
         return f"Does federated learning help {'in the town of pretraining, too' if home else 'where nobody learned'}?"
-    own, other = (settings[arm] for arm in (MAIN, each.before_arm))
-    if (own.placement.rule, other.placement.rule) == ("vrcsp", "densest"):
+    main, other = (settings[arm] for arm in (MAIN, each.before_arm))
+    if (main.placement.rule, other.placement.rule) == ("vrcsp", "densest"):
         return "Does the placed pole beat the pole with the densest traffic?"
-    if other.placement.rule == "none" != own.placement.rule:
+    if other.placement.rule == "none" != main.placement.rule:
         return "Does the placed pole beat no pole?"
-    if (own.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
+    if (main.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
         return "What do labels of the trained road detector lose to those of an ideal one?"
-    if _is_bound(own, other, each.task):
+    if _is_bound(main, other, each.task):
         return f"What does the run lose to its arm '{each.before_arm}', which learns from ground truth?"
     return f"Does the run beat its arm '{each.before_arm}'?"
 
@@ -150,22 +149,24 @@ def findings(
     recipe: RunRecipe,
     caveats: Mapping[str, str],
 ) -> tuple[RunFinding, ...]:
-    """Return a finding for each difference of the run itself.
+    """Return the findings from the differences of the run itself.
 
-    `settings`: those of each arm. `caveats`: those of the labels, by task.
+    `settings`: those of all arms. `caveats`: those of the labels, by task.
     """
     values = {test.key: test for test in tests}
-    own = [each for each in differences if each.arm == MAIN]
-    asked = ask_all(own, recipe, settings)
-    same = [_tell_same_poles(each, arms, settings) for each in own]
+    claimed = [each for each in differences if each.arm == MAIN]
+    questions = ask_all(claimed, recipe, settings)
+    same = [_tell_same_poles(each, arms, settings) for each in claimed]
     means = [
         None if none_differs else _mean(each, sum(test.result.scenes for test in _after(each, values)))
-        for each, none_differs in zip(own, same, strict=True)
+        for each, none_differs in zip(claimed, same, strict=True)
     ]
-    families = Counter(about.kind for about in asked)
+    families = Counter(about.kind for about in questions)
     return tuple(
         replace(_finding(each, judged, about, values, none_differs, caveats, families[about.kind]), kind=about.named)
-        for each, judged, about, none_differs in zip(own, judge_asked(asked, means), asked, same, strict=True)
+        for each, judged, about, none_differs in zip(
+            claimed, judge_asked(questions, means), questions, same, strict=True
+        )
     )
 
 
@@ -177,7 +178,7 @@ def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
 
 
 def _finding(
-    each: Difference,
+    compared: Difference,
     judged: Judged | None,
     asked: ClaimQuestion,
     values: Mapping[tuple[str, str, str, str], Test],
@@ -185,39 +186,42 @@ def _finding(
     caveats: Mapping[str, str],
     family: int,
 ) -> RunFinding:
-    """Return the finding of a difference, one of `family` claims; `same`: what is said where nothing differs."""
-    tests, measure = _after(each, values), _after(each, values)[0].result.measure
-    earlier, later = (float(np.mean([test.estimate.mean for test in own])) for own in (_before(each, values), tests))
-    place, question = f"{each.region}, {each.task}", asked.question
+    """Return the finding of a difference, one of `family` claims; `same`: the sentence for arms that do not differ."""
+    tests = _after(compared, values)
+    measure = tests[0].result.measure
+    earlier, later = (float(np.mean([test.estimate.mean for test in at])) for at in (_before(compared, values), tests))
+    place = f"{compared.region}, {compared.task}"
+    question = asked.question
     loss = asked.kind == "loss"
     open_, undecided = (ESTIMATE, "") if loss else (UNDECIDED, ", so the result is inconclusive")
     if same is not None:
         return RunFinding(place, question, open_, f"{same}: there is nothing to compare{undecided}.")
-    mean, low, high = each.estimate.mean, each.estimate.low, each.estimate.high
-    trainings = "" if each.over_trainings is None else f" in the mean of {each.over_trainings.seeds} trainings"
-    told = (
-        f"On {each.region}, {measure} of {each.task} was {earlier:.3f} "
-        f"({name_stage(each.before_arm, each.before_stage)}) and {later:.3f} "
-        f"({name_stage(each.arm, each.stage)}){trainings}: {signed(mean)}"
+    mean, low, high = compared.estimate.mean, compared.estimate.low, compared.estimate.high
+    trainings = "" if compared.over_trainings is None else f" in the mean of {compared.over_trainings.seeds} trainings"
+    change = (
+        f"On {compared.region}, {measure} of {compared.task} was {earlier:.3f} "
+        f"({name_stage(compared.before_arm, compared.before_stage)}) and {later:.3f} "
+        f"({name_stage(compared.arm, compared.stage)}){trainings}: {signed(mean)}"
     )
     frames, scenes = (sum(counts) for counts in zip(*((t.result.frames, t.result.scenes) for t in tests), strict=True))
     over = f"{frames} test frames of {scenes} scenes"
     if low is None or high is None:
-        return RunFinding(place, question, open_, f"{told}, over {over}: too few scenes for an interval.")
-    rests = f" ({caveats[each.task]})" if caveats.get(each.task) else ""
-    if each.spread is None or (judged is None and not loss):
+        return RunFinding(place, question, open_, f"{change}, over {over}: too few scenes for an interval.")
+    rests = f" ({caveats[compared.task]})" if caveats.get(compared.task) else ""
+    if compared.spread is None or (judged is None and not loss):
         unknown = f"how much another training on the same frames would differ is not known{undecided}"
-        lost = None if loss or each.spread is not None else tell_loss(each.over_scenes, scenes, family)
+        lost = None if loss or compared.spread is not None else tell_loss(compared.over_scenes, scenes, family)
         if lost is not None:
             open_, unknown = NOT_HELD, f"{unknown.removesuffix(undecided)}, but {lost}: {explain_verdict(NOT_HELD)}"
-        sentence = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
+        sentence = f"{change}, 95 % interval {signed(low)} to {signed(high)} over {over} alone; {unknown}{rests}."
         return RunFinding(place, question, open_, sentence)
-    of = f"{over} and over retraining (standard deviation {each.spread.sd:.3f} of {each.spread.trainings} trainings)"
-    found = f"{told}, 95 % interval {signed(low)} to {signed(high)} over {of}"
+    spread = compared.spread
+    of = f"{over} and over retraining (standard deviation {spread.sd:.3f} of {spread.trainings} trainings)"
+    text = f"{change}, 95 % interval {signed(low)} to {signed(high)} over {of}"
     if judged is None:
-        return RunFinding(place, question, ESTIMATE, f"{found}: an estimate, no claim{rests}.")
-    said = f"{judged.describe('trainings')}: {explain_verdict(judged.verdict)}"
-    return RunFinding(place, question, judged.verdict, f"{found}; {said}{rests}.")
+        return RunFinding(place, question, ESTIMATE, f"{text}: an estimate, no claim{rests}.")
+    judgement = f"{judged.describe('trainings')}: {explain_verdict(judged.verdict)}"
+    return RunFinding(place, question, judged.verdict, f"{text}; {judgement}{rests}.")
 
 
 def _after(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) -> list[Test]:
@@ -232,9 +236,9 @@ def _before(each: Difference, values: Mapping[tuple[str, str, str, str], Test]) 
 
 
 def _tell_same_poles(each: Difference, arms: Mapping[str, ArmResult], settings: Mapping[str, Setting]) -> str | None:
-    """Describe that two arms chose the same poles, if that is why nothing differs; else return None.
+    """Describe that two arms chose the same poles, if they differ in nothing else; otherwise return None.
 
-    Arms that differ in more than the placement may come to the same figures, too: that is a difference of 0.
+    Arms that differ in more than the placement may reach the same figures, too: that is a difference of 0.
     """
     ours, other = settings[each.arm], settings[each.before_arm]
     if each.before_arm == MAIN or each.stage != each.before_stage:

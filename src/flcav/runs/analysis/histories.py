@@ -1,9 +1,9 @@
 """Learning histories: points of a finished run, the runs that measure a task's history, and gaps that stages close.
 
-For each seed and number of samples one run pretrains on so many samples and then runs the same numbers of edge and
+Per seed and number of samples, one run pretrains on so many samples and then performs the same numbers of edge and
 cloud rounds; validation after every round gives a point of the history. Towns, sizes and training are those of a
-recipe, but for test frames, of which a history has no use; budgets are as large as the runs need. Take other seeds than
-those of the runs that are planned by the history.
+recipe, except for test frames, which a history does not need; budgets are as large as the runs need. Choose other seeds
+than those of the runs that are planned by the history.
 """
 
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ from flcav.runs.results.training import average_regions
 from flcav.runs.tables import HistoryPoint
 from flcav.storage.records import select
 
-AMPLE_MB = 1e6
+AMPLE_MB = 1e6  # budgets that no run exhausts [MB]
 UNUSED = Split(scenes=2, spins=1, cavs=1)  # test frames
 ORIGIN = "history.json"
 
@@ -32,7 +32,7 @@ class HistoryOrigin(Saved):
 
     task: str
     recipe: RunRecipe
-    samples: tuple[int, ...]  # of the runs of each seed
+    samples: tuple[int, ...]  # of the runs of a seed
     edge_rounds: int
     cloud_rounds: int
     seeds: tuple[int, ...]
@@ -42,7 +42,7 @@ class HistoryOrigin(Saved):
 def history_recipes(
     recipe: RunRecipe, task: str, samples: Sequence[int], edge_rounds: int, cloud_rounds: int, seeds: Sequence[int]
 ) -> dict[str, RunRecipe]:
-    """Return the recipe of each run by the name of its folder.
+    """Return the recipes of the runs that measure a history, by the name of the folder.
 
     Raises `InputError` for a task that `recipe` lacks, and for a seed or a count that a recipe cannot have.
     """
@@ -56,31 +56,31 @@ def history_recipes(
 
 def _fix_plan(recipe: RunRecipe, task: str, seed: int, samples: int, edge_rounds: int, cloud_rounds: int) -> RunRecipe:
     """Return the recipe with this task alone, a fixed plan, ample budgets and time, and no arms."""
-    asked = recipe.model_dump(mode="json")
+    values = recipe.model_dump(mode="json")
     plan = {"samples": samples, "edge_rounds": edge_rounds, "cloud_rounds": cloud_rounds}
     placed = {} if task in recipe.placement.tasks else {"rule": "none", "tasks": []}
     splits = recipe.sized_splits.model_copy(update={"test": UNUSED})
     return parse_config(
         RunRecipe,
-        asked
+        values
         | {
             "seed": seed,
             "retrainings": 0,
             "splits": splits.model_dump(mode="json"),
-            "tasks": {task: asked["tasks"][task] | {"history": None, "plan": plan}},
+            "tasks": {task: values["tasks"][task] | {"history": None, "plan": plan}},
             "budgets_mb": {"wireless": AMPLE_MB, "wireline": AMPLE_MB},
-            "placement": asked["placement"] | placed,
+            "placement": values["placement"] | placed,
             "arms": {},
             "primary_claims": (),
             "horizon_s": None,
-            "stragglers": asked["stragglers"] if recipe.federation.network else None,
+            "stragglers": values["stragglers"] if recipe.federation.network else None,
         },
         f"the run of seed {seed} with {samples} samples",
     )
 
 
 def save_origin(recipe: RunRecipe, task: str, runs: Sequence[Run], out: Path) -> None:
-    """Write the origin of the history that `runs` made to the folder `out`, where the history is."""
+    """Write the origin of a history, measured by `runs`, to its folder `out`."""
     plans = [run.arms["main"].plan.tasks[task] for run in runs]
     HistoryOrigin(
         task=task,
@@ -99,9 +99,9 @@ def gap_closed(start: float, reached: float, end: float) -> float:
 
 
 def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
-    """Return the fraction of the gap from pretraining to centralised training that each stage closes, by its name.
+    """Return the fractions of the gap from pretraining to centralised training that stages close, by name of the test.
 
-    The reference trains on the region's own ground truth; regions without such an arm are left out.
+    The reference trains on the ground truth of the same region; regions without such an arm are left out.
     """
     values = {test.key: test.estimate.mean for test in tests}
     oracle = next((name for name, arm in recipe.arms.items() if arm.central == "federate"), None)
@@ -116,16 +116,16 @@ def gaps_closed(tests: Sequence[Test], recipe: RunRecipe) -> dict[str, float]:
 
 
 def make_history_points(result: Run, run: str) -> list[HistoryPoint]:
-    """Return a run's points of the learning history: samples, rounds, and the score they reached.
+    """Return a run's points of the learning history: samples, rounds, and the score that they reached.
 
-    The score is the mean over regions on validation frames, weighted by frames.
+    The score is the mean over regions on validation frames, weighted by the numbers of frames.
     """
     points: list[HistoryPoint] = []
-    for task, own in result.arms[MAIN].plan.tasks.items():
+    for task, planned in result.arms[MAIN].plan.tasks.items():
         for stage in (PRETRAIN, EDGE, CLOUD):
             regions = select(result.watched, task=task, stage=stage)
             frames = sum(watched.frames for watched in regions)
             for at in average_regions(regions):
-                counts = (own.edge_rounds, at.round) if stage == CLOUD else (at.round, 0)
-                points.append(HistoryPoint(task, own.samples, *counts, at.score, frames, run, result.recipe.seed))
+                counts = (planned.edge_rounds, at.round) if stage == CLOUD else (at.round, 0)
+                points.append(HistoryPoint(task, planned.samples, *counts, at.score, frames, run, result.recipe.seed))
     return points

@@ -18,24 +18,26 @@ VERDICTS = (HELD, NOT_HELD, UNDECIDED)  # of a claim
 
 
 def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
-    """Return means over the seeds of a recipe; `works`: the folder of each run's steps, with the outcomes of its tests.
+    """Return means over the seeds of a recipe; `works`: folders of the runs' steps, with the outcomes of their tests.
 
     A seed's number is the mean over its trainings. The claims that the run itself is better are judged as in its
-    findings. Simulated towns have traffic of their own for each seed. Where seeds are tested on the same
-    recorded scenes, the intervals include what these scenes vary by; those of closed gaps do not.
+    findings. Simulated towns have different traffic for every seed. Where seeds are tested on the same recorded scenes,
+    the intervals include the variation of these scenes; those of closed gaps do not.
     """
     tests = [{test.key: test for test in run.tested} for run in runs]
-    measures = [Mean(first.name, _mean_measure([own[key] for own in tests], works)) for key, first in tests[0].items()]
+    measures = [
+        Mean(first.name, _mean_measure([by_key[key] for by_key in tests], works)) for key, first in tests[0].items()
+    ]
     differences = [
         Mean(rows[0].name, _mean_difference(rows, tests, works))
         for rows in zip(*(run.differences for run in runs), strict=True)
     ]
     recipe = runs[0].recipe
     settings = resolve_settings(recipe)
-    own = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
-    asked = ask_all([runs[0].differences[number] for number in own], recipe, settings)
-    judged = judge_asked(asked, [differences[number].estimate for number in own])
-    for number, about, one in zip(own, asked, judged, strict=True):
+    numbers = [number for number, each in enumerate(runs[0].differences) if each.arm == MAIN]
+    questions = ask_all([runs[0].differences[number] for number in numbers], recipe, settings)
+    judged = judge_asked(questions, [differences[number].estimate for number in numbers])
+    for number, about, one in zip(numbers, questions, judged, strict=True):
         differences[number] = replace(differences[number], judged=one, kind=about.named)
     closed = [Mean(name, mean_over_seeds([run.gap_closed[name] for run in runs])) for name in runs[0].gap_closed]
     return Summary(
@@ -48,10 +50,10 @@ def summarise(runs: Sequence[Run], works: Sequence[Path]) -> Summary:
 
 
 def count_claims(runs: Sequence[Run]) -> tuple[ClaimCount, ...]:
-    """Return how many of the runs, which ask the same questions, decide each claim in which way."""
+    """Count the verdicts on every claim over runs that ask the same questions."""
     claims = []
     for one, *others in zip(*(run.findings for run in runs), strict=True):
-        ways = Counter(each.verdict for each in (one, *others))
+        ways = Counter(finding.verdict for finding in (one, *others))
         if one.verdict in VERDICTS:
             claims.append(ClaimCount(one.question, one.place, one.kind, *(ways[way] for way in VERDICTS)))
     return tuple(claims)
@@ -65,12 +67,14 @@ def _mean_measure(tests: Sequence[Test], works: Sequence[Path]) -> MeanOverSeeds
 def _mean_difference(
     rows: Sequence[Difference], tests: Sequence[dict[tuple[str, str, str, str], Test]], works: Sequence[Path]
 ) -> MeanOverSeeds:
-    one, values, parts = rows[0], [row.estimate.mean for row in rows], []
+    one = rows[0]
+    values = [row.estimate.mean for row in rows]
+    parts = []
     pair = ((one.arm, one.stage), (one.before_arm, one.before_stage))
     for region in one.places:
         folders = []
-        for own, work in zip(tests, works, strict=True):
-            tested = [own.get((*each, region, one.task)) or own[MAIN, each[1], region, one.task] for each in pair]
+        for by_key, work in zip(tests, works, strict=True):
+            tested = [by_key.get((*at, region, one.task)) or by_key[MAIN, at[1], region, one.task] for at in pair]
             folders.append([work / test.step for test in tested])
         parts.append(mean_of_tests(one.task, values, folders).shared)
     return mean_over_seeds(values, shared=average_shared(parts))

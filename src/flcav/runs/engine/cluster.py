@@ -1,10 +1,10 @@
 """Execution of steps by actors of a Ray cluster, on machines without shared storage.
 
-An actor is sent the folders of the steps that its step needs, which it keeps for later steps, and the step's own
-unfinished folder. The step's files are sent back when it is done and, as they are then, at its reports; that takes at
-most a twentieth of its time (`SENDING`). A killed step resumes from the last report whose files came back. Files are
-sent unchanged, linked ones too, in pieces of `PIECE_BYTES`, so that no folder is held in memory. A folder is replaced
-as a whole: it is never seen in part.
+An actor receives the folders of the steps that its step needs, which it keeps for later steps, and the unfinished
+folder of the step itself. The step's files are sent back when it is done, and whenever it reports, for at most a
+twentieth of its time (`SENDING`). A killed step resumes from the last report whose files came back. Files are sent
+unchanged, linked ones too, in pieces of `PIECE_BYTES`, so that no folder is held in memory. A folder is replaced
+atomically: it is never seen in part.
 """
 
 import contextlib
@@ -31,15 +31,15 @@ from flcav.storage.files import flush_tree
 PIECE_BYTES = 8_000_000
 SENDING = 1 / 20  # of a step's time, at most, for sending files back
 
-Stamps = dict[str, tuple[int, int]]  # of each file of a folder: time of its last change [ns], size [bytes]
+Stamps = dict[str, tuple[int, int]]  # by file of a folder: time of its last change [ns], size [bytes]
 
 
 @contextlib.contextmanager
 def open_actors(jobs: int) -> Iterator[Workers]:
-    """Yield `jobs` actors on the cluster that RAY_ADDRESS names, or on as many processors of this machine.
+    """Yield `jobs` actors on the cluster at RAY_ADDRESS, or on as many processors of this machine.
 
-    A step raises `OSError` where its actor was killed, or runs another flcav. Raises `InputError` where Ray is not
-    installed.
+    A step raises `OSError` where its actor was killed, or runs another version of flcav. Raises `InputError` where Ray
+    is not installed.
     """
     reports: Queue[Any] = Queue()
     with actor_pool(jobs, _Worker) as pool:
@@ -84,7 +84,7 @@ class _Worker:
         use_threads(1)
         self._folder = Path(tempfile.mkdtemp(prefix="flcav-steps-"))
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 - open as long as the actor lives
-        self._told: Queue[Any] = Queue(maxsize=2)  # bounded: a step waits until it is heard
+        self._messages: Queue[Any] = Queue(maxsize=2)  # bounded: a step waits until it is heard
 
     def holds(self, package: str, run: str) -> list[str]:
         """Return the steps of a run whose folders are here; raises `OSError` where flcav's hash is not `package`."""
@@ -105,19 +105,19 @@ class _Worker:
     def perform(self, run: str, pickled: bytes) -> None:
         """Perform a pickled (step, record) of a run; reports and files are queued for `hear`."""
         try:
-            step, record = pickle.loads(pickled)  # within try: the end is told even if this fails
+            step, record = pickle.loads(pickled)  # within try: the end is reported even if this fails
             folder = self._folder / run
-            sender = _Sender(folder / step.name, self._told)
+            sender = _Sender(folder / step.name, self._messages)
             try:
                 perform(step, folder, record, provenance(), sender.report)
             finally:
                 sender.send()  # of a refused federation, too, that it has removed its secrets
         finally:
-            self._told.put(None)
+            self._messages.put(None)
 
     def hear(self) -> Any:
         """Return the next message: a report, a piece of changed files, or the names of all files; None at the end."""
-        return self._told.get()
+        return self._messages.get()
 
     def leave(self) -> None:
         """Remove the temporary folder."""
@@ -127,31 +127,32 @@ class _Worker:
 class _Sender:
     """Queues a step's reports and its changed files."""
 
-    def __init__(self, folder: Path, told: Queue[Any]) -> None:
-        self._folder, self._told = folder, told
+    def __init__(self, folder: Path, messages: Queue[Any]) -> None:
+        self._folder = folder
+        self._messages = messages
         self._sent = stamps(folder)
         self._next_s = 0.0
 
     def report(self, done: int, total: int, note: str = "") -> None:
-        """Queue a report, and before it the changed files where `SENDING` allows that."""
+        """Queue a report, preceded by the changed files where `SENDING` allows."""
         if (start := time.monotonic()) >= self._next_s:
             self.send()
             end = time.monotonic()
             self._next_s = end + (end - start) / SENDING
-        self._told.put(("report", done, total, note))
+        self._messages.put(("report", done, total, note))
 
     def send(self) -> None:
-        """Queue the files that have changed since the last time, in pieces, then the names of all files."""
+        """Queue the files that have changed since the last call, in pieces, then the names of all files."""
         now = stamps(self._folder)
         with packed(self._folder, [name for name in now if self._sent.get(name) != now[name]]) as pieces:
             for piece in pieces:
-                self._told.put(("piece", piece))
-        self._told.put(("files", list(now)))
+                self._messages.put(("piece", piece))
+        self._messages.put(("files", list(now)))
         self._sent = now
 
 
 def stamps(folder: Path) -> Stamps:
-    """Return the stamp of each file below `folder`, by relative path; links are followed, empty folders end in "/"."""
+    """Return the stamps of the files below `folder`, by relative path; links are followed, empty folders end in "/"."""
     found: Stamps = {}
     for place, folders, files in os.walk(folder, followlinks=True):
         below = Path(place)
@@ -175,23 +176,23 @@ def packed(folder: Path, names: Iterable[str]) -> Iterator[Iterator[bytes]]:
 
 
 def replace_folder(folder: Path, names: Collection[str] | None, archive: IO[bytes]) -> None:
-    """Replace `folder` by the files of a ZIP archive and, of the files it held, those in `names` (None: no others).
+    """Replace `folder` by the files of a ZIP archive, keeping those of its files that are in `names` (None: none).
 
-    Files have the permissions that they were packed with. The folder is replaced as a whole: an interruption leaves the
-    old folder, or none.
+    Files keep the permissions that they were packed with. The folder is replaced atomically: an interruption leaves
+    the old folder, or none.
     """
     new = reserve_sibling(folder, "new")
     new.mkdir(parents=True)
     with zipfile.ZipFile(archive) as files:
-        for each in files.infolist():
-            if each.is_dir():
-                files.extract(each, new)
+        for member in files.infolist():
+            if member.is_dir():
+                files.extract(member, new)
                 continue
-            place = new / each.filename
+            place = new / member.filename
             place.parent.mkdir(parents=True, exist_ok=True)
-            place.touch(mode=0o600)  # secrets are nobody else's while they are written, either
-            files.extract(each, new)
-            place.chmod(each.external_attr >> 16 & 0o777)
+            place.touch(mode=0o600)  # key files must not be readable by others while they are being written
+            files.extract(member, new)
+            place.chmod(member.external_attr >> 16 & 0o777)
         here = set(files.namelist())
     for name in set(names or ()) - here:
         (new / name).parent.mkdir(parents=True, exist_ok=True)

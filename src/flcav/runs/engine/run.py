@@ -1,9 +1,9 @@
 """Execution of steps in dependency order, by processes or on a cluster, resuming from those that are finished.
 
-A step is finished when its folder has a `done.json`: value, fingerprint, hash of the code it reaches, sizes of its
-files, and provenance. One with a file that is missing or of another size is repeated.
-That is written last, so an interrupted run resumes after its last finished step; a step may also keep checkpoints of
-its own. `started.json` has fingerprint and code before, so that a checkpoint is not resumed with other arguments.
+A step is finished when its folder contains `done.json`: value, fingerprint, hash of the code it reaches, sizes of its
+files, and provenance. The file is written last, so an interrupted run resumes after its last finished step. A finished
+step is repeated if one of its files is missing or has another size. A step may also write checkpoints; `started.json`
+records fingerprint and code beforehand, so that a checkpoint is not resumed with other arguments.
 
 Steps with another fingerprint (function or arguments) need another folder. Steps begun or finished by other code are
 stale, and so are all steps that depend on them: they are refused, done again or kept, by the argument `stale`.
@@ -63,13 +63,13 @@ def run_steps(
 ) -> dict[str, Any]:
     """Run `steps`, given in topological order, in `folder`, and return their values by name.
 
-    `jobs` workers of one thread each: processes, which end with this one however it ends, or actors on the machines of
-    a Ray cluster, see `flcav.runs.engine.cluster`. Of the processes, those that no step waits for are lent to steps
-    that can make use of several, until these end. Steps begun or finished by other code are refused, done again
-    ("redo") or kept ("keep", their records unchanged); those of other arguments, and what needs them, are done again by
-    "redo" and else refused. Steps whose functions have moved to other modules since count as those of other code.
-    Raises `InputError` for what is refused, and where another process runs steps in the folder; `OSError` where a
-    worker was killed.
+    `jobs` is the number of single-threaded workers: processes, which end with this one however it ends, or actors on
+    the machines of a Ray cluster, see `flcav.runs.engine.cluster`. Idle processes are lent to steps that can use
+    several, until these end. `stale` decides on steps begun or finished by other code: they are refused, done again
+    ("redo") or kept ("keep", with their records unchanged). Steps with other arguments, and the steps that need them,
+    are done again by "redo" and otherwise refused. A step whose function has since moved to another module counts as
+    done by other code. Raises `InputError` for steps that are refused, and where another process runs steps in the
+    folder; `OSError` where a worker was killed.
     """
     return _run({folder: steps}, {folder: notify}, jobs, stale, engine)[folder]
 
@@ -83,11 +83,11 @@ def run_side_by_side(
     engine: str = "processes",
     names: Mapping[Path, str] | None = None,
 ) -> dict[Path, dict[str, Any]]:
-    """Run the steps of each folder, on the same `jobs` workers; return each folder's values as `run_steps` does.
+    """Run the steps of several folders on the same `jobs` workers; return the values by folder and step.
 
-    Earlier folders come first. A step that is finished in another of the folders, asked in the same way and by the same
-    code, is taken over; one that is under way there is waited for. `names`: prefixes of the folders' steps in `notify`
-    (None: the folders' own names).
+    Earlier folders have precedence. A step that is finished in another of the folders, with the same arguments and
+    code, is taken over; one that is under way there is waited for. `names`: prefixes of the steps in `notify`, by
+    folder (None: the folders' names). Raises as `run_steps`.
     """
 
     def named(folder: Path) -> Notify:
@@ -116,12 +116,12 @@ class _Run:
 def _run(
     steps: Mapping[Path, Sequence[Step]], notify: Mapping[Path, Notify], jobs: int, stale: str, engine: str
 ) -> dict[Path, dict[str, Any]]:
-    """Run the steps of each folder; return the values of each."""
+    """Run the steps of all folders; return their values by folder and step."""
     with contextlib.ExitStack() as locks:
         for folder in steps:
             locks.enter_context(only_writer(folder))
         sources = Sources()
-        runs = [_plan(own, folder, notify[folder], stale, sources) for folder, own in steps.items()]
+        runs = [_plan(planned, folder, notify[folder], stale, sources) for folder, planned in steps.items()]
         if any(run.waiting for run in runs):
             if engine not in ENGINES:
                 raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
@@ -133,7 +133,7 @@ def _run(
 def _plan(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sources: Sources) -> _Run:
     """Return the work that is left of `steps`, notifying of those done before; raises `InputError` as `run_steps`.
 
-    A finished step that lacks a file is left to do: its own checkpoints, and what else is whole, it goes on from.
+    A finished step that lacks a file is repeated; it resumes from its checkpoints and its intact files.
     """
     records, kept = _settle_records(steps, folder, stale, sources)
     values: dict[str, Any] = {}
@@ -150,7 +150,7 @@ def _plan(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sourc
 
 
 def _perform(runs: Sequence[_Run], workers: Workers, jobs: int) -> None:
-    """Do the work that is left on `jobs` workers; steps that are finished in another folder are taken over."""
+    """Run the remaining steps on `jobs` workers; steps that are finished in another folder are taken over."""
     by_folder = {run.folder: run for run in runs}
     running: dict[Future[Any], tuple[_Run, Step, int]] = {}
     while running or any(run.waiting for run in runs):
@@ -176,20 +176,20 @@ def _perform(runs: Sequence[_Run], workers: Workers, jobs: int) -> None:
 
 
 def _list_ready(runs: Sequence[_Run], running: Sequence[tuple[_Run, Step]]) -> list[tuple[_Run, Step]]:
-    """Return the steps that can begin: what they need is finished, and no other folder is about to do the same."""
+    """Return the steps that can begin: their inputs are finished, and no other folder is running the same step."""
     begun = [(step.name, run.records[step.name]) for run, step in running]
     ready = []
     for run in runs:
         for step in run.waiting:
-            asked = step.name, run.records[step.name]
-            if all(name in run.values for name in step.needs) and asked not in begun:
-                begun.append(asked)
+            job = step.name, run.records[step.name]
+            if all(name in run.values for name in step.needs) and job not in begun:
+                begun.append(job)
                 ready.append((run, step))
     return ready
 
 
 def _share_workers(ready: Sequence[tuple[_Run, Step]], free: int, *, lent: bool) -> Iterator[tuple[_Run, Step, int]]:
-    """Yield the steps that begin on `free` workers, and how many each has: one and, if `lent`, spare ones."""
+    """Yield the steps that begin on `free` workers, with their numbers of workers: one and, if `lent`, spare ones."""
     spare = max(0, free - len(ready)) if lent else 0
     for run, step in ready[:free]:
         more = min(step.workers - 1, spare)
@@ -210,7 +210,7 @@ def _most_waited_for_first(steps: Sequence[Step]) -> list[Step]:
 def _settle_records(
     steps: Sequence[Step], folder: Path, stale: str, sources: Sources
 ) -> tuple[dict[str, StepRecord], set[str]]:
-    """Return the record of each finished or pending step, and the stale steps.
+    """Return the records of finished and pending steps by name, and the stale steps.
 
     "redo" removes these, and those of other arguments.
     """
@@ -220,13 +220,15 @@ def _settle_records(
     outdated: dict[str, tuple[StepRecord, StepRecord]] = {}
     edited: dict[str, tuple[StepRecord, StepRecord]] = {}
     for step in steps:
-        asked = step.fingerprint({name: records[name].fingerprint for name in step.needs})
+        fingerprint = step.fingerprint({name: records[name].fingerprint for name in step.needs})
         code = sources.hashes(find_definitions((step.run, step.arguments)))
-        record = StepRecord.of(asked, code, [records[name] for name in step.needs], step.asked)
+        record = StepRecord.of(fingerprint, code, [records[name] for name in step.needs], step.asked)
         held = read_record(folder / step.name)
+        # A fingerprint contains the function's module. With equal arguments, and a recorded module that no longer
+        # exists, a different fingerprint means that the function has moved, not that the recipe was edited.
         moved = held is not None and asks_the_same(held, step.asked) and sources.lack(held.code)
         moved = moved and not edited.keys() & {*step.needs}
-        if held is not None and held.fingerprint != asked and not moved:
+        if held is not None and held.fingerprint != fingerprint and not moved:
             edited[step.name] = held, record
         elif held is not None and held.lineage != record.lineage:
             outdated[step.name] = held, record
@@ -245,11 +247,12 @@ def _settle_records(
 
 
 def stopwatch(folder: Path) -> Callable[[], float]:
-    """Return a clock of the wall time [s] spent on the run in `folder`, its earlier, interrupted starts included.
+    """Return a clock of the wall time [s] spent on the run in `folder`, including earlier, interrupted starts.
 
-    Each reading is saved; of an earlier start, the time up to its last reading counts.
+    Every reading is saved; an earlier start counts up to its last reading.
     """
-    path, start = folder / "elapsed.json", time.monotonic()
+    path = folder / "elapsed.json"
+    start = time.monotonic()
     kept: Any = read_json(path) if path.exists() else {"elapsed_s": 0.0}
     earlier = kept["elapsed_s"]
 

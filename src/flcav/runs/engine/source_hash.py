@@ -1,10 +1,10 @@
 """Hash of the code that a step's value depends on: the definitions reachable from its function by static analysis.
 
-Only syntax trees are read; nothing is imported. A definition is what one statement at the top of a module binds: a
+Only syntax trees are read; nothing is imported. A definition is what one top-level statement of a module binds: a
 function, a class, a constant. It reaches the definitions that it mentions: names of its module or imported anywhere in
 it, also through packages that re-export them (`PLACES` of lazy ones), and strings `module:NAME`. Layout, comments,
 docstrings, imports for type checkers and blocks under `__name__ == "__main__"` do not count. Not covered are other
-names looked up by strings, data files, and other packages, whose versions are in `flcav.runs.provenance`.
+names looked up by strings, data files, and third-party packages, whose versions are in `flcav.runs.provenance`.
 """
 
 import ast
@@ -33,7 +33,7 @@ PACKAGES = {"flcav": Path(flcav.__file__).parent}
 
 
 class Sources:
-    """Sources of `packages` (name -> folder), and of single modules beside them, each read once."""
+    """Source code of `packages` (name -> folder) and of single modules outside them; a module is read once."""
 
     def __init__(self, packages: Mapping[str, Path] = PACKAGES) -> None:
         self._packages = packages
@@ -42,17 +42,18 @@ class Sources:
         self._of_starts = functools.cache(self._hash_reached)  # steps of one kind start at the same definitions
 
     def hashes(self, starts: Iterable[Place]) -> dict[str, str]:
-        """Return, by module, a hash of the definitions in it that are reachable from `starts`."""
+        """Return the hash of the definitions reachable from `starts`, by module."""
         return self._of_starts(frozenset(starts))
 
     def lack(self, modules: Iterable[str]) -> bool:
-        """Return whether one of the modules is no longer here: it has moved, or another one has its content."""
+        """Return whether one of the modules no longer exists: it was renamed, or its content has moved to another."""
         return any(self._module(name) is None for name in modules)
 
     @pause_collector()  # syntax trees are all kept
     def _hash_reached(self, starts: frozenset[Place]) -> dict[str, str]:
         reached: dict[str, set[ast.stmt]] = defaultdict(set)
-        left, seen = [*starts], set[Place]()
+        left = [*starts]
+        seen = set[Place]()
         while left:
             place = name, wanted = left.pop()
             if place in seen or (module := self._module(name)) is None:
@@ -67,10 +68,10 @@ class Sources:
 
     def _digest(self, name: str, statements: Iterable[ast.stmt]) -> str:
         """Return the hash of statements of a module, and of what they import from outside these sources."""
-        ordered = sorted(statements, key=lambda each: each.lineno)
-        mentioned = {place for each in ordered for place in self._reach(name, each)}
+        ordered = sorted(statements, key=lambda node: node.lineno)
+        mentioned = {place for node in ordered for place in self._reach(name, node)}
         return digest(
-            [[_unparse(each) for each in ordered], sorted(p for p in mentioned if self._module(p[0]) is None)]
+            [[_unparse(node) for node in ordered], sorted(p for p in mentioned if self._module(p[0]) is None)]
         )
 
     def _resolve_mentions(self, name: str, statement: ast.stmt) -> set[Place]:
@@ -87,7 +88,7 @@ class Sources:
         return {place for target in targets for place in self._resolve(*target)}
 
     def _resolve(self, name: str, path: str) -> Iterator[Place]:
-        """Yield the definitions that a target names, itself where it is outside these sources."""
+        """Yield the definitions that a target names; the target itself if it is outside these sources."""
         part, _, rest = path.partition(".")
         if (module := self._module(name)) is None:
             yield name, path
@@ -109,13 +110,13 @@ class Sources:
             folder = self._packages[top].joinpath(*parts)
             path = next((path for path in (folder / "__init__.py", folder.with_suffix(".py")) if path.is_file()), None)
         else:
-            path = _find_own(name)
+            path = _find_users(name)
         package = name if path is not None and path.name == "__init__.py" else name.rpartition(".")[0]
         return None if path is None else _parse(package, path.read_text())
 
 
-def _find_own(name: str) -> Path | None:
-    """Return the file of a user's own module; None for one of Python or of an installed package."""
+def _find_users(name: str) -> Path | None:
+    """Return the file of a user's module; None for one of Python or of an installed package."""
     loaded = getattr(sys.modules.get(name), "__file__", None) or ""
     if not loaded and name.isidentifier() and name != "__main__":
         loaded = getattr(importlib.util.find_spec(name), "origin", None) or ""
@@ -124,7 +125,7 @@ def _find_own(name: str) -> Path | None:
 
 
 def find_definitions(value: Any) -> Iterator[Place]:
-    """Yield the definitions of all functions and classes in `value`, its fields, items and bound arguments included.
+    """Yield the definitions of all functions and classes in `value`, including its fields, items and bound arguments.
 
     Keys of mappings count: `module:NAME` may be one, with settings. Fields of a dataclass with `compare=False` are left
     out.
@@ -145,13 +146,13 @@ def find_definitions(value: Any) -> Iterator[Place]:
         for item in value:
             yield from find_definitions(item)
     else:
-        counted = [each.name for each in fields(value) if each.compare] if is_dataclass(value) else []
+        counted = [field.name for field in fields(value) if field.compare] if is_dataclass(value) else []
         names = type(value).model_fields if isinstance(value, Config) else counted
         yield from find_definitions([type(value), *(getattr(value, name) for name in names)])
 
 
 def package_hash() -> str:
-    """Return a hash of all source files of flcav, to tell whether two machines run the same code."""
+    """Return the hash of all source files of flcav, by which machines check that they run the same code."""
     folder = PACKAGES["flcav"]
     return digest({path.relative_to(folder).as_posix(): path.read_text() for path in folder.rglob("*.py")})
 
@@ -168,9 +169,9 @@ class _Module(ast.NodeTransformer):
             if isinstance(node, ast.Import | ast.ImportFrom):
                 bound = {""} & _list_mentions(node)
             else:
-                bound = _bound(node) or {"", *(each for part in ast.walk(node) for each in _bound(part))}
-            for each in bound:
-                self.defined.setdefault(each, []).append(node)
+                bound = _bound(node) or {"", *(name for part in ast.walk(node) for name in _bound(part))}
+            for name in bound:
+                self.defined.setdefault(name, []).append(node)
             if bound == {"PLACES"} and isinstance(node, ast.Assign):
                 self.places = ast.literal_eval(node.value)
 
@@ -217,20 +218,20 @@ def _bound(node: ast.AST) -> set[str]:
 @functools.lru_cache(maxsize=1 << 16)
 def _list_mentions(node: ast.AST) -> set[str]:
     """Return the names in a statement, with their attributes, strings `module:NAME`, and "" for `import *`."""
-    found: set[str] = set()
+    mentions: set[str] = set()
     left = [node]
     while left:
-        each, attributes = left.pop(), ""
-        while isinstance(each, ast.Attribute):
-            each, attributes = each.value, f".{each.attr}{attributes}"
-        if isinstance(each, ast.Name):
-            found.add(each.id + attributes)
-        elif isinstance(each, ast.Constant) and isinstance(each.value, str) and NAMED.fullmatch(each.value):
-            found.add(each.value)
-        elif isinstance(each, ast.alias) and each.name == "*":
-            found.add("")
-        left += ast.iter_child_nodes(each)
-    return found
+        part, attributes = left.pop(), ""
+        while isinstance(part, ast.Attribute):
+            part, attributes = part.value, f".{part.attr}{attributes}"
+        if isinstance(part, ast.Name):
+            mentions.add(part.id + attributes)
+        elif isinstance(part, ast.Constant) and isinstance(part.value, str) and NAMED.fullmatch(part.value):
+            mentions.add(part.value)
+        elif isinstance(part, ast.alias) and part.name == "*":
+            mentions.add("")
+        left += ast.iter_child_nodes(part)
+    return mentions
 
 
 _unparse = functools.lru_cache(maxsize=1 << 16)(ast.unparse)

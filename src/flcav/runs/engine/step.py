@@ -1,7 +1,7 @@
 """A step of a workflow, the context it runs in, and the record of its execution on disk.
 
-The record says what was asked (function, arguments, inputs), which decides whether a folder is the right one, and by
-which code it was done, which decides whether its result still holds.
+The record states what was computed (function, arguments, inputs), which decides whether a folder is the right one, and
+by which code, which decides whether its result still holds.
 """
 
 import hashlib
@@ -28,20 +28,20 @@ NAMED = 3  # most steps, or modules, that a message lists
 
 
 def print_steps(step: str, done: int, total: int, note: str) -> None:
-    """Write each finished step on stderr where somebody watches: the `Notify` of Python."""
+    """Report finished steps on stderr if it is a terminal: the default `Notify` of Python programs."""
     if note in FINISHED:
         print_progress(1, 1, f"{step} {note}")
 
 
 def ignore_steps(step: str, done: int, total: int, note: str) -> None:
-    """Do nothing: the default `Notify`, without a display."""
+    """Report nothing: the `Notify` without a display."""
 
 
 @dataclass(frozen=True)
 class Work:
     """The context that a step runs in."""
 
-    folder: Path  # the step's own
+    folder: Path  # of the step
     inputs: Mapping[str, Path]  # folders of the steps it needs
     report: Report  # to be called when the folder's files are a checkpoint
 
@@ -62,22 +62,22 @@ class Step:
     workers: int = 1  # most that it can make use of; where several, it takes how many they are as `processes`
 
     def on(self, workers: int) -> "Step":
-        """Return the step with so many workers."""
+        """Return the step to be run by so many workers."""
         return self if workers == 1 else replace(self, means={**self.means, "processes": workers})
 
     @property
     def asked(self) -> dict[str, Json]:
-        """Return the arguments as JSON values, by dotted name, to say in which of them two steps differ."""
+        """The arguments as JSON values by dotted name, to report in which of them two steps differ."""
         values = json.loads(json.dumps(self.arguments, default=_fields))
         return {name.removeprefix("settings.").removeprefix("recipe."): value for name, value in flatten_record(values)}
 
     def fingerprint(self, inputs: Mapping[str, str]) -> str:
-        """Return a hash of what is asked: function, arguments, and the fingerprints of the needed steps (`inputs`).
+        """Return the hash of function, arguments, and fingerprints of the needed steps (`inputs`).
 
         Raises `TypeError` for an argument that is neither a JSON value nor a record of them.
         """
-        asked = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
-        return digest(asked, default=_named)
+        identity = [self.run.__module__, self.run.__qualname__, self.arguments, {n: inputs[n] for n in self.needs}]
+        return digest(identity, default=_named)
 
 
 def _named(value: Any) -> list[Any]:
@@ -90,7 +90,7 @@ def _fields(value: Any) -> dict[str, Any]:
     if isinstance(value, Config):
         return value.model_dump(mode="json")
     if is_dataclass(value):
-        return {each.name: getattr(value, each.name) for each in fields(value)}
+        return {member.name: getattr(value, member.name) for member in fields(value)}
     raise TypeError(f"{value!r} cannot be a step's argument: it is neither a JSON value nor a record of them")
 
 
@@ -121,10 +121,10 @@ def digest(value: Any, **how: Any) -> str:
 
 
 def read_record(folder: Path) -> StepRecord | None:
-    """Read the record by which the step in `folder` was done or, if it is not, begun; None where it was neither.
+    """Read the record of a finished step in `folder`, or of one that was begun; None where it was neither.
 
-    Without recorded code, `code` is empty and `lineage` is "". Where that by which it was done is damaged, it is the
-    one by which it was begun. Raises `InputError` for a file that is no record.
+    Without recorded code, `code` is empty and `lineage` is "". If the record of the finished step is damaged, the one
+    written at its start is returned. Raises `InputError` for a file that is not a record.
     """
     for path in (folder / DONE, folder / STARTED):
         if path.exists():
@@ -144,14 +144,14 @@ def read_value(folder: Path) -> Any:
 
 
 def write_started(folder: Path, record: StepRecord) -> None:
-    """Write the record of the step in `folder` that begins."""
+    """Write the record of the step that begins in `folder`."""
     write_json(folder / STARTED, asdict(record))
 
 
 def write_done(folder: Path, record: StepRecord, value: Any, provenance: Mapping[str, Any]) -> None:
-    """Write record, value and provenance of the step in `folder`, and the sizes of its files; it is finished with that.
+    """Mark the step in `folder` as finished: write its record, value, provenance, and the sizes of its files.
 
-    The files are on the disk before.
+    Its files are flushed to disk first, so that no crash leaves a finished step with missing bytes.
     """
     flush_tree(folder)
     files = {
@@ -163,10 +163,10 @@ def write_done(folder: Path, record: StepRecord, value: Any, provenance: Mapping
 
 
 def find_damage(folder: Path) -> str | None:
-    """Return the name of a file of a finished step that is missing, or not as long as it was; None where none is.
+    """Return the name of a file of a finished step that is missing or has another size; None if all are intact.
 
-    Its record counts, too: one that cannot be read is damaged. Of a step that was finished before sizes were recorded,
-    the record alone is looked at.
+    A record that cannot be read counts as damaged. For a step that was finished before sizes were recorded, only the
+    record is checked.
     """
     try:
         done: Any = read_json(folder / DONE)
@@ -181,7 +181,7 @@ def find_damage(folder: Path) -> str | None:
 
 
 def changed_modules(held: StepRecord, wanted: StepRecord) -> list[str]:
-    """Return the modules whose reached code differs between two records; none where `held` does not know its code."""
+    """Return the modules whose reached code differs between two records; none where `held` has no recorded code."""
     if not held.code:
         return []
     return [name for name in sorted({*held.code, *wanted.code}) if held.code.get(name) != wanted.code.get(name)]
@@ -195,14 +195,14 @@ def make_stale_error(folder: Path, outdated: Mapping[str, tuple[StepRecord, Step
     changed = [name for name in outdated if modules[name] and name not in moved]
     after = [name for name in outdated if name not in unknown and name not in (*changed, *moved)]
     which = sorted({module for name in changed for module in modules[name]})
-    told = [
+    causes = [
         f"{_some(moved)} by an earlier flcav, whose steps have moved since" if moved else "",
         f"{_some(changed)} by other code ({_some(which)} changed)" if changed else "",
         f"{_some(unknown)} by code that was not recorded" if unknown else "",
         f"{_some(after)} on top of other code" if after else "",
     ]
     return InputError(
-        f"{folder}: did {', '.join(filter(None, told))}; choose another folder, or --stale redo to do that again, or "
+        f"{folder}: did {', '.join(filter(None, causes))}; choose another folder, or --stale redo to do that again, or "
         "--stale keep to take it as it is"
     )
 
@@ -210,7 +210,7 @@ def make_stale_error(folder: Path, outdated: Mapping[str, tuple[StepRecord, Step
 def make_edited_error(
     folder: Path, edited: Mapping[str, tuple[StepRecord, StepRecord]], steps: Sequence[Step]
 ) -> InputError:
-    """Return the error for a folder some of whose `steps` are of other arguments: records (held, wanted) by step."""
+    """Return the error for a folder in which some `steps` had other arguments; `edited`: records (held, wanted)."""
     changes: dict[str, list[str]] = {}  # steps by how their arguments differ
     after = []
     for step in steps:
@@ -220,21 +220,24 @@ def make_edited_error(
                 after.append(step.name)
             else:
                 changes.setdefault(_some(differences), []).append(step.name)
-    told = [
+    reasons = [
         f"{_some(names)} by another configuration{f' ({fields})' if fields else ''}"
         for fields, names in changes.items()
     ]
-    told += [f"{_some(after)} on top of that"] if after else []
+    reasons += [f"{_some(after)} on top of that"] if after else []
     return InputError(
-        f"{folder}: did {'; '.join(told)}; choose another folder, or --stale redo to do that again and keep "
+        f"{folder}: did {'; '.join(reasons)}; choose another folder, or --stale redo to do that again and keep "
         f"{plural(len(steps) - len(edited), 'other step')}"
     )
 
 
 def asks_the_same(held: StepRecord, wanted: Mapping[str, Json]) -> bool:
     """Return whether two steps have the same arguments; a missing argument equals None."""
-    told = [{name: each for name, each in (own or {}).items() if each is not None} for own in (held.asked, wanted)]
-    return held.asked is not None and told[0] == told[1]
+    given, expected = (
+        {name: value for name, value in (arguments or {}).items() if value is not None}
+        for arguments in (held.asked, wanted)
+    )
+    return held.asked is not None and given == expected
 
 
 def describe_changes(held: StepRecord, wanted: StepRecord) -> list[str]:
@@ -252,15 +255,15 @@ def _said(value: Any) -> str:
 
 
 def _some(names: Sequence[str]) -> str:
-    """Return the first `NAMED` names in words, and how many more there are."""
+    """Return the first `NAMED` names as text, and the number of others."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more} more" if more > 0 else "")
 
 
 def take_over(folder: Path, record: StepRecord, others: Iterable[Path]) -> bool:
-    """Make `folder` a step that is finished in one of the folders `others` by the same record; False where none is.
+    """Link a finished step with the same record from one of the folders `others` to `folder`; False if there is none.
 
-    Files are linked, not copied, and the folder appears at once. A step that has begun is left to go on.
+    Files are hard-linked, not copied, and the folder appears atomically. A step that has begun is left alone.
     """
     for other in () if folder.exists() else others:
         if (other / DONE).exists() and read_record(other) == record:
@@ -272,7 +275,7 @@ def take_over(folder: Path, record: StepRecord, others: Iterable[Path]) -> bool:
 
 
 def remove(folder: Path) -> None:
-    """Remove a step's folder, or the link to it; the folder is renamed first, so that it disappears at once."""
+    """Remove a step's folder, or the link to it; the folder is renamed first, so that it disappears atomically."""
     if folder.is_symlink():
         folder.unlink()
         return

@@ -1,4 +1,4 @@
-"""Workers of steps: what they share, and processes of one thread each on this machine."""
+"""Workers of steps: their common interface, and single-threaded processes on this machine."""
 
 import contextlib
 from collections.abc import Callable, Iterator, Mapping
@@ -20,7 +20,7 @@ _process: Any = None  # in a worker process: provenance of its results, and `Wor
 
 @dataclass(frozen=True)
 class Workers:
-    """The workers of steps, which may be steps of several runs."""
+    """The workers that perform the steps of one or several runs."""
 
     submit: Callable[[Path, Step, StepRecord], Future[Any]]  # folder of the run, step, record -> value of the step
     reports: Any  # queue of (folder of the run, name of the step, done, total, note)
@@ -29,23 +29,23 @@ class Workers:
 
 @contextlib.contextmanager
 def open_step_processes(jobs: int) -> Iterator[Workers]:
-    """Yield `jobs` processes, which end with this one, however it ends; raises `OSError` where one was killed."""
+    """Yield `jobs` worker processes, which end with this one however it ends; raises `OSError` where one was killed."""
     reports = start_server().Queue()
     with process_pool(jobs, _begin, replace(provenance(), threads=1), reports) as pool:
         yield Workers(partial(pool.submit, _perform), reports, lent=True)
 
 
 def perform(step: Step, folder: Path, record: StepRecord, made_by: Provenance, report: Report) -> Any:
-    """Execute a step in its folder below `folder`, where those it needs lie too; write its record, return its value."""
-    own = folder / step.name
-    with only_writer(own):  # as long as this process lives, which the one that asked may not
-        own.mkdir(parents=True, exist_ok=True)
+    """Perform a step in its folder below `folder`, next to those it needs; write its record and return its value."""
+    own_folder = folder / step.name
+    with only_writer(own_folder):  # locked by this process, which may outlive the one that submitted the step
+        own_folder.mkdir(parents=True, exist_ok=True)
         report(0, 1, "")
-        write_started(own, record)
+        write_started(own_folder, record)
         needs = {name: folder / name for name in step.needs}
-        value = step.run(Work(own, needs, report), **step.arguments, **step.means)
-        write_done(own, record, value, asdict(replace(made_by, seed=find_seed(step.arguments))))
-        return read_value(own)
+        value = step.run(Work(own_folder, needs, report), **step.arguments, **step.means)
+        write_done(own_folder, record, value, asdict(replace(made_by, seed=find_seed(step.arguments))))
+        return read_value(own_folder)
 
 
 def find_seed(arguments: Any) -> int | None:
@@ -53,7 +53,7 @@ def find_seed(arguments: Any) -> int | None:
     values: Any = dict(arguments) if isinstance(arguments, Mapping | Config) else getattr(arguments, "__dict__", {})
     if isinstance(seed := values.get("seed"), int):
         return seed
-    return next((seed for each in values.values() if (seed := find_seed(each)) is not None), None)
+    return next((seed for value in values.values() if (seed := find_seed(value)) is not None), None)
 
 
 def _begin(made_by: Provenance, reports: Any) -> None:

@@ -1,1 +1,1 @@
-"""Extras of a run: each folder is one, with its part of the recipe, checks, steps, rows and section of the report."""
+"""Extras of a run: a folder per extra, with its part of the recipe, checks, steps, rows and section of the report."""

@@ -1,4 +1,4 @@
-"""Ground truth with one fault of the vehicles' own labels at a time, which shows what each fault costs."""
+"""Ground-truth labels with one fault of the vehicles' labels at a time, to measure what this fault costs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -16,16 +16,16 @@ from flcav.runs.frames import Frames
 from flcav.runs.recipe import Fault
 
 OVERLAP = 0.3  # bird's-eye IoU from which on a label is of an object, however wrong its box
-FAR_M = 24.0  # distance from which on an object is far: half of what the demo's network reaches
+FAR_M = 24.0  # distance from which on an object is far [m]: half of the range of the demo's network
 OCCLUDED = 0.5  # hidden share from which on an object is occluded
 
-Occlusion = NDArray[np.float64]  # (B,) hidden share of each object of a sample in [0, 1]; NaN: not known
+Occlusion = NDArray[np.float64]  # (B,) hidden shares of a sample's objects in [0, 1]; NaN: not known
 
 
 def read_occlusion(
     split: Frames, frames: Sequence[int], region: str, config: SecondConfig
 ) -> dict[str, list[Occlusion]]:
-    """Return the hidden share of the objects of each of `frames`, in the order of `annotated_samples`, by vehicle."""
+    """Read the hidden shares of the objects in `frames`, in the order of `annotated_samples`, by "region/vehicle"."""
     found: dict[str, list[Occlusion]] = {}
     for i in frames:
         frame = split.data.frame(i)
@@ -40,22 +40,22 @@ def give_fault(
     hidden: Mapping[str, Sequence[Occlusion]],
     fault: Fault,
 ) -> dict[str, list[Sample]]:
-    """Return samples with ground truth as labels but for one fault of `labelled`, the same frames; all by vehicle.
+    """Return the samples of `truth` with one fault of the labels in `labelled`; both have the same frames, by vehicle.
 
-    hidden: shares of the objects of `truth`, see `read_occlusion`.
+    `hidden`: hidden shares of the objects of `truth`, see `read_occlusion`.
     """
     return {
-        name: [change_labels(*each, fault) for each in zip(own, labelled[name], hidden[name], strict=True)]
-        for name, own in truth.items()
+        name: [change_labels(*sample, fault) for sample in zip(samples, labelled[name], hidden[name], strict=True)]
+        for name, samples in truth.items()
     }
 
 
 def change_labels(truth: Sample, labelled: Sample, hidden: Occlusion, fault: Fault) -> Sample:
-    """Return the sample of `truth` with one fault of the labels of the same sweep.
+    """Return the sample of `truth` with one fault of the labels of the same sweep, boxes in the LiDAR frame.
 
-    missed: objects without a label are background; unsure: they are neutral; range, occlusion: those of them are
-    background that are far, or occluded; false: labels of nothing are added; boxes: labelled objects have the boxes of
-    their labels; presence: size and pose of no object are learned.
+    missed: objects without a label become background; unsure: they become neutral; range, occlusion: only far or
+    occluded ones become background; false: labels without an object are added; boxes: labelled objects get the boxes
+    of their labels; presence: the size and pose of no object is learned.
     """
     if fault == "presence":
         return replace(truth, exact=np.zeros(len(truth.boxes), bool))
@@ -79,5 +79,5 @@ def change_labels(truth: Sample, labelled: Sample, hidden: Occlusion, fault: Fau
 
 
 def _join(first: Boxes, second: Boxes) -> Boxes:
-    """Return the boxes of both, without scores."""
-    return concatenate([Boxes.from_array(each.array(), np.asarray(each.label)) for each in (first, second)])
+    """Concatenate boxes, dropping their scores."""
+    return concatenate([Boxes.from_array(boxes.array(), np.asarray(boxes.label)) for boxes in (first, second)])

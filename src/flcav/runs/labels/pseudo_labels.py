@@ -25,17 +25,17 @@ from flcav.runs.labels.sightings import navigate
 from flcav.runs.recipe import EDGE
 from flcav.sensors.frame import Frame
 
-Spin = tuple[str, int]  # scene, and number in the scene
+Spin = tuple[str, int]  # scene, and number of the LiDAR's revolution in the scene
 LabelFrame = Callable[[int, Frame, Sequence[RoadView]], Sample]  # labels a frame, see `label_frames`
 
-EXACT = NavigationErrors()
+EXACT = NavigationErrors()  # poses without errors
 PRECISION = 0.9  # least precision of pseudo-labels, on validation frames
 
 
 def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
     """Return the score threshold of pseudo-labels: the lowest with a precision of `PRECISION` on validation frames.
 
-    Detections are right that match a target at IoU 0.5. Where no score has that precision, the threshold is 1.
+    A detection is right if it matches a target at IoU 0.5. Where no score has that precision, the threshold is 1.
     """
     frames = [split.data.frame(i) for split in splits for i in split.vehicles]
     truths = [asked_of(frame, network.config) for frame in frames]
@@ -43,11 +43,11 @@ def fit_label_threshold(network: Second, splits: Sequence[Frames]) -> float:
 
 
 def find_precise_score(found: Sequence[Boxes], truths: Sequence[FrameTruth], least: float) -> float:
-    """Return the lowest score from which on a share `least` of the boxes found in frames match a target at IoU 0.5.
+    """Return the lowest score threshold at which the precision of detections, at IoU 0.5, is at least `least`.
 
-    It is 1 where no score has that precision.
+    `found` and `truths` are by frame. The threshold is 1 where no score has that precision.
     """
-    matches = match(found, [t.targets for t in truths], [t.neutral for t in truths], 0.5)
+    matches = match(found, [truth.targets for truth in truths], [truth.neutral for truth in truths], 0.5)
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
     good = np.flatnonzero(precision >= least)
     return float(matches.score[good[-1]]) if len(good) else 1.0
@@ -56,11 +56,11 @@ def find_precise_score(found: Sequence[Boxes], truths: Sequence[FrameTruth], lea
 def annotated_samples(
     task: Task, config: Any, split: Frames, frames: Sequence[int], region: str
 ) -> dict[str, Sequence[Any]]:
-    """Return each vehicle's samples with their recorded annotations, by "region/vehicle"."""
-    own: dict[str, list[int]] = {}
+    """Return the vehicles' samples with their recorded annotations, by "region/vehicle"."""
+    numbers_by_vehicle: dict[str, list[int]] = {}
     for i in frames:
-        own.setdefault(f"{region}/{split.data.keys[i].agent}", []).append(i)
-    return {name: task.samples(split.data, config, numbers) for name, numbers in own.items()}
+        numbers_by_vehicle.setdefault(f"{region}/{split.data.keys[i].agent}", []).append(i)
+    return {name: task.samples(split.data, config, numbers) for name, numbers in numbers_by_vehicle.items()}
 
 
 def pseudo_label_samples(
@@ -75,18 +75,18 @@ def pseudo_label_samples(
     trained: bool = False,
     poses: PoseSource = EXACT,
 ) -> dict[str, list[Sample]]:
-    """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
+    """Return the vehicles' sweeps with pseudo-labels, by "region/vehicle".
 
-    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, by
-    the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
-    downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by the `poses`
-    of its navigation.
+    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the roadside sensors on
+    `poles`, which come from the package's road detector if `trained`, else from an ideal one. Vehicles receive the
+    latter in messages, which enter `book` as downlinks; stage III passes no ledger, since its labels are those of
+    stage II. A vehicle transforms them into its frame by the `poses` of its navigation.
     """
     relief = DatasetGround(split.data).relief
 
-    def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
+    def label(i: int, frame: Frame, views: Sequence[RoadView]) -> Sample:
         (detections,) = detect_in(network, [frame], score_threshold=threshold)
-        return label_sample(frame, detections, told, network.config, choose_lidar(frame), relief)
+        return label_sample(frame, detections, views, network.config, choose_lidar(frame), relief)
 
     return label_frames(label, split, frames, poles, region, report, book, trained, poses)
 
@@ -102,22 +102,23 @@ def label_frames(
     trained: bool = False,
     poses: PoseSource = EXACT,
 ) -> dict[str, list[Sample]]:
-    """Return each vehicle's samples, by "region/vehicle", as `label` makes them.
+    """Return the vehicles' samples as `label` makes them, by "region/vehicle".
 
-    It is given a frame's number, the frame with the pose of the vehicle's navigation, and what road sensors see of it.
-    See `pseudo_label_samples` for the other arguments.
+    `label` receives a frame's number, the frame with the pose of the vehicle's navigation in place of the true one,
+    and the views of roadside sensors at its spin. See `pseudo_label_samples` for the other arguments.
     """
     data = split.data
     views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
     samples: dict[str, list[Sample]] = {}
     for done, i in enumerate(frames):
         key, frame = data.keys[i], data.frame(i)
-        told, name = [*views.get((key.scene, key.index), {}).values()], f"{region}/{key.agent}"
+        seen = [*views.get((key.scene, key.index), {}).values()]
+        name = f"{region}/{key.agent}"
         if book is not None:
             about: Any = {"stage": EDGE, "task": OBJECTS.name, "link": "wireless", "direction": "down", "client": name}
-            told = [RoadView.from_message(send_message(book, view.message(), **about)) for view in told]
+            seen = [RoadView.from_message(send_message(book, view.message(), **about)) for view in seen]
         known = replace(frame, world_from_agent=navigate(data, i, poses)[0])
-        samples.setdefault(name, []).append(label(i, known, told))
+        samples.setdefault(name, []).append(label(i, known, seen))
         report(done, len(frames), "labels")
     return samples
 
@@ -125,7 +126,10 @@ def label_frames(
 def road_views(
     split: Frames, poles: Sequence[int], trained: bool, spins: Collection[Spin]
 ) -> dict[Spin, dict[int, RoadView]]:
-    """Return what sensors see in `spins`, by spin and number of the pole, of `poles`: see `pseudo_label_samples`."""
+    """Return the views of the sensors on `poles` in `spins`, by spin and number of the pole.
+
+    `trained`: by the package's road detector instead of an ideal one.
+    """
     ground = DatasetGround(split.data)
     views: dict[Spin, dict[int, RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
@@ -142,7 +146,7 @@ def road_views(
 
 
 def select_frames_near(split: Frames, sites: np.ndarray, range_m: float) -> tuple[int, ...]:
-    """Return the vehicles' frames taken within `range_m` of one of the sites (P, 2), world [m]; without sites, all."""
+    """Return the vehicles' frames within `range_m` [m] of a site (P, 2), world frame [m]; without sites, all frames."""
     if not len(sites):
         return split.vehicles
 

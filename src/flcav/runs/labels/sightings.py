@@ -1,4 +1,4 @@
-"""Sightings of vehicles: their poses and clocks by their own navigation, and the boxes that they detect."""
+"""Sightings of vehicles: poses and clocks by their navigation, and the boxes that they detect."""
 
 from collections.abc import Mapping
 from functools import lru_cache
@@ -21,25 +21,27 @@ from flcav.sensors.frame import Frame
 from flcav.statistics.streams import stream
 from flcav.world.map.town import Town
 
-KEPT_DRIVES = 64  # whose estimated poses are kept
+KEPT_DRIVES = 64  # drives whose estimated poses are cached
 
 
 def navigate(data: Dataset, i: int, how: PoseSource) -> tuple[Array, Navigation]:
-    """Return the pose (4, 4) of the vehicle of frame `i` by its navigation, and what it states of its accuracy.
+    """Return the pose of the vehicle in frame `i` by its navigation, and the accuracy that it states.
 
-    Estimated poses need the navigation log of the drive; raises `InputError` where there is none, or it is damaged.
+    The pose is world_from_agent (4, 4) [m]. Estimated poses need the navigation log of the drive; raises `InputError`
+    where there is none, or it is damaged.
     """
     key = data.keys[i]
     if how == ESTIMATED:
         number, drive = _estimate(data, key.scene, key.agent)
         position_m, heading_rad = drive.deviation[number[i]].tolist()
         return drive.world_from_agent[number[i]], state_accuracy(position_m, heading_rad)
+    # Errors depend on the recording alone, not on the run: arms that are compared see the same ones.
     rng = stream(0, "navigation", str(data.manifest.recipe.get("seed")), key.scene, key.index, key.agent)
     return how.navigate(data.world_from_agent(i), rng), how.stated
 
 
 def draw_clock_offset(data: Dataset, i: int, how: PoseSource) -> float:
-    """Return the clock offset [s] of the vehicle of frame `i`, positive if ahead; 0 with a GNSS receiver."""
+    """Return the clock offset [s] of the vehicle in frame `i`, positive if ahead; 0 with a GNSS receiver."""
     if how == ESTIMATED:
         return 0.0
     key = data.keys[i]
@@ -50,7 +52,7 @@ def draw_clock_offset(data: Dataset, i: int, how: PoseSource) -> float:
 def make_sighting(
     network: Second, data: Dataset, i: int, how: Distillation, poses: PoseSource
 ) -> tuple[Sighting, Boxes]:
-    """Return the message of the vehicle of frame `i`, and its detections in the LiDAR frame."""
+    """Return the message of the vehicle in frame `i` (vehicle frame), and its detections in the LiDAR frame."""
     key, frame = data.keys[i], data.frame(i)
     (found,) = detect_in(network, [frame], score_threshold=TOLD)
     boxes = found.transform(frame.assumed.agent_from_sensor[choose_lidar(frame)])
@@ -59,7 +61,7 @@ def make_sighting(
 
 
 def find_told_posts(frame: Frame, how: Distillation) -> Array:
-    """Return the feet (L, 2) x, y [m, vehicle frame] of the posts that a vehicle reports; none without a pose graph."""
+    """Return the feet (L, 2) of the posts that a vehicle reports, vehicle frame [m]; none without a pose graph."""
     if not how.pose_graph:
         return np.zeros((0, 2))
     lidar = choose_lidar(frame)
@@ -68,8 +70,12 @@ def find_told_posts(frame: Frame, how: Distillation) -> Array:
 
 @lru_cache(maxsize=KEPT_DRIVES)
 def _estimate(data: Dataset, scene: str, agent: str) -> tuple[Mapping[int, int], MotionEstimate]:
-    """Return the estimated poses of a vehicle's frames in a scene, and frame -> row in them."""
-    path, town = data.folder / navigation_path(scene), _find_town(data)
+    """Return the rows by frame number, and the estimated poses, of a vehicle's drive through a scene.
+
+    They are estimated from the whole drive at once, and cached for its other frames.
+    """
+    path = data.folder / navigation_path(scene)
+    town = _find_town(data)
     log = data.navigation_logs(scene).get(agent)
     if log is None:
         raise InputError(f"{path}: no navigation log of '{agent}'; estimated poses need 'navigation_s' in its recipe")

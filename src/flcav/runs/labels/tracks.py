@@ -1,4 +1,4 @@
-"""Labels from tracks: each vehicle labels its frames after the drive, from the sweeps that it recorded around them."""
+"""Labels from tracks: a vehicle labels its frames after the drive, from the sweeps that it recorded around them."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -25,15 +25,15 @@ from flcav.sensors.frame import Frame
 from flcav.storage.files import write_bytes
 
 TRACKS = "tracks.msgpack"
-PRECISION = 0.95  # least of labels by tracks, on validation frames of the towns of pretraining
-WINDOW_S, WINDOW_EVERY_S = 1.0, 0.2  # of the sweeps that are recorded around a frame
+PRECISION = 0.95  # least precision of labels by tracks, on validation frames of the towns of pretraining
+WINDOW_S, WINDOW_EVERY_S = 1.0, 0.2  # half width and period of the sweeps that are recorded around a frame [s]
 
 
 def label_tracked(tracks: Mapping[int, Boxes], threshold: float, config: SecondConfig) -> LabelFrame:
-    """Return the labelling of frames by `tracks`, in the frame of their LiDAR, that score `threshold` or more."""
+    """Return the function that labels frames by their `tracks`, in the LiDAR frame, that score `threshold` or more."""
 
-    def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
-        return label_by_tracks(frame, tracks[i], threshold, told, config, choose_lidar(frame))
+    def label(i: int, frame: Frame, views: Sequence[RoadView]) -> Sample:
+        return label_by_tracks(frame, tracks[i], threshold, views, config, choose_lidar(frame))
 
     return label
 
@@ -43,10 +43,12 @@ def track_frame(
 ) -> Boxes:
     """Return the tracks at frame `i` that score `LEAST_SCORE` or more, in the frame of its LiDAR.
 
-    They are of the detections of `network` in the sweeps that the vehicle recorded within `WINDOW_S` of the frame, by
-    the `poses` of its navigation. views: of the road sensors at the spin, whose boxes join them.
+    They join the detections of `network` in the sweeps that the vehicle recorded within `WINDOW_S` of the frame, placed
+    by the `poses` of its navigation, and the boxes in the `views` of road sensors at the spin.
     """
-    data, sweeps, known = split.data, list[VehicleSweep](), dict[int, NDArray[np.float64]]()
+    data = split.data
+    sweeps = list[VehicleSweep]()
+    known = dict[int, NDArray[np.float64]]()  # world_from_lidar by frame
     for number in list_window(split, (i,), WINDOW_S):
         frame = data.frame(number)
         lidar = choose_lidar(frame)
@@ -54,24 +56,27 @@ def track_frame(
         known[number] = world_from_lidar
         (found,) = detect_in(network, [frame], score_threshold=LOWEST_SCORE)
         points = transform_points(world_from_lidar, frame.lidar[lidar][:, :3].astype(np.float64))
-        boxes, origin = found.transform(world_from_lidar), world_from_lidar[:3, 3]
+        boxes = found.transform(world_from_lidar)
+        origin = world_from_lidar[:3, 3]
         sweeps.append(VehicleSweep(data.keys[number].time_s, boxes, points, origin))
-    at_s, told = data.keys[i].time_s, [_classify(view.boxes, network.config) for view in views]
-    others = [BoxReport(f"pole {number}", at_s, boxes) for number, boxes in enumerate(told)]
+    at_s = data.keys[i].time_s
+    reported = [_classify(view.boxes, network.config) for view in views]
+    others = [BoxReport(f"pole {number}", at_s, boxes) for number, boxes in enumerate(reported)]
+    # Back by the navigation's pose, not the true one: an error common to all sweeps of the vehicle cancels.
     return track_objects(sweeps, at_s, others, LEAST_SCORE).transform(inverse(known[i]))
 
 
 def save_tracks(tracks: Mapping[int, Boxes], folder: Path) -> None:
-    """Write the tracks of frames, by number, into a step's folder."""
+    """Write the tracks of frames, by frame number, into a step's folder."""
     boxes = concatenate([*tracks.values()])
-    frame = np.repeat(np.array([*tracks], dtype=np.int64), [len(own) for own in tracks.values()])
+    frame = np.repeat(np.array([*tracks], dtype=np.int64), [len(found) for found in tracks.values()])
     arrays = {"frames": np.array([*tracks], dtype=np.int64), "frame": frame, "boxes": boxes.array()}
     arrays |= {"score": np.zeros(0) if boxes.score is None else boxes.score, "label": from_names(boxes.label.tolist())}
     write_bytes(folder / TRACKS, pack_arrays(arrays))
 
 
 def load_tracks(folder: Path) -> dict[int, Boxes]:
-    """Return the tracks of frames, by number, in a step's folder: the inverse of `save_tracks`."""
+    """Read the tracks of frames, by frame number, from a step's folder: the inverse of `save_tracks`."""
     arrays = unpack_arrays((folder / TRACKS).read_bytes())
     boxes = Boxes.from_array(arrays["boxes"], to_names(arrays["label"]), arrays["score"])
     return {i: boxes[arrays["frame"] == i] for i in arrays["frames"].tolist()}
@@ -92,6 +97,6 @@ def fit_track_threshold(network: Second, splits: Sequence[Frames], report: Repor
 
 
 def _classify(boxes: Boxes, config: SecondConfig) -> Boxes:
-    """Return the boxes of road sensors, whose labels are actor categories, that are of the network's classes."""
+    """Return the boxes of road sensors that belong to the network's classes; their labels are actor categories."""
     label = detection_labels(boxes.label, config.classes)
     return replace(boxes, label=label)[label != ""]

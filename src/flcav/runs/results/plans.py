@@ -17,37 +17,38 @@ class TaskPlan:
     samples: int
     edge_rounds: int
     cloud_rounds: int
-    wireless_mb: float  # uplink, all stages
-    wireline_mb: float
-    sample_mb: float  # of one sample
-    model_mb: float  # of one model update
-    predicted: Mapping[str, float] | None  # score after each stage, by the learning curve; None: a fixed plan
+    wireless_mb: float  # uplink of all stages [MB]
+    wireline_mb: float  # likewise [MB]
+    sample_mb: float  # size of one sample [MB]
+    model_mb: float  # size of one model update [MB]
+    predicted: Mapping[str, float] | None  # score by the learning curve, after the stage; None: a fixed plan
     joins: Annotated[Mapping[str, tuple[int, ...]] | None, LEFT_OUT] = (
-        None  # by vehicle the rounds of its region that it joins, of 1 … edge rounds + k · cloud rounds; None: all
+        None  # rounds of its region that a vehicle joins, of 1 … edge rounds + k · cloud rounds; None: all join all
     )
 
     uploads: Annotated[Mapping[str, int] | None, LEFT_OUT] = (
-        None  # samples that each vehicle of the pretraining regions uploads; None: drawn from the frames of all
+        None  # samples to upload by vehicle of the pretraining regions; None: drawn from the frames of all
     )
 
     exchange_mb: Annotated[float | None, LEFT_OUT] = (
-        None  # what a vehicle sends to be combined in a round; None: a model update
+        None  # what a vehicle sends to be combined in a round [MB]; None: a model update
     )
     labels_mb: Annotated[float | None, LEFT_OUT] = (
-        None  # what it sends to have its samples labelled: before each round of stage II, once before stage III
+        None  # what it sends to have its samples labelled [MB]: before every round of stage II, once before stage III
     )
 
     called: Annotated[int | None, LEFT_OUT] = None  # vehicles of a group on request; None: the plan does not decide
 
     @property
     def sizes(self) -> MessageSizes:
-        """Sizes of the task's messages."""
+        """The sizes of the task's messages [MB]."""
         return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
 
     def joins_after_edge(self) -> Mapping[str, tuple[int, ...]]:
-        """Return the rounds after stage II that each vehicle joins, numbered from 1; empty: all join all."""
+        """Return the rounds after stage II that vehicles join, numbered from 1, by vehicle; empty: all join all."""
         over = self.edge_rounds
-        return {name: tuple(each - over for each in own if each > over) for name, own in (self.joins or {}).items()}
+        joins = self.joins or {}
+        return {name: tuple(number - over for number in joined if number > over) for name, joined in joins.items()}
 
 
 @dataclass(frozen=True)
@@ -57,7 +58,7 @@ class Plan(Saved):
     rule: str
     tasks: Mapping[str, TaskPlan]
     after: Annotated[str | None, LEFT_OUT] = None  # stage after which it was updated; None: before the run
-    reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score then, by task, which it rests on
+    reached: Annotated[Mapping[str, float] | None, LEFT_OUT] = None  # score at that time, by task, that it starts from
 
 
 @dataclass(frozen=True)
@@ -88,12 +89,12 @@ class Placed(Saved):
     chosen: tuple[int, ...]  # poles
     errors: int  # registered
     covered: int  # errors within range of a chosen pole
-    range_m: float
+    range_m: float  # radius of a sensor's coverage [m]
     poles: tuple[Pole, ...]  # all candidates
 
     @property
     def first(self) -> int:
-        """Return the pole that was chosen first; raises `InputError` where no sensor was placed."""
+        """The pole that was chosen first; raises `InputError` where no sensor was placed."""
         if not self.chosen:
             found = f"candidate poles: {len(self.poles)}, errors to cover: {self.errors}"
             raise InputError(f"region {self.region!r}: no sensor was placed ({found})")
@@ -101,5 +102,5 @@ class Placed(Saved):
 
     @property
     def densest(self) -> int:
-        """Return the pole with the most road users within range on average."""
+        """The pole with the most road users within range on average."""
         return max(self.poles, key=lambda site: site.actors).pole

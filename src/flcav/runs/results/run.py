@@ -26,37 +26,37 @@ class Spent:
     stage: str
     task: str
     link: str
-    mb: float
+    mb: float  # [MB]
 
 
 @dataclass(frozen=True)
 class LinkUse:
     """Budget, planned traffic and actual traffic of one uplink [MB]."""
 
-    budget_mb: float
-    planned_mb: float
-    used_mb: float
+    budget_mb: float  # of the recipe
+    planned_mb: float  # of the last plan, all tasks
+    used_mb: float  # in the ledger
 
 
 @dataclass(frozen=True)
 class ArmResult:
     """Results of one arm: its plans, placements, stages, and uplink traffic."""
 
-    plan: Plan  # carried out: the last one
+    plan: Plan  # the last plan, which was carried out
     placed: tuple[Placed, ...]
     stages: tuple[StageResult, ...]
     links: Mapping[str, LinkUse]
     spent: tuple[Spent, ...]
     regional: Annotated[tuple[RegionalTest, ...] | None, LEFT_OUT] = None  # of stage III, where regions keep arrays
-    earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that others took the place of, oldest first
+    earlier: Annotated[tuple[Plan, ...] | None, LEFT_OUT] = None  # plans that were replaced, oldest first
     retrained: Annotated[tuple[StageResult, ...] | None, LEFT_OUT] = (
-        None  # stage III of each retraining, in their order
+        None  # stage III of all retrainings, in their order
     )
     privacy: Annotated[PrivacySpent | None, LEFT_OUT] = None  # all tasks and retrainings together; None: no noise
 
     @property
     def plans(self) -> tuple[Plan, ...]:
-        """Return all plans in the order in which they were made."""
+        """All plans in the order in which they were made."""
         return (*(self.earlier or ()), self.plan)
 
     def sent_mb(self, task: str, link: str) -> float:
@@ -66,32 +66,32 @@ class ArmResult:
 
 @dataclass(frozen=True)
 class ArmCost(Record):
-    """Costs and gain of a task in an arm, in the mean over the regions that federate in it."""
+    """Costs and gain of a task in an arm; scores are means over the regions that federate in it."""
 
     arm: str
     task: str
     regions: tuple[str, ...]
     measure: str
     stage: str  # the last one that was tested
-    wireless_mb: float  # uplink of stages II and III
-    wireline_mb: float
-    edge_rounds: int  # of a region, the most
+    wireless_mb: float  # uplink of stages II and III [MB]
+    wireline_mb: float  # likewise [MB]
+    edge_rounds: int  # of the region with the most
     cloud_rounds: int
     epsilon: float | None  # of a vehicle, all tasks and trainings together; None: no noise
     before: float  # the measure after pretraining
-    after: Estimate  # and after the last stage, with its interval
-    gain: float  # how much it rose
-    gain_per_mb: float | None  # for a megabyte of uplink on both links; None: nothing was sent
+    after: Estimate  # the measure after the last stage, with its interval
+    gain: float  # after - before
+    gain_per_mb: float | None  # gain per megabyte of uplink on both links [1/MB]; None: nothing was sent
 
     @property
     def uplink_mb(self) -> float:
-        """Uplink of stages II and III on both links [MB]."""
+        """The uplink traffic of stages II and III on both links [MB]."""
         return self.wireless_mb + self.wireline_mb
 
 
 @dataclass(frozen=True)
 class _RunFigures(Saved):
-    """Fields of a run's results, without those of extras."""
+    """The fields of a run's results, without those of extras."""
 
     recipe: RunRecipe
     arms: Mapping[str, ArmResult]
@@ -103,9 +103,9 @@ class _RunFigures(Saved):
     gap_closed: Mapping[str, float]  # fraction closed of the gap to centralised training
     caveats: tuple[str, ...]  # of the kinds of labels, and of rigs unlike those of the training
     provenance: Provenance
-    elapsed_s: float = 0.0  # wall time of all starts together
-    costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # of each arm and task
-    home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # of further measures than the tasks' own
+    elapsed_s: float = 0.0  # wall time of all starts together [s]
+    costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # by arm and task
+    home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # in the tasks' further measures
 
 
 @dataclass(frozen=True)
@@ -116,7 +116,7 @@ class Run(Displayed, RunRows, _RunFigures):
 
     @property
     def steps(self) -> Names:
-        """Return the names of the run's steps, whose folders, in its folder `work`, hold all artefacts."""
+        """The names of the run's steps, whose folders below `work` hold all artefacts."""
         return name_steps(self.recipe)
 
     def list_sections(self) -> list[PageSection]:
@@ -125,13 +125,13 @@ class Run(Displayed, RunRows, _RunFigures):
         return [section for section in found if section is not None]
 
     def describe_rows(self) -> list[str]:
-        """Return the rows of extras in words, each with its name and task."""
-        rows = [(each.name, row) for each in fields(RunRows) for row in getattr(self, each.name) or ()]
+        """Return the rows of extras as lines of text, with their names and tasks."""
+        rows = [(field.name, row) for field in fields(RunRows) for row in getattr(self, field.name) or ()]
         return [f"{name}, {row.task}, {row.describe()}" for name, row in rows]
 
     def test(self, *, stage: str, region: str, task: str, arm: str = "main") -> Tested:
         """Return the result of a test; raises `KeyError` for one that was not made."""
-        return {each.key: each.result for each in self.tested}[arm, stage, region, task]
+        return {test.key: test.result for test in self.tested}[arm, stage, region, task]
 
 
 @dataclass(frozen=True)
@@ -140,13 +140,13 @@ class Mean:
 
     name: str
     estimate: MeanOverSeeds
-    judged: Annotated[Judged | None, LEFT_OUT] = None  # of the run's own differences: the claim that they are positive
+    judged: Annotated[Judged | None, LEFT_OUT] = None  # on the claim that a difference of the run itself is positive
     kind: Annotated[str | None, LEFT_OUT] = None  # of this claim: primary or secondary, where the recipe names some
 
 
 @dataclass(frozen=True)
 class ClaimCount:
-    """Verdicts on one claim over the runs of several seeds: how many runs come to each."""
+    """Number of runs of several seeds by their verdict on one claim."""
 
     question: str
     place: str  # region, or regions, and task
@@ -165,7 +165,7 @@ class ClaimCount:
 
 @dataclass(frozen=True)
 class Summary(Saved):
-    """Means over several seeds of a recipe; verdicts are corrected together, on primary claims apart from others."""
+    """Means over several seeds of a recipe; verdicts are corrected jointly, on primary claims apart from others."""
 
     file: ClassVar[str] = "summary.json"
     seeds: tuple[int, ...]

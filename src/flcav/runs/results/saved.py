@@ -7,17 +7,18 @@ from flcav.config import read_json
 from flcav.storage.files import write_json
 from flcav.storage.records import Record
 
-RESULT, PROBLEM = "result.json", "problem.json"  # the latter: the allocation problem of a plan
+RESULT = "result.json"
+PROBLEM = "problem.json"  # the allocation problem of a plan
 WEIGHTS, LEDGER, ERRORS, OUTCOMES = "weights.safetensors", "ledger.parquet", "errors.parquet", "outcomes.npz"
 
 
 class Saved(Record):
     """A record that is saved as JSON in a folder."""
 
-    file: ClassVar[str] = RESULT  # its name there, unless another is given
+    file: ClassVar[str] = RESULT  # default name of the file
 
     def save(self, folder: Path | str, name: str | None = None) -> None:
-        """Write the record to `folder`, atomically; tasks and regions stay in their order."""
+        """Write the record to `folder` atomically; tasks and regions keep their order."""
         write_json(Path(folder) / (name or self.file), self.as_json(), sort=False)
 
     @classmethod

@@ -1,4 +1,4 @@
-"""Records of tests: of networks on test frames, of differences between them, and what follows from these."""
+"""Records of tests: of networks on test frames, of differences between them, and of findings from these."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.records import LEFT_OUT
 
-WORDS = {  # for stages in reports
+WORDS = {  # names of stages in reports
     PRETRAIN: "pretrained",
     EDGE: "edge FL",
     MORE_EDGE: "further edge FL",
@@ -26,12 +26,12 @@ def name_stage(arm: str, stage: str) -> str:
 
 @dataclass(frozen=True)
 class Tested(Saved):
-    """Test of a network on a region's test frames; the outcome of each frame is in the same folder."""
+    """Test of a network on a region's test frames; the outcomes by frame are in the same folder."""
 
     region: str
     task: str
-    measure: str  # name of what is estimated
-    estimate: Estimate
+    measure: str  # name of the measure, such as AP50
+    estimate: Estimate  # in [0, 1] for AP and accuracy
     numbers: Mapping[str, float | None]  # other numbers of the task, by name
     frames: int
     scenes: int
@@ -45,53 +45,53 @@ class Test:
     stage: str
     region: str
     task: str
-    step: str  # its folder holds the outcomes
-    result: Tested  # its interval is over scenes alone
+    step: str  # whose folder holds the outcomes
+    result: Tested  # of the first training; its interval is over scenes alone
     estimate: Estimate  # of `over_trainings`; else of one training, with the spread of retraining where it is known
-    spread: Spread | None  # over retrainings: of this run's own, or of the recipe's table; None: not known
-    retrained: tuple[float, ...] = ()  # the measure of each retraining of the arm, on the same frames
-    over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # the run's own trainings, on these scenes
+    spread: Spread | None  # over the retrainings of this run, or from the recipe's table; None: not known
+    retrained: tuple[float, ...] = ()  # the measure by retraining of the arm, on the same frames
+    over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # mean over this run's trainings, same scenes
     retrained_steps: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # their folders, in the order of `retrained`
 
     @property
     def key(self) -> tuple[str, str, str, str]:
-        """Return arm, stage, region and task."""
+        """Arm, stage, region and task."""
         return self.arm, self.stage, self.region, self.task
 
     @property
     def network(self) -> str:
-        """Return the name of the network in reports, by its arm and stage."""
+        """The name of the network in reports, by its arm and stage."""
         return name_stage(self.arm, self.stage)
 
     @property
     def name(self) -> str:
-        """Return the name of the test in reports."""
+        """The name of the test in reports."""
         return f"{self.region}, {self.task}: {self.network}"
 
     @property
     def measure(self) -> str:
-        """Return the name of what was measured."""
+        """The name of the measure, such as AP50."""
         return self.result.measure
 
     @property
     def over_scenes(self) -> Estimate:
-        """Return the estimate of the first training; its interval is over scenes alone."""
+        """The estimate of the first training; its interval is over scenes alone."""
         return self.result.estimate
 
     @property
     def steps(self) -> tuple[str, ...]:
-        """Return the folders of the tests of all trainings whose outcomes are known, the first training's first."""
+        """The folders of the tests of all trainings whose outcomes are known, the first training first."""
         return (self.step, *(self.retrained_steps or ()))
 
     @property
     def trainings(self) -> tuple[float, ...]:
-        """Return the measure of each training, the first training's first."""
+        """The measure by training, the first training first."""
         return (self.over_scenes.mean, *self.retrained)
 
 
 @dataclass(frozen=True)
 class RegionalTest:
-    """A test of the model that a region keeps for itself, by `federation.personal`."""
+    """A test of the personalised model of a region, by `federation.personal`."""
 
     model: str  # region whose model it is
     region: str  # whose test frames
@@ -102,7 +102,7 @@ class RegionalTest:
 
 @dataclass(frozen=True)
 class Difference:
-    """Paired difference of a measure on the same test frames: `arm` at `stage` minus `before_arm` at its stage."""
+    """Paired difference of a measure on the same test frames: `arm` at `stage` minus `before_arm` at `before_stage`."""
 
     name: str
     arm: str
@@ -114,23 +114,23 @@ class Difference:
     estimate: Estimate  # as in `Test`
     over_scenes: Estimate  # of the first training; the interval is over scenes alone
     spread: Spread | None  # as in `Test`
-    retrained: tuple[float, ...] = ()  # the difference in each retraining
+    retrained: tuple[float, ...] = ()  # the difference by retraining
     over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # as in `Test`
-    regions: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # whose mean it is; None: `region` alone
+    regions: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # over which it is a mean; None: `region` alone
 
     @property
     def minus(self) -> str:
-        """Return what is subtracted, as arm/stage."""
+        """The subtrahend as arm/stage."""
         return f"{self.before_arm}/{self.before_stage}"
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Return the regions of the difference: several for a mean over regions."""
+        """The regions of the difference: several for a mean over regions."""
         return self.regions or (self.region,)
 
     @property
     def trainings(self) -> tuple[float, ...]:
-        """Return the difference in each training, the first training's first."""
+        """The difference by training, the first training first."""
         return (self.over_scenes.mean, *self.retrained)
 
 
@@ -141,8 +141,8 @@ class HomeCost:
     region: str
     task: str
     measure: str
-    before: float  # mean over the run's trainings
-    after: float
+    before: float  # mean over the run's trainings, before federated learning
+    after: float  # mean over the run's trainings, after it
     difference: Estimate  # after - before, paired over scenes; over trainings too, where there are several
     trainings: int  # of the run itself
 
@@ -159,7 +159,7 @@ class RunFinding:
 
     @property
     def decision(self) -> str:
-        """Return the verdict, with the kind of the claim where it is known."""
+        """The verdict, with the kind of the claim where it is known."""
         return self.verdict if self.kind is None else f"{self.verdict}, {self.kind} claim"
 
 
@@ -168,8 +168,8 @@ class SweepDetections:
     """Detections of one network in a sweep, matched to the targets; boxes are in the LiDAR frame."""
 
     boxes: tuple[tuple[float, ...], ...]  # x y z length width height yaw [m, rad]; without those of neutral objects
-    hit: tuple[bool, ...]  # whether each box matches a target
-    found: tuple[bool, ...]  # whether each target is matched
+    hit: tuple[bool, ...]  # whether a box matches a target, by box
+    found: tuple[bool, ...]  # whether a target is matched, by target
 
 
 @dataclass(frozen=True)

@@ -1,5 +1,5 @@
-"""The step functions of a run: each loads the results of earlier steps, calls its stage's function, saves the result.
+"""The step functions of a run: they load the results of earlier steps, call their stage's function, save its result.
 
-A step's settings are one frozen record, of which its fingerprint is made. Other steps are given by name; `Work.inputs`
-has their folders.
+A step's settings are one frozen record, from which its fingerprint is computed. They refer to other steps by name;
+`Work.inputs` has the folders of these.
 """

@@ -45,8 +45,8 @@ from flcav.runs.training.messages import choose_planned_uploads, choose_uploads,
 from flcav.statistics.streams import derive_seed
 
 CHECKPOINT, ROUND = "checkpoint.pt", LAST
-COUNTED_MB = 1e9  # budget of a link that is counted and never full
-VALIDATIONS, APART = 10, 5  # during pretraining; at least so many steps apart
+COUNTED_MB = 1e9  # budget of a link whose traffic is counted but not limited [MB]
+VALIDATIONS, APART = 10, 5  # number of validations during pretraining, and the least number of steps between them
 
 
 def pretrain(
@@ -57,9 +57,9 @@ def pretrain(
     folder: Path,
     report: Report,
 ) -> tuple[Validated, ...]:
-    """Pretrain a network with the task's schedule of the learning rate; return the validations on the way.
+    """Pretrain a network with the task's learning-rate schedule; return the validations in between.
 
-    Writes the weights of the last step. An interrupted training resumes after its last validation.
+    Writes the weights of the last step to `folder`. An interrupted training resumes after its last validation.
     """
     task, steps = learning.task, learning.training.steps
     every = max(steps // VALIDATIONS, min(APART, steps))
@@ -84,16 +84,16 @@ def pretrain(
 
 
 def average_splits(task: Task, network: Any, splits: Sequence[Frames]) -> float:
-    """Return the task's measure on the vehicles' frames, as the mean over `splits`."""
+    """Return the mean over `splits` of the task's measure on the vehicles' frames."""
     return float(np.mean([score_network(task, network, split.data, split.vehicles) for split in splits]))
 
 
 def train_centrally(
     learning: Learning, network: Any, samples: Sequence[Any], rounds: int, clients: int, name: str
 ) -> tuple[float, ...]:
-    """Train centrally, in place, for as many steps as a federation of `clients` takes in `rounds`, at the same rates.
+    """Train a network centrally for as many steps as a federation of `clients` takes in `rounds`, at the same rates.
 
-    Returns the mean loss of each round.
+    Changes the network in place; returns the mean loss by round.
     """
     schedule = learning.schedule(rounds, learning.training.local_steps * clients, "more", name)
     losses = []
@@ -120,22 +120,22 @@ class PretrainSettings(StepSettings):
     start: StartingWeights | None = None  # None: initial weights are drawn
     plan: str
     pools: Mapping[str, str]  # recordings of the candidates for upload, by region
-    validation: tuple[str, ...]  # recordings of the frames that it is validated on
+    validation: tuple[str, ...]  # recordings of the validation frames
     budgets_mb: Budgets  # of the run
     upload_seed: int  # of the draw of uploads, the same in retrainings
-    thresholded: bool  # whether detections serve as labels, from some score on
+    thresholded: bool  # whether detections serve as labels, so that a score threshold is needed
     tracked: bool = False  # whether tracks do
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (self.plan, *self.pools.values(), *self.validation)
 
 
 def pretrain_step(work: Work, settings: PretrainSettings, processes: int = 1) -> None:
     """Run stage I of a task: upload the planned samples, train on them, fix the score threshold of pseudo-labels.
 
-    Where it has several `processes`, gradients are computed on two cores, to the same weights.
+    With several `processes`, gradients are computed on two cores, with the same weights as the result.
     """
     task, learning = settings.learning.task, settings.learning.resolve()
     plan = Plan.load(work.inputs[settings.plan])
@@ -149,11 +149,12 @@ def pretrain_step(work: Work, settings: PretrainSettings, processes: int = 1) ->
         held = {region: dict(list_frames(region, split)) for region, split in opened.items()}
         chosen = choose_planned_uploads(held, uploads, settings.upload_seed)
     network = learning.build_network() if settings.start is None else load_start(learning.task, settings.start)
-    book, samples = Ledger(share_plan_budget(plan, settings.budgets_mb, task)), list[Any]()
+    book = Ledger(share_plan_budget(plan, settings.budgets_mb, task))
+    samples = list[Any]()
     for region, frames in chosen.items():
         if frames:
             received = upload_samples(book, learning.task, network.config, region, opened[region], frames)
-            samples += [received[number] for number in range(len(received))]  # in memory: each is drawn many times
+            samples += [received[number] for number in range(len(received))]  # in memory: samples are drawn many times
     book.save(work.folder / LEDGER)
     validated = ()
     if samples:
@@ -174,10 +175,10 @@ def pretrain_step(work: Work, settings: PretrainSettings, processes: int = 1) ->
 
 
 def list_pretraining(outline: Outline, arm: Setting) -> Iterator[Step]:
-    """Yield stage I of an arm, for each task."""
+    """Yield the steps of stage I of an arm, by task."""
     recipe, names = outline.recipe, outline.names
     for task in recipe.tasks:
-        kinds = [LABEL_SOURCES[each.labels[task]] for each in outline.settings.values()]
+        kinds = [LABEL_SOURCES[setting.labels[task]] for setting in outline.settings.values()]
         settings = PretrainSettings(
             learning=outline.learning(arm, task),
             start=outline.starts[task],
@@ -196,14 +197,14 @@ class MoreSettings(StepSettings):
     """Settings of further pretraining, the same for all regions of an arm."""
 
     learning: LearningSettings
-    plan: str  # whose edge rounds it is as long as
+    plan: str  # whose number of edge rounds decides its length
     pretrain: str
     pools: Mapping[str, str]  # recordings of the candidates for upload, by region
-    vehicles: int  # whose local steps it takes: those of the largest region
+    vehicles: int  # number of those whose local steps it takes: the largest region's
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (self.plan, self.pretrain, *self.pools.values())
 
 
@@ -211,13 +212,13 @@ class JointSettings(StepSettings):
     """Settings of centralised training on the samples of stage I and on the annotated frames of all vehicles."""
 
     learning: LearningSettings
-    regions: Mapping[str, RegionInputs]  # whose vehicles' frames it has
+    regions: Mapping[str, RegionInputs]  # regions whose vehicles' frames it trains on
     pools: Mapping[str, str]  # recordings of the candidates for upload, by region
-    vehicles: int  # whose local steps it takes: those of the largest region
+    vehicles: int  # number of those whose local steps it takes: the largest region's
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (*self.pools.values(), *(step for inputs in self.regions.values() for step in inputs.needs))
 
 
@@ -226,18 +227,18 @@ class OracleSettings(StepSettings):
 
     learning: LearningSettings
     inputs: RegionInputs
-    vehicles: int  # whose local steps it takes: those of the region
-    uploads: int | None = None  # frames that the vehicles upload; None: all are there, whatever that would cost
+    vehicles: int  # number of those whose local steps it takes: the region's
+    uploads: int | None = None  # frames that the vehicles upload; None: all are available at no cost
     budgets_mb: Budgets  # of the run
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return self.inputs.needs
 
 
 def more_step(work: Work, settings: MoreSettings) -> None:
-    """Continue pretraining, for as many optimiser steps as stage II takes in the largest region."""
+    """Continue pretraining for as many optimiser steps as stage II takes in the largest region."""
     learning = settings.learning.resolve()
     trained = load_stage_network(learning.task, work.inputs[settings.pretrain])
     samples = load_uploads(work, learning, trained.config, settings.pretrain, settings.pools)
@@ -245,7 +246,7 @@ def more_step(work: Work, settings: MoreSettings) -> None:
 
 
 def joint_step(work: Work, settings: JointSettings) -> None:
-    """Continue training centrally on ground truth of all regions, as long as stage II takes in the largest."""
+    """Continue training centrally on ground truth of all regions, for as many steps as stage II in the largest."""
     learning, (first, *_) = settings.learning.resolve(), settings.regions.values()
     trained = load_stage_network(learning.task, work.inputs[first.pretrain])
     samples = load_uploads(work, learning, trained.config, first.pretrain, settings.pools)
@@ -257,12 +258,11 @@ def joint_step(work: Work, settings: JointSettings) -> None:
 
 
 def oracle_step(work: Work, settings: OracleSettings) -> None:
-    """Continue training centrally on ground truth, for as many optimiser steps as stage II takes in the region."""
-    learning, inputs = settings.learning.resolve(), settings.inputs
-    trained, split = (
-        load_stage_network(learning.task, work.inputs[inputs.pretrain]),
-        Frames.open(work.inputs[inputs.frames]),
-    )
+    """Continue training centrally on ground truth of a region, for as many optimiser steps as its stage II takes."""
+    learning = settings.learning.resolve()
+    inputs = settings.inputs
+    trained = load_stage_network(learning.task, work.inputs[inputs.pretrain])
+    split = Frames.open(work.inputs[inputs.frames])
     frames = select_group(work, split, inputs)
     if settings.uploads is None:
         held = learning.task.samples(split.data, trained.config, frames)
@@ -274,14 +274,14 @@ def oracle_step(work: Work, settings: OracleSettings) -> None:
         chosen = choose_uploads({inputs.region: frames}, settings.uploads, settings.learning.seed)[inputs.region]
         held = upload_samples(book, learning.task, trained.config, inputs.region, split, chosen, EDGE)
         Ledger(share, book.entries[before:]).save(work.folder / LEDGER)
-    samples = [held[number] for number in range(len(held))]  # in memory: each is drawn many times
+    samples = [held[number] for number in range(len(held))]  # in memory: samples are drawn many times
     _train_on(work, learning, trained, samples, inputs.plan, settings.vehicles, inputs.region)
 
 
 def _train_on(
     work: Work, learning: Learning, network: Any, samples: Sequence[Any], plan: str, vehicles: int, region: str | None
 ) -> None:
-    """Train a network centrally; write its weights and the result of the stage: `region` None is that of all."""
+    """Train a network centrally; write its weights and the result of the stage (`region` None: of all regions)."""
     task = learning.task.name
     rounds = Plan.load(work.inputs[plan]).tasks[task].edge_rounds
     losses = train_centrally(learning, network, samples, rounds, vehicles, PRETRAIN if region is None else "federate")
@@ -290,7 +290,7 @@ def _train_on(
 
 
 def list_central_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
-    """Yield the centralised training of an arm for a task: one for all of its regions, or one in each."""
+    """Yield the steps of an arm's centralised training for a task: one for all of its regions, or one per region."""
     names, learning = outline.names, outline.learning(arm, task)
     if arm.central == PRETRAIN:
         settings = MoreSettings(

@@ -1,4 +1,4 @@
-"""Where the federations of a run take place: in this process, or on the vehicles of a deployed fleet."""
+"""Deployment of a run's federations: in this process, or on the vehicles of a deployed fleet."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -13,7 +13,7 @@ from flcav.runs.stages.settings import FederationSettings
 
 
 def check_clients(graph: Graph, arms: Iterable[str], runtime: str) -> None:
-    """Raise `InputError` where an arm's labels or optimisers cannot be had by clients of a `runtime` elsewhere."""
+    """Raise `InputError` where the clients of a remote `runtime` cannot have an arm's labels or optimisers."""
     for arm in arms if runtime != "embedded" else ():
         if runtime == "flower":
             check_deployable(graph.settings[arm].federation)
@@ -25,10 +25,10 @@ def check_clients(graph: Graph, arms: Iterable[str], runtime: str) -> None:
 
 
 def deploy(graph: Graph, runtime: str, fleet: Path | None, engine: str = "processes") -> tuple[Step, ...]:
-    """Return the steps of a graph, those that federate on a `runtime`: embedded, or flower.
+    """Return the steps of a graph, with federations on a `runtime`: embedded, or flower.
 
-    fleet: folder of one that is up, or of one for each region; None: each step brings one up here, for as long. The
-    results do not depend on it. Raises `InputError` where a step cannot be deployed, or the fleet is not up.
+    `fleet`: folder of a fleet that is up, or of one per region; None: a step brings up a fleet here for its duration.
+    The results do not depend on it. Raises `InputError` where a step cannot be deployed, or the fleet is not up.
     """
     if runtime == "embedded":
         return graph.steps
@@ -40,7 +40,7 @@ def deploy(graph: Graph, runtime: str, fleet: Path | None, engine: str = "proces
     if fleet is not None:
         from flcav.federation.links.flower import RegionalDeployment
 
-        RegionalDeployment(fleet, graph.vehicles)  # says now that it is not up
+        RegionalDeployment(fleet, graph.vehicles)  # fails at once if the fleet is not up, not hours later in a step
     where = {"runtime": runtime, "fleet": "" if fleet is None else str(fleet.absolute())}
     return tuple(replace(step, means=where) if _federates(step) else step for step in graph.steps)
 

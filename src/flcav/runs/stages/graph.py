@@ -1,6 +1,6 @@
 """The steps of a run in their order: plan, pretrain, register errors, place sensors, edge FL, cloud FL, test.
 
-After them come those of extras.
+The steps of extras follow them.
 """
 
 from collections.abc import Iterator
@@ -21,7 +21,7 @@ from flcav.runs.stages.tracking import list_tracks
 
 
 class Graph(Outline):
-    """The steps of a recipe in topological order: each comes after those it needs.
+    """The steps of a recipe in topological order: a step comes after those it needs.
 
     Raises `InputError` where a task, its labels, a town, a recording or a dataset cannot be used.
     """
@@ -30,12 +30,13 @@ class Graph(Outline):
         super().__init__(recipe, beside)
         steps: dict[str, Step] = {}
         for step in self._list_steps():
-            steps.setdefault(step.name, step)  # arms share a step: it is the same
+            steps.setdefault(step.name, step)  # arms that share a step have the same one
         self.steps = tuple(steps.values())
 
     def _list_steps(self) -> Iterator[Step]:
-        """Yield the steps of all arms, those that they share more than once."""
-        arms, replanned = self.settings.values(), self.settings[MAIN].replanned
+        """Yield the steps of all arms; shared steps occur more than once."""
+        arms = self.settings.values()
+        replanned = self.settings[MAIN].replanned
         yield from list_recordings(self)
         for arm in arms:
             yield from self._start(arm)
@@ -69,7 +70,7 @@ class Graph(Outline):
             yield from list_placements(self, arm, region)
 
     def _replan(self, stage: str) -> Iterator[Step]:
-        """Yield the validations of a stage of the tasks that are planned by a history, and the plan of the rest."""
+        """Yield the validations of a stage for the tasks that are planned by a history, and the plan of the rest."""
         for name, task in self.recipe.tasks.items():
             if task.history is not None:
                 yield from list_validations(self, stage, name)

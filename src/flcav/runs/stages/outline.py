@@ -1,4 +1,4 @@
-"""The outline of a run: the settings of its arms, the names of its steps, and what several steps are given."""
+"""The outline of a run: the settings of its arms, the names of its steps, and inputs common to several steps."""
 
 from collections.abc import Mapping
 from pathlib import Path
@@ -35,22 +35,22 @@ from flcav.runs.stages.settings import LearningSettings, RegionInputs
 from flcav.runs.training.learning import find_start
 from flcav.statistics.streams import derive_seed
 
-NAVIGATION_S = 20.0  # of navigation logs before the first frame
+NAVIGATION_S = 20.0  # duration of navigation logs before the first frame [s]
 
 
 class Outline:
-    """The outline of a run.
+    """The outline of a run: settings, names of steps, and common inputs.
 
-    `beside` is the folder that towns, datasets and histories are looked for in. Raises `InputError` where a task, its
-    network, its labels or a dataset cannot be used.
+    Towns, datasets and histories are searched in the folder `beside`. Raises `InputError` where a task, its network,
+    its labels or a dataset cannot be used.
     """
 
     def __init__(self, recipe: RunRecipe, beside: Path) -> None:
         self.beside = beside.absolute()
         self.recipe = recipe = _fix_throughput(recipe, self.beside)
-        for task, own in recipe.tasks.items():
-            check_network(task_named(task), own.network)
-        self.starts = {task: find_start(task_named(task), own, self.beside) for task, own in recipe.tasks.items()}
+        for task, entry in recipe.tasks.items():
+            check_network(task_named(task), entry.network)
+        self.starts = {task: find_start(task_named(task), entry, self.beside) for task, entry in recipe.tasks.items()}
         self.settings = resolve_settings(recipe)
         for setting in self.settings.values():
             for task, kind in setting.labels.items():
@@ -65,11 +65,12 @@ class Outline:
     def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
         """Return stage, region and task of every test of an arm.
 
-        Pretrained networks (of the run itself, and others) and those for all regions, of cloud FL or centralised
-        training on all, are tested in every region, others in the regions that federate in the arm. Of a retraining it
-        is what it is of the arm itself.
+        Pretrained networks (of the run itself, and of arms with another one) and networks for all regions, by cloud FL
+        or centralised training, are tested in every region; others in the regions that federate in the arm. The tests
+        of a retraining are those of the arm itself.
         """
-        tests, main = [], name_repeat(MAIN, arm.repeat)
+        tests = []
+        main = name_repeat(MAIN, arm.repeat)
         for task in self.recipe.tasks:
             if arm.name == main or self.names.pretrain(arm.name, task) != self.names.pretrain(main, task):
                 tests += [(PRETRAIN, region, task) for region in self.recipe.regions]
@@ -79,24 +80,24 @@ class Outline:
         return tests
 
     def models(self, arm: Setting, stage: str) -> tuple[str | None, ...]:
-        """Return whose models a stage ends with: None for the federation's, and regions that keep arrays."""
+        """Return the models that a stage ends with: None for the common one, and regions with a personalised model."""
         return (None, *arm.regions) if stage == CLOUD and arm.federation.personal else (None,)
 
     def watched(self) -> list[tuple[str, str, str]]:
-        """Return stage, region and task of what is validated in each federating region: the main arm's stages."""
+        """Return stage, region and task of the validations: of the main arm's stages in the federating regions."""
         main = self.settings[MAIN]
         stages = (PRETRAIN, *main.stages)
         return [(stage, region, task) for task in self.recipe.tasks for stage in stages for region in main.regions]
 
     @property
     def vehicles(self) -> dict[str, int]:
-        """Return the number of vehicles of each federating region."""
+        """The number of vehicles by federating region."""
         known = {region: len(vehicles) for region, vehicles in self.recorded.items()}
         return {region: known.get(region) or self.recipe.vehicles(region) for region in self.federating}
 
     @property
     def placing_task(self) -> str:
-        """Return the task whose recorded traffic has the density that the placement uses."""
+        """The task whose recordings give the traffic density for the placement."""
         return (self.recipe.placement.tasks or tuple(self.recipe.tasks))[0]
 
     def sites(self, region: str) -> tuple[str, ...]:
@@ -109,7 +110,7 @@ class Outline:
         return any(LABEL_SOURCES[arm.labels[task]].from_poles for arm in self.settings.values())
 
     def averaging(self, task: str) -> list[Distillation]:
-        """Return how the labels of a task are averaged, of each arm that federates with the road average."""
+        """Return the averaging of a task's labels, by arm that federates with the road average."""
         arms = [arm for arm in self.settings.values() if arm.central is None]
         return [arm.distillation for arm in arms if LABEL_SOURCES[arm.labels[task]].averaged]
 
@@ -118,27 +119,29 @@ class Outline:
         return any(LABEL_SOURCES[arm.labels[task]].tracked for arm in self.settings.values())
 
     def estimates(self, task: str) -> bool:
-        """Return whether labels of a task reach vehicles' frames by estimated poses in any arm."""
+        """Return whether labels of a task are placed in vehicles' frames by estimated poses in any arm."""
         placed = any(LABEL_SOURCES[arm.labels[task]].placed for arm in self.settings.values())
         return placed and self.recipe.navigation == ESTIMATED
 
     def window_s(self, task: str) -> float:
-        """Return how long before and after a task's training frames others are recorded for labels [s]; 0: none are.
+        """Return the half width of the window recorded around a task's training frames for labels [s]; 0: none is.
 
-        Raises `InputError` where arms differ in it, other than by 0, and a region is recorded in a town.
+        Raises `InputError` where arms have different windows, other than 0, and a region is recorded in a town.
         """
         tracked = {WINDOW_S} if self.tracks(task) else set[float]()
-        windows = sorted(({each.window_s for each in self.averaging(task)} | tracked) - {0.0})
+        windows = sorted(({average.window_s for average in self.averaging(task)} | tracked) - {0.0})
+        # Arms share the recordings of a town, which have one window; in recorded data a window is chosen when read.
         if len(windows) > 1 and len(self.recorded) < len(self.federating):
-            told = " and ".join(f"{each:g} s" for each in windows)
+            listed = " and ".join(f"{window_s:g} s" for window_s in windows)
             why = f" (labels by tracks: {WINDOW_S:g} s)" if tracked else ""
-            raise InputError(f"distillation.window_s: arms have {told}{why}; in a town all have one window, or 0")
+            raise InputError(f"distillation.window_s: arms have {listed}{why}; in a town all have one window, or 0")
         return max(windows, default=0.0)
 
     def window(self, task: str, role: Role, split: SplitName) -> Mapping[str, float]:
-        """Return the fields of `flcav.sources.recipe.Recipe` of what a split records around its frames for labels.
+        """Return the fields of `flcav.sources.recipe.Recipe` for what a split records around its frames for labels.
 
-        Beside training frames these are the frames of pretraining towns by which the score of tracks is chosen.
+        Apart from training frames, these are the validation frames of pretraining towns, by which the score threshold
+        of tracks is chosen.
         """
         if not (split == EDGE or (self.tracks(task) and role == "pretrain" and split == "validation")):
             return {}
@@ -152,11 +155,11 @@ class Outline:
         return window
 
     def pools(self, task: str) -> dict[str, str]:
-        """Return the steps that record a task's candidates for upload, by region."""
+        """Return the names of the steps that record a task's candidates for upload, by region."""
         return {region: self.names.recording(region, "pool", task) for region in self.recipe.with_role("pretrain")}
 
     def learning(self, arm: Setting, task: str) -> LearningSettings:
-        """Return the settings of an arm's training of a task; a retraining has a seed of its own."""
+        """Return the settings of an arm's training of a task; a retraining has another seed."""
         seed = self.recipe.seed
         return LearningSettings(
             task=task,
@@ -166,7 +169,7 @@ class Outline:
         )
 
     def inputs(self, arm: Setting, region: str, task: str, stage: str) -> RegionInputs:
-        """Return the steps that a stage of a task in a region rests on; of TRACKING those of its vehicles' tracks."""
+        """Return the steps that a stage of a task in a region depends on; `stage` may also be TRACKING."""
         names = self.names
         tracked = LABEL_SOURCES[arm.labels[task]].tracked and stage in (EDGE, CLOUD, MORE_EDGE)
         return RegionInputs(
@@ -186,7 +189,8 @@ class Outline:
 
     def federation(self, arm: Setting, task: str, stage: str) -> dict[str, Any]:
         """Return the fields of `FederationSettings` of a stage of a task."""
-        recipe, timed = self.recipe, arm.federation.network is not None
+        recipe = self.recipe
+        timed = arm.federation.network is not None
         given = {name: recipe.speeds(name) for name in self.federating}
         speeds = {f"{region}/{vehicle}": speed for region in given for vehicle, speed in given[region].items()}
         return {
@@ -203,7 +207,7 @@ class Outline:
         }
 
     def find_data(self, region: Region, split: SplitName) -> Path:
-        """Return the folder of a region's recorded dataset of a split; raises `InputError` where there is none."""
+        """Return the folder of a region's recorded dataset for a split; raises `InputError` where there is none."""
         named = region.data[split] if isinstance(region.data, Mapping) else str(region.data)
         found = find_path(named, self.beside)
         if found is None or not found.is_dir():
@@ -221,12 +225,12 @@ class Outline:
                 )
 
     def _count_frames(self, region: str) -> dict[str, int]:
-        own = self.recipe.regions[region]
-        return count_training_frames(self.find_data(own, EDGE), self.recipe.seed, isinstance(own.data, Mapping))
+        place = self.recipe.regions[region]
+        return count_training_frames(self.find_data(place, EDGE), self.recipe.seed, isinstance(place.data, Mapping))
 
 
 def _fix_throughput(recipe: RunRecipe, beside: Path) -> RunRecipe:
-    """Return the recipe with the files of measured rates of the run and its arms found, see `fix_throughput`."""
+    """Return the recipe with absolute paths and hashes of all files of measured rates, see `fix_throughput`."""
 
     def fix(network: NetworkSettings | None) -> NetworkSettings | None:
         return network and fix_throughput(network, beside)
@@ -234,8 +238,8 @@ def _fix_throughput(recipe: RunRecipe, beside: Path) -> RunRecipe:
     arms = dict(recipe.arms)
     for name, arm in arms.items():
         if arm.federation.get("network"):
-            own = fix(NetworkSettings.model_validate(arm.federation["network"]))
-            federation = {**arm.federation, "network": own and own.model_dump(mode="json")}
+            given = fix(NetworkSettings.model_validate(arm.federation["network"]))
+            federation = {**arm.federation, "network": given and given.model_dump(mode="json")}
             arms[name] = arm.model_copy(update={"federation": federation})
     federation = recipe.federation.model_copy(update={"network": fix(recipe.federation.network)})
     return recipe.model_copy(update={"federation": federation, "arms": arms})

@@ -28,12 +28,12 @@ class ErrorsSettings(StepSettings):
     plan: str
     pretrained: str
     registry: str  # recording of the frames that errors are registered in
-    vehicles: Mapping[str, int]  # of each federating region
+    vehicles: Mapping[str, int]  # number by federating region
     budgets_mb: Budgets  # of the run
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (self.pretrained, self.registry, self.plan)
 
 
@@ -50,12 +50,12 @@ class PlaceSettings(StepSettings):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (*self.errors.values(), self.registry, *(() if self.edge is None else (self.edge,)))
 
 
 def errors_step(work: Work, settings: ErrorsSettings) -> None:
-    """Register the errors of the pretrained network in a region, as its vehicles report them to the edge server.
+    """Register the errors of the pretrained network in a region, which its vehicles report to the edge server.
 
     Raises `InputError` for a task whose errors have no position.
     """
@@ -78,7 +78,7 @@ def errors_step(work: Work, settings: ErrorsSettings) -> None:
 
 
 def place_step(work: Work, settings: PlaceSettings) -> None:
-    """Place a region's roadside sensors by the errors and weights of each task."""
+    """Place a region's roadside sensors by the errors and weights of all tasks."""
     drive = Frames.open(work.inputs[settings.registry])
     edge = None if settings.edge is None else Frames.open(work.inputs[settings.edge])
     sites = find_sites(drive, edge)

@@ -1,4 +1,4 @@
-"""The steps that plan a run, and plan the rest of it again after a stage."""
+"""The steps that plan a run, and that plan the rest of it again after a stage."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -37,19 +37,19 @@ from flcav.storage.files import write_json
 
 
 class LabelSettings(Config):
-    """Settings of the prediction of what vehicles send to have their samples labelled by the road average."""
+    """Settings for predicting the messages by which vehicles have their samples labelled by the road average."""
 
     distillation: Distillation
     drives: Mapping[str, str]  # recording, by federating region
     recorded: tuple[str, ...]  # regions that are recorded datasets
     poles: tuple[int, ...]  # numbers of the poles that the arms name for sensors
-    count: int  # of the other sensors in a region, the most of the arms
+    count: int  # number of the other sensors in a region: the maximum over the arms
     traffic_m: float  # radius of the traffic around a pole [m]
     near_m: float  # vehicles label frames recorded within this distance of a sensor [m]
 
 
 class PlannedTask(Config):
-    """A task as the planning step receives it."""
+    """The planning step's input for a task."""
 
     network: str | None  # name of the configuration; None: the task's first
     weight: float  # of its error in the objective
@@ -61,10 +61,10 @@ class PlannedTask(Config):
 
 
 class AirSettings(Config):
-    """Settings of the prediction of the time that a round's messages take on the air."""
+    """Settings for predicting the time that a round's messages take on the air."""
 
     network: NetworkSettings
-    range_m: float  # of the traffic that the unit's pole is chosen by [m]
+    range_m: float  # radius around a pole within which traffic counts for choosing the unit's pole [m]
     drives: Mapping[str, str]  # recording, by region
     recorded: tuple[str, ...]  # regions that are recorded datasets
 
@@ -73,8 +73,8 @@ class UploadSettings(Config):
     """Settings of planned uploads."""
 
     regions: tuple[str, ...]  # that pretrain
-    network: NetworkSettings | None  # vehicles upload by what their uplinks carry; None: by the frames they have
-    range_m: float  # of the traffic that the unit's pole is chosen by [m]
+    network: NetworkSettings | None  # vehicles upload by the capacity of their uplinks; None: by the frames they have
+    range_m: float  # radius around a pole within which traffic counts for choosing the unit's pole [m]
 
 
 class FirstPlanSettings(StepSettings):
@@ -82,25 +82,25 @@ class FirstPlanSettings(StepSettings):
 
     rule: PlanRule
     seed: int
-    budgets_mb: Budgets
+    budgets_mb: Budgets  # of the run, both uplinks [MB]
     headroom: float  # fraction of the budgets left unspent
     limits: PlanLimits
     horizon_s: float | None  # longest time that a vehicle trains, over all rounds of all tasks [s]
     edge_rounds_per_cloud_round: int
     tasks: Mapping[str, PlannedTask]
     held: Mapping[str, Mapping[str, int]]  # numbers of training frames, by federating region and vehicle
-    speeds: Mapping[str, float]  # of every vehicle, "region/vehicle"; empty: all train at the same speed
+    speeds: Mapping[str, float]  # relative computing speeds by "region/vehicle"; empty: all train at the same speed
     called: tuple[int, int] | None = None  # least and most vehicles of a group on request; None: it does not decide
-    overlap: float = 0.0  # share of a further vehicle's data that those called before it have
-    updates: tuple[UpdateForm, ...]  # forms of the arms' updates, of which the largest is planned with
+    overlap: float = 0.0  # share of a further vehicle's data that the vehicles called before it already have
+    updates: tuple[UpdateForm, ...]  # forms of the arms' updates; the plan is made for the largest
     uploads: UploadSettings | None  # None: uploads are drawn
     air: AirSettings | None  # None: messages take no time
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         drives = () if self.air is None else self.air.drives.values()
-        labelled = [own.labels.drives.values() for own in self.tasks.values() if own.labels is not None]
+        labelled = [task.labels.drives.values() for task in self.tasks.values() if task.labels is not None]
         pools = (step for task in self.tasks.values() for step in task.pools)
         return (*pools, *drives, *(step for steps in labelled for step in steps))
 
@@ -110,29 +110,29 @@ class ReplanSettings(StepSettings):
 
     stage: Literal["pretrain", "edge"]
     first: str  # step of the first plan
-    plan: str  # step of the plan that was carried out in the stage
+    plan: str  # step of the plan by which the stage was carried out
     watched: Mapping[str, tuple[str, ...]]  # validations of the stage, by task
-    books: Mapping[str, tuple[str, ...]]  # steps whose ledgers count, by task
+    books: Mapping[str, tuple[str, ...]]  # steps whose ledgers count as spent, by task
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (
             self.first,
             self.plan,
-            *(step for by in (self.watched, self.books) for own in by.values() for step in own),
+            *(step for by_task in (self.watched, self.books) for steps in by_task.values() for step in steps),
         )
 
 
 def plan_step(work: Work, settings: FirstPlanSettings) -> None:
     """Allocate both budgets to all tasks."""
     scenes = {} if settings.air is None else _link_drives(work, settings.air, settings.seed)
-    asked = tuple(_request(work, settings, name, scenes) for name in settings.tasks)
-    plan, problem = make_plan(asked, frame_plan(settings), settings.rule)
+    requests = tuple(_request(work, settings, name, scenes) for name in settings.tasks)
+    plan, problem = make_plan(requests, frame_plan(settings), settings.rule)
     if problem is not None:
         write_json(work.folder / PROBLEM, problem.model_dump(mode="json"))
     if settings.uploads is not None:
-        pools = {name: own.pools for name, own in settings.tasks.items()}
+        pools = {name: task.pools for name, task in settings.tasks.items()}
         plan = plan_uploads(work, plan, pools, settings.uploads, settings.seed)
     plan.save(work.folder)
 
@@ -145,7 +145,7 @@ def frame_plan(settings: FirstPlanSettings) -> PlanSettings:
         limits=settings.limits,
         edge_groups=tuple(map(len, settings.held.values())),
         edge_rounds_per_cloud_round=settings.edge_rounds_per_cloud_round,
-        group_samples=tuple(sum(own.values()) for own in settings.held.values()),
+        group_samples=tuple(sum(frames.values()) for frames in settings.held.values()),
         horizon_s=settings.horizon_s,
         speeds=settings.speeds,
         called=settings.called,
@@ -157,27 +157,27 @@ def _request(
     work: Work, settings: FirstPlanSettings, name: str, scenes: Mapping[str, Sequence[RadioLinks]]
 ) -> PlanRequest:
     """Return the planner's request for a task; `scenes`: radio links of the vehicles' drives, by region."""
-    own, task = settings.tasks[name], task_named(name)
-    config, shared = find_configuration(task, own.network), as_shared(task)
-    pools = [Frames.open(work.inputs[step]) for step in own.pools]
+    entry, task = settings.tasks[name], task_named(name)
+    config, shared = find_configuration(task, entry.network), as_shared(task)
+    pools = [Frames.open(work.inputs[step]) for step in entry.pools]
     sizes = [len(message) for split in pools for message in shared.pack_samples(split.data, config, split.vehicles)]
-    most = len(sizes) if own.fixed is None else own.fixed.samples
+    most = len(sizes) if entry.fixed is None else entry.fixed.samples
     messages = MessageSizes(
         sample_mb=float(np.mean(sizes)) / 1e6,
-        model_mb=model_mb(task, own.network, settings.updates),
+        model_mb=model_mb(task, entry.network, settings.updates),
         exchange_mb=measure_exchange(task, config, pools, settings.updates, most, settings.seed),
-        labels_mb=None if own.labels is None else _measure_labels(work, own.labels, settings.held, config),
+        labels_mb=None if entry.labels is None else _measure_labels(work, entry.labels, settings.held, config),
     )
-    history = None if own.history is None else parse_history(name, own.history, name)
-    whole_mb = model_mb(task, own.network) if scenes else 0.0
-    air_s = {region: _predict(region, name, each, whole_mb, messages) for region, each in scenes.items()}
-    return PlanRequest(name, own.weight, messages, len(sizes), history, own.fixed, own.train_s, air_s)
+    history = None if entry.history is None else parse_history(name, entry.history, name)
+    whole_mb = model_mb(task, entry.network) if scenes else 0.0
+    air_s = {region: _predict(region, name, links, whole_mb, messages) for region, links in scenes.items()}
+    return PlanRequest(name, entry.weight, messages, len(sizes), history, entry.fixed, entry.train_s, air_s)
 
 
 def _measure_labels(
     work: Work, how: LabelSettings, held: Mapping[str, Mapping[str, int]], config: SecondConfig
 ) -> float:
-    """Return what a vehicle sends to have its samples labelled once [MB]; `held` as in `FirstPlanSettings`."""
+    """Return the size of a vehicle's messages for one labelling of its samples [MB]; `held`: as in the settings."""
     regions = [
         RegionDrive(
             Frames.open(work.inputs[step]), region in how.recorded, sum(held[region].values()), len(held[region])
@@ -189,7 +189,7 @@ def _measure_labels(
 
 
 def _link_drives(work: Work, air: AirSettings, seed: int) -> dict[str, list[RadioLinks]]:
-    """Return the links of each region's drives."""
+    """Return the radio links of the regions' drives, by region and scene."""
     opened = {region: Frames.open(work.inputs[step]) for region, step in air.drives.items()}
     return {
         region: link_drive(region, drive, air.network, air.range_m, seed, region in air.recorded)
@@ -198,6 +198,7 @@ def _link_drives(work: Work, air: AirSettings, seed: int) -> dict[str, list[Radi
 
 
 def _predict(region: str, task: str, scenes: Sequence[RadioLinks], whole_mb: float, sizes: MessageSizes) -> float:
+    """Return the mean time of a round's messages on the air [s]; `whole_mb`: size of the whole model [MB]."""
     sent_mb = sizes.model_mb if sizes.exchange_mb is None else sizes.exchange_mb
     found = predict_air_s(scenes, round(whole_mb * BYTES_PER_MB), round(sent_mb * BYTES_PER_MB))
     if found is None:
@@ -217,43 +218,44 @@ def replan_step(work: Work, settings: ReplanSettings) -> None:
     for task in problem.tasks:
         reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in settings.watched[task.name]])
         for entry in read_entries(work, *settings.books[task.name]):
-            used[entry.link] += entry.bytes * (entry.direction == "up")
+            used[entry.link] += entry.bytes * (entry.direction == "up")  # budgets limit uplinks alone
     used_mb = LinkMegabytes(*(used[link] / BYTES_PER_MB for link in LINKS))
     remake_plan(done, problem, settings.stage, reached, used_mb).save(work.folder)
 
 
 def plan_uploads(work: Work, plan: Plan, pools: Mapping[str, Sequence[str]], how: UploadSettings, seed: int) -> Plan:
-    """Return the plan with the number of samples that each vehicle uploads, of every task.
+    """Return the plan with the numbers of samples that the vehicles upload, by task and vehicle.
 
-    pools: by task the steps that recorded the pools, of the regions in `how`. With a `network` there, vehicles upload
-    by what their uplinks carry, as measured in the pools of the first task; otherwise by the frames they have.
+    `pools`: the steps that recorded the candidates, by task, in the order of the regions in `how`. With a `network`,
+    vehicles upload in proportion to the capacity of their uplinks, as measured in the pools of the first task; without
+    one, in proportion to the frames that they have.
     """
     opened = {
         task: {region: Frames.open(work.inputs[step]) for region, step in zip(how.regions, steps, strict=True)}
         for task, steps in pools.items()
     }
-    asked = {}
+    demands = {}
     for task, splits in opened.items():
         held = {name: len(frames) for region, split in splits.items() for name, frames in list_frames(region, split)}
-        asked[task] = UploadDemand(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
+        demands[task] = UploadDemand(plan.tasks[task].samples, plan.tasks[task].sample_mb, held)
     if how.network is None:
-        shares = {task: share_by_held(own) for task, own in asked.items()}
+        shares = {task: share_by_held(demand) for task, demand in demands.items()}
     else:
         mbps: dict[str, float] = {}
         for region, split in next(iter(opened.values())).items():
             found = measure_uplinks(region, split, how.network, how.range_m, seed)
             mbps |= {
                 name: found.get(name, 0.0)
-                for own in asked.values()
-                for name in own.held
+                for demand in demands.values()
+                for name in demand.held
                 if name.startswith(f"{region}/")
             }
-        shares = share_by_links(asked, mbps)
-    return replace(plan, tasks={task: replace(own, uploads=shares[task]) for task, own in plan.tasks.items()})
+        shares = share_by_links(demands, mbps)
+    return replace(plan, tasks={task: replace(entry, uploads=shares[task]) for task, entry in plan.tasks.items()})
 
 
 def list_frames(region: str, split: Frames) -> list[tuple[str, list[int]]]:
-    """Return the frames of each vehicle of a split, "region/vehicle", in the order of their names."""
+    """Return the vehicles of a split, "region/vehicle", with their frame numbers, in the order of their names."""
     found: dict[str, list[int]] = {}
     for frame in split.vehicles:
         found.setdefault(f"{region}/{split.data.keys[frame].agent}", []).append(frame)
@@ -262,7 +264,9 @@ def list_frames(region: str, split: Frames) -> list[tuple[str, list[int]]]:
 
 def make_plan_step(outline: Outline, arm: Setting) -> Step:
     """Return the step that makes an arm's first plan."""
-    recipe, air, uploads = outline.recipe, _predict_air(outline), None
+    recipe = outline.recipe
+    air = _predict_air(outline)
+    uploads = None
     if recipe.uploads == "planned":
         network, range_m = recipe.federation.network, recipe.placement.range_m
         uploads = UploadSettings(regions=recipe.with_role("pretrain"), network=network, range_m=range_m)
@@ -288,7 +292,7 @@ def make_plan_step(outline: Outline, arm: Setting) -> Step:
 
 
 def make_replan_step(outline: Outline, stage: str) -> Step:
-    """Return the step that updates the plan after stage I or II, from what the run itself reached."""
+    """Return the step that updates the plan after stage I or II, from the scores that the run itself reached."""
     names, main = outline.names, outline.settings[MAIN]
     tasks = [name for name, task in outline.recipe.tasks.items() if task.history is not None]
     edges = {task: tuple(names.edge(MAIN, region, task) for region in main.regions) for task in tasks}
@@ -303,41 +307,43 @@ def make_replan_step(outline: Outline, stage: str) -> Step:
 
 
 def _plan_task(outline: Outline, task: str) -> PlannedTask:
-    own = outline.recipe.tasks[task]
+    entry = outline.recipe.tasks[task]
     return PlannedTask(
-        network=own.network,
-        weight=own.weight,
-        train_s=own.train_s,
-        fixed=own.plan,
-        history=None if own.history is None else read_history(task, own.history, outline.beside),
+        network=entry.network,
+        weight=entry.weight,
+        train_s=entry.train_s,
+        fixed=entry.plan,
+        history=None if entry.history is None else read_history(task, entry.history, outline.beside),
         pools=tuple(outline.pools(task).values()),
         labels=_label_task(outline, task),
     )
 
 
 def _label_task(outline: Outline, task: str) -> LabelSettings | None:
-    """Return the inputs for predicting label messages; None if no arm labels by the road average."""
+    """Return the settings for predicting label messages; None if no arm labels by the road average."""
     arms = [arm for arm in outline.settings.values() if arm.central is None]
     averaging = outline.averaging(task)
     if not averaging:
         return None
-    most = {"window_s": outline.window_s(task), "pose_graph": any(each.pose_graph for each in averaging)}
-    placements, own = [arm.placement for arm in arms], outline.recipe.placement
-    split = "registry" if task in (*own.tasks, outline.placing_task) else "validation"
+    most = {"window_s": outline.window_s(task), "pose_graph": any(average.pose_graph for average in averaging)}
+    placements = [arm.placement for arm in arms]
+    common = outline.recipe.placement
+    split = "registry" if task in (*common.tasks, outline.placing_task) else "validation"
     return LabelSettings(
         distillation=averaging[0].model_copy(update=most),  # the largest messages of any arm
         drives={region: outline.names.recording(region, split, task) for region in outline.federating},
         recorded=tuple(outline.recorded),
-        poles=tuple(sorted({pole for each in placements for pole in each.poles})),
-        count=max((each.count for each in placements if each.rule not in ("fixed", "none")), default=0),
-        traffic_m=own.range_m,
-        near_m=own.group_range_m,
+        poles=tuple(sorted({pole for placement in placements for pole in placement.poles})),
+        count=max((how.count for how in placements if how.rule not in ("fixed", "none")), default=0),
+        traffic_m=common.range_m,
+        near_m=common.group_range_m,
     )
 
 
 def _predict_air(outline: Outline) -> AirSettings | None:
-    """Return the inputs for predicting transmission times of a plan with a horizon; None without a network."""
-    recipe, network = outline.recipe, outline.recipe.federation.network
+    """Return the settings for predicting times on the air for a plan with a horizon; None without a network."""
+    recipe = outline.recipe
+    network = recipe.federation.network
     if network is None or recipe.horizon_s is None:
         return None
     names, task = outline.names, outline.placing_task
@@ -347,18 +353,19 @@ def _predict_air(outline: Outline) -> AirSettings | None:
 
 
 def _count_held(outline: Outline) -> dict[str, dict[str, int]]:
-    """Return the vehicles of each federating region with their numbers of training frames."""
-    recipe, each = outline.recipe, outline.recipe.sized_splits.edge
+    """Return the numbers of training frames by federating region and vehicle."""
+    recipe = outline.recipe
+    size = recipe.sized_splits.edge
     return {
         region: outline.recorded.get(region)
-        or {f"cav{number}": each.scenes * each.spins for number in range(recipe.vehicles(region))}
+        or {f"cav{number}": size.scenes * size.spins for number in range(recipe.vehicles(region))}
         for region in outline.federating
     }
 
 
 def _list_speeds(outline: Outline, held: dict[str, dict[str, int]], timed: bool) -> dict[str, float]:
-    """Return the speed of every vehicle, "region/vehicle"; empty where no region gives any, and no message is timed."""
+    """Return the speeds by "region/vehicle"; empty where no region gives any, and no message is timed."""
     speeds = {region: outline.recipe.speeds(region) for region in held}
     if not timed and not any(speeds.values()):
         return {}
-    return {f"{region}/{cav}": speeds[region].get(cav, 1.0) for region, own in held.items() for cav in own}
+    return {f"{region}/{cav}": speeds[region].get(cav, 1.0) for region, vehicles in held.items() for cav in vehicles}

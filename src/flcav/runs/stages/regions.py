@@ -1,4 +1,4 @@
-"""A region's vehicles in the steps of stages II and III: their labelled samples, and the radio of their rounds."""
+"""A region's vehicles in the steps of stages II and III: labelled samples, and the radio links of rounds."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -40,20 +40,20 @@ from flcav.runs.training.learning import Learning, load_stage_network
 
 
 class RenewedSamples(Mapping[str, Sequence[Any]], ABC):
-    """Samples of a region's vehicles, by "region/vehicle", that are labelled anew in the course of the rounds."""
+    """Samples of a region's vehicles, by "region/vehicle", that are relabelled in the course of the rounds."""
 
     @abstractmethod
     def renew(self, round_: int, weights: Weights) -> None:
-        """Label all samples by what `weights` detect, before a round."""
+        """Relabel all samples by the detections of a network with `weights`, before a round."""
 
     @abstractmethod
     def list_quality(self) -> tuple[LabelQuality, ...]:
-        """Return the quality of the labels before each round so far."""
+        """Return the quality of the labels before the rounds so far."""
 
 
 @dataclass(frozen=True)
 class Labelling:
-    """What the labels of a region's vehicles come from."""
+    """The inputs for labelling the samples of a region's vehicles."""
 
     split: Frames
     frames: Sequence[int]  # to be labelled
@@ -62,7 +62,7 @@ class Labelling:
     threshold: float  # lowest score of a label
     inputs: RegionInputs
     book: Ledger  # of the messages
-    stage: str  # that they are entered under
+    stage: str  # under which they are entered
 
 
 @dataclass(frozen=True)
@@ -76,14 +76,14 @@ class LabelledSamples:
 def select_group(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, ...]:
     """Return the vehicles' frames near a roadside sensor of any arm, so that all arms have the same frames.
 
-    Without such frames the region has no labels from the road, and all frames are those of the group.
+    Without such frames, the region has no labels from the road, and all frames are returned.
     """
     return _select_near(work, split, inputs) or split.vehicles
 
 
 def _select_near(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, ...]:
     placed = [Placed.load(work.inputs[step]) for step in inputs.sites]
-    numbers = {pole for each in placed for pole in each.chosen}
+    numbers = {pole for placement in placed for pole in placement.chosen}
     if not numbers:
         return ()
     sites = find_sites(split, split if inputs.recorded else None)
@@ -91,7 +91,7 @@ def _select_near(work: Work, split: Frames, inputs: RegionInputs) -> tuple[int, 
 
 
 def choose_poles(work: Work, split: Frames, inputs: RegionInputs, kind: LabelSource) -> tuple[int, ...]:
-    """Return the poles whose sensors give a region's vehicles labels of a kind: none where no frame is near one."""
+    """Return the poles whose sensors contribute to a region's labels of a kind: none where no frame is near one."""
     near = kind.from_poles and _select_near(work, split, inputs)
     return Placed.load(work.inputs[inputs.place]).chosen if near else ()
 
@@ -101,12 +101,14 @@ def label_samples(
 ) -> LabelledSamples:
     """Return the labelled samples of a region's vehicles; messages enter `book`, under `stage`.
 
-    Some are to be renewed: in stage II before each round; after it, where `inputs` has a stage II to go on from, once,
-    and vehicles still have what road sensors saw.
+    They may be `RenewedSamples`, which are relabelled before every round of stage II. After it, where `inputs` names
+    the stage II that is continued, they are relabelled once, from road sensors' views that vehicles still have.
     """
     task = settings.learning.resolve().task
-    split, kind = Frames.open(work.inputs[inputs.frames]), LABEL_SOURCES[settings.labels]
-    frames, frozen = select_group(work, split, inputs), load_stage_network(task, work.inputs[inputs.pretrain])
+    split = Frames.open(work.inputs[inputs.frames])
+    kind = LABEL_SOURCES[settings.labels]
+    frames = select_group(work, split, inputs)
+    frozen = load_stage_network(task, work.inputs[inputs.pretrain])
     if not kind.from_detections:
         return LabelledSamples(annotated_samples(task, frozen.config, split, frames, inputs.region), ())
     poles = choose_poles(work, split, inputs, kind)
@@ -131,21 +133,21 @@ def label_samples(
 
 
 def load_uploads(work: Work, learning: Learning, config: Any, pretrained: str, pools: Mapping[str, str]) -> list[Any]:
-    """Return the samples that were uploaded for stage I, the step `pretrained`, in memory: each is drawn many times.
+    """Load the samples that were uploaded for stage I, the step `pretrained`, into memory: they are drawn many times.
 
-    pools: the steps that recorded the candidates for upload, by region.
+    `pools`: the steps that recorded the candidates for upload, by region.
     """
     samples: list[Any] = []
     for name, frames in Pretrained.load(work.inputs[pretrained]).uploaded.items():
-        own = learning.task.samples(Frames.open(work.inputs[pools[name]]).data, config, frames)
-        samples += [own[number] for number in range(len(own))]
+        held = learning.task.samples(Frames.open(work.inputs[pools[name]]).data, config, frames)
+        samples += [held[number] for number in range(len(held))]
     return samples
 
 
 def choose_loss(work: Work, settings: FederationSettings, pretrained: str) -> Learning:
-    """Return the settings of a federation's training, with the loss that they ask for.
+    """Return the training of a federation with the loss that its settings choose.
 
-    It is that of an extra, the task's own, or this with imitation of the network of the step `pretrained`.
+    It is that of an extra, or that of the task, possibly with imitation of the network of the step `pretrained`.
     """
     learning = settings.learning.resolve()
     for choose in load_all(LOSSES):
@@ -160,7 +162,7 @@ def choose_loss(work: Work, settings: FederationSettings, pretrained: str) -> Le
 def score_labels(
     work: Work, inputs: RegionInputs, config: Any, samples: Mapping[str, Sequence[Any]]
 ) -> tuple[LabelQuality, ...]:
-    """Return the quality of the labels of a stage II before each round; of labels that stay, before the first."""
+    """Return the quality of the labels of a stage II before its rounds; of constant labels, before the first."""
     if isinstance(samples, RenewedSamples):
         return samples.list_quality()
     split = Frames.open(work.inputs[inputs.frames])
@@ -176,10 +178,10 @@ def drive_region(
     rules: Rules,
     seeds: Sequence[int],
 ) -> DrivenRounds:
-    """Return what the radio network makes of a region's rounds by `rules`, and write their clock.
+    """Simulate a region's rounds by `rules` on the radio network, and write their times.
 
-    `start` names the vehicles and counts the rounds before these; `seeds` are those of these rounds. Without a network
-    no client is lost.
+    `start` names the vehicles and counts the earlier rounds; `seeds`: one per round. Without a network no client is
+    lost.
     """
     network = settings.federation.network
     if network is None:
@@ -192,9 +194,10 @@ def drive_region(
 
 
 def open_region_fleet(settings: FederationSettings, learning: Learning, region: str, clients: Sequence[str]) -> Fleet:
-    """Return the vehicles of a region with the work of each of their rounds."""
-    how, weights = settings.federation, to_arrays(learning.build_network())
-    both = isinstance(how.personal, RegionalModels)  # the region's and the global model go down together
+    """Return the vehicles of a region with their work in a round."""
+    how = settings.federation
+    weights = to_arrays(learning.build_network())
+    both = isinstance(how.personal, RegionalModels)  # the region's and the global model are downloaded together
     down = update_bytes(weights, exchanging=both)
     up = update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy))
     return Fleet(region, tuple(clients), down, up, settings.train_s, settings.speeds)
@@ -203,11 +206,12 @@ def open_region_fleet(settings: FederationSettings, learning: Learning, region: 
 def link_stage_scenes(
     work: Work, inputs: RegionInputs, network: NetworkSettings, most: int, seed: int
 ) -> list[RadioLinks]:
-    """Return the links of the vehicles in the first `most` scenes of a region's training data."""
-    split, placed = Frames.open(work.inputs[inputs.frames]), Placed.load(work.inputs[inputs.place])
+    """Return the radio links of the vehicles in the first `most` scenes of a region's training data, by scene."""
+    split = Frames.open(work.inputs[inputs.frames])
+    placed = Placed.load(work.inputs[inputs.place])
     return link_scenes(split, placed, network, most, seed)
 
 
 def save_clock(driven: DrivenRounds, work: Work, region: str) -> None:
-    """Write the clock of a region's rounds."""
+    """Write the times of a region's rounds to a Parquet file in the step's folder."""
     save_rounds(driven.records, work.folder / f"{CLOCK}-{region}.parquet")

@@ -1,6 +1,6 @@
 """Rounds of stages II and III: vehicles federate with edge servers, and in stage III these with the cloud.
 
-Both stages end with weights and a ledger in their folder, by way of checkpoints after each round.
+Both stages write a checkpoint after every round, and end with weights and a ledger in their folder.
 """
 
 import contextlib
@@ -50,9 +50,9 @@ if TYPE_CHECKING:
 
     Deployed = RegionalDeployment | PartlyDeployed | None  # vehicles of a fleet
 
-BAG = "bag-from-round"  # begins the names of the folders of ROS 2 bags
-REPLAY = "cloud-replay"  # the cloud's own training among the edge servers; no region has a hyphen in its name
-RunRounds = Callable[[Weights, Account, int, OnRound], LocalUpdate]  # `federate` after so many rounds, with the rest
+BAG = "bag-from-round"  # prefix of the folders of ROS 2 bags
+REPLAY = "cloud-replay"  # client name of the cloud's training; no region has a hyphen in its name
+RunRounds = Callable[[Weights, Account, int, OnRound], LocalUpdate]  # `federate` after given rounds, partially applied
 
 
 @dataclass(frozen=True)
@@ -60,73 +60,73 @@ class RegionStart:
     """The start of a region's edge server."""
 
     clients: Mapping[str, TaskClient]  # its vehicles, by name
-    weights: Weights  # that its first round begins with: of stage II, or before it of pretraining
-    earlier: int  # rounds before with the same vehicles, which a privacy budget counts
+    weights: Weights  # at the start of its first round: those of pretraining, or after stage II those of stage II
+    earlier: int  # earlier rounds with the same vehicles, which count against a privacy budget
     edge_rounds: int = 1  # in a cloud round
 
 
 @dataclass(frozen=True)
 class Replay:
-    """The cloud's own training on what it was sent in stage I, which counts for a given number of samples."""
+    """The cloud's training on the samples of stage I, weighted as if it had a given number of samples."""
 
     client: TaskClient
     samples: int
 
     def train(self, weights: Weights, **how: Any) -> Update:
-        """Return the update of `TaskClient.train`, with that number."""
+        """Return the update of `TaskClient.train`, with that number of samples."""
         return replace(self.client.train(weights, **how), samples=self.samples)
 
 
 @dataclass(frozen=True)
 class CloudServer:
-    """What the cloud does in stage III besides averaging."""
+    """The cloud's tasks in stage III besides averaging."""
 
-    keeps_statistics: bool = False  # whether each region's statistics of batch normalisation are written, too
-    replay: TaskClient | None = None  # its own training on the samples of stage I
-    replay_share: float = 0.0  # of that in each of its averages
+    keeps_statistics: bool = False  # whether the regions' statistics of batch normalisation are written, too
+    replay: TaskClient | None = None  # client that trains on the samples of stage I
+    replay_share: float = 0.0  # weight of its update in an average, in [0, 1)
     topics: str | None = None  # ROS namespace by which edge servers and cloud exchange messages; None: in memory
 
 
 class RoundsOver(Exception):
-    """The rounds of a stage end before their planned number."""
+    """Raised to end the rounds of a stage before their planned number."""
 
 
 class Conduct:
-    """The conduct of a stage's rounds: here all clients take part, to the planned end. Extras of a run change that."""
+    """The conduct of a stage's rounds: by default all clients take part, to the planned end; extras override it."""
 
     @property
     def within(self) -> frozenset[str]:
-        """Return the clients at the edge server itself, whose messages cross no radio."""
+        """The clients at the edge server itself, whose messages do not use the radio."""
         return frozenset()
 
     @property
     def vacant(self) -> bool:
-        """Return whether the conduct has no participants."""
+        """Whether there are no participants."""
         return False
 
     @property
     def over(self) -> bool:
-        """Return whether no further round is to begin."""
+        """Whether no further round is to begin."""
         return False
 
     def choose(self, samples: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
-        """Return the samples of those who take part, by client."""
+        """Return the samples of the participants, by client."""
         return samples
 
     def enlist(self, clients: Mapping[str, Trainable]) -> Mapping[str, Trainable]:
-        """Return the clients as the rounds have them."""
+        """Return the clients of the rounds, possibly wrapped."""
         return clients
 
     def resume(
         self, folder: Path, clients: Mapping[str, Trainable], deployed: Any, account: Account, done: int
     ) -> None:
-        """Take up the conduct after `done` rounds, whose weights are in `folder`; clients may be `deployed`."""
+        """Resume after `done` rounds, whose weights are in `folder`; clients may be `deployed`."""
 
     def follow(self, number: int, weights: Weights, ask: Ask) -> None:
-        """Take note of the weights after a round, for which the clients may be asked."""
+        """Observe the weights after a round; `ask` sends requests to the clients."""
 
     def foresee(self, records: tuple[RoundTiming, ...], region: str) -> "Conduct":
-        """Return the conduct of rounds that are driven as `records` have it."""
+        """Return the conduct of rounds with the simulated times in `records`."""
         return self
 
     def run(
@@ -136,56 +136,59 @@ class Conduct:
         run(start, account, done, on_round)
 
     def report(self, work: Work, settings: Any, rounds: int, deployed: "Deployed") -> dict[str, Any]:
-        """Return rows of the stage's result after its rounds, of which so many were planned."""
+        """Return rows of the stage's result after its rounds; `rounds`: their planned number."""
         return {}
 
 
 @dataclass(frozen=True)
 class StageFederation:
-    """The federation of a stage: what its rounds begin with, and where they are kept.
+    """The federation of a stage: the state at its start, its schedule, and its folder.
 
-    Without a cloud it is that of one region's vehicles with their edge server, else of edge servers with the cloud.
+    Without a cloud, the vehicles of one region federate with their edge server; with one, edge servers with the cloud.
     """
 
     learning: Learning
-    network: Any  # that the server begins with
+    network: Any  # with the server's weights at the start
     regions: Mapping[str, RegionStart]
     schedule: Schedule  # of the server's rounds
     strategies: Strategies
     book: Ledger
     folder: Path  # of checkpoints, weights and ledger
     report: Report
-    start_share: float = 0.0  # of the weights of `network` in the result
+    start_share: float = 0.0  # share of the weights of `network` in the result, in [0, 1]
     cloud: CloudServer | None = None
-    shared: SharedSamples | None = None  # that vehicles send outputs on, instead of weights
-    validation: Mapping[str, Frames] = field(default_factory=dict)  # scored after each round, by region
-    relabel: BeforeRound | None = None  # changes the clients' labels before each round of stage II
+    shared: SharedSamples | None = None  # samples on which vehicles send outputs, instead of weights
+    validation: Mapping[str, Frames] = field(default_factory=dict)  # frames to score after every round, by region
+    relabel: BeforeRound | None = None  # changes the clients' labels before every round of stage II
     conduct: Conduct = field(default_factory=Conduct)  # of the rounds of stage II
-    first_loss: float | None = None  # of stage II, where it is over: a training diverges by it
+    first_loss: float | None = None  # first loss of stage II, if it is over: divergence is measured by it
 
     def afford(self, rules: Rules, rounds: int, buffers: Mapping[str, Buffers]) -> int:
-        """Return as many of `rounds` as the privacy budget affords in every region; without one all."""
-        for region, own in self.regions.items() if rules.privacy is not None else ():
-            k = own.edge_rounds
+        """Return the number of `rounds` that the privacy budget affords in every region; all without a budget."""
+        for region, start in self.regions.items() if rules.privacy is not None else ():
+            k = start.edge_rounds
             if region in buffers:
                 rounds = min(rounds, afford_buffers(buffers[region], rules.privacy) // k)
             else:
-                rounds = min(rounds, afford_cloud_rounds(rules, [*own.clients], rounds, k, own.earlier))
+                rounds = min(rounds, afford_cloud_rounds(rules, [*start.clients], rounds, k, start.earlier))
         return rounds
 
     def score(self, round_: int) -> Mapping[str, float]:
-        """Return the scores, by region, of the network that a federation of so many rounds ends with."""
-        task, averaged = self.learning.task, self.learning.training.average_rounds
+        """Return the scores by region of the network that a federation of `round_` rounds would end with."""
+        task = self.learning.task
+        averaged = self.learning.training.average_rounds
         reached = load_round_network(task, self.network, self.folder, round_, averaged, self.start_share)
-        return {name: score_network(task, reached, own.data, own.vehicles) for name, own in self.validation.items()}
+        return {
+            name: score_network(task, reached, split.data, split.vehicles) for name, split in self.validation.items()
+        }
 
     def list_vehicles(self, region: str) -> Mapping[str, Trainable]:
         """Return the clients of a region's edge server, by name."""
-        own = self.regions[region]
-        return own.clients if self.shared is None else give_outputs(own.clients, self.shared, own.weights)
+        start = self.regions[region]
+        return start.clients if self.shared is None else give_outputs(start.clients, self.shared, start.weights)
 
     def prepare(self, clients: Mapping[str, Trainable], where: Runtime | None, number: int, weights: Weights) -> None:
-        """Have the clients' samples labelled again before a round, where labels change, and hand them on to `where`."""
+        """Relabel the clients' samples before a round, where labels change, and pass them on to the runtime `where`."""
         if self.relabel is not None:
             self.relabel(number, weights)
             if isinstance(where, ClientProcesses):
@@ -194,16 +197,19 @@ class StageFederation:
     def open_replay(self, cloud: CloudServer) -> dict[str, Trainable]:
         """Return the cloud's training on samples of stage I by its client name, if there is any.
 
-        It counts for so many samples, one at least, that its share is right where all vehicles take part in a round.
+        Its number of samples, at least 1, gives it the right share if all vehicles take part in a round.
         """
         if cloud.replay is None:
             return {}
-        steps, share = self.learning.training.local_steps, cloud.replay_share
-        samples = sum(each.count_samples(steps) for own in self.regions.values() for each in own.clients.values())
+        steps = self.learning.training.local_steps
+        share = cloud.replay_share
+        clients = (client for start in self.regions.values() for client in start.clients.values())
+        samples = sum(client.count_samples(steps) for client in clients)
+        # Averages weigh clients by samples: x / (x + samples) = share.
         return {REPLAY: Replay(cloud.replay, max(round(samples * share / (1 - share)), 1))}
 
     def open_topics(self, topics: str | None, done: int) -> "RosTopics | None":
-        """Return the topics of the rounds after `done`, and their bag; None where messages stay in memory."""
+        """Return the ROS 2 topics, with their bag, of the rounds after `done`; None where messages stay in memory."""
         if topics is None:
             return None
         from flcav.federation.links.topics import RosTopics
@@ -220,43 +226,43 @@ class StageFederation:
         states: Mapping[str, FederationState],
         runtime: Runtime | None,
     ) -> dict[str, EdgeServer]:
-        """Return the edge servers by region, after `done` cloud rounds; `states` are theirs.
+        """Return the edge servers by region, after `done` cloud rounds, with their `states`.
 
-        The vehicles of one after another train, where `runtime` says.
+        Edge servers train one after another, with their vehicles on the `runtime`.
         """
         return {
             region: EdgeServer(
                 self.list_vehicles(region),
-                own.edge_rounds,
+                start.edge_rounds,
                 account,
-                own.weights,
+                start.weights,
                 cloud_rounds_done=done,
                 strategy=self.strategies.edge,
                 rules=driven.rules,
                 state=states[region],
-                earlier=own.earlier,
+                earlier=start.earlier,
                 runtime=runtime,
                 distiller=self.shared,
                 buffers=driven.buffers.get(region),
             )
-            for region, own in self.regions.items()
+            for region, start in self.regions.items()
         }
 
 
 @dataclass(frozen=True)
 class Whereabouts:
-    """Where the vehicles of a federation train: in this process, in others, or on a deployed fleet."""
+    """The place where the vehicles of a federation train: this process, others, or a deployed fleet."""
 
     runtime: str = "embedded"  # one of `RUNTIMES`
-    processes: int = 1  # in so many, or actors
-    fleet: str = ""  # folder of the fleet that is up; "": one is brought up for as long
-    vehicles: Mapping[str, int] = field(default_factory=dict)  # of each region of that fleet
-    timed: bool = False  # whether their times are kept, see `read_times`, unless nobody is to know who was drawn
-    deployed: "RegionalDeployment | None" = None  # the vehicles of that fleet, once it is reached
+    processes: int = 1  # number of processes, or of actors
+    fleet: str = ""  # folder of a fleet that is up; "": one is brought up for the duration
+    vehicles: Mapping[str, int] = field(default_factory=dict)  # numbers of vehicles by region of that fleet
+    timed: bool = False  # whether training times are kept, see `read_times`, unless the draw of clients is secret
+    deployed: "RegionalDeployment | None" = None  # the connected vehicles of that fleet
 
     @contextlib.contextmanager
     def reach(self, clients: list[str]) -> Iterator["Whereabouts"]:
-        """Yield this with the deployed vehicles connected, if there is a fleet for these clients."""
+        """Yield a copy with the deployed vehicles connected, if these clients train on a fleet."""
         if self.runtime != "flower":
             yield self
             return
@@ -267,21 +273,19 @@ class Whereabouts:
 def federate_stage(
     own: StageFederation, driven: DrivenStage, where: Whereabouts = Whereabouts()
 ) -> tuple[tuple[float | None, ...], int | None]:
-    """Run the rounds of a stage, write weights and ledger, and return the mean training loss of each round.
+    """Run the rounds of a stage, write weights and ledger, and return the mean training loss by round.
 
-    Where the training diverges, it stops with the weights of the last sound round, whose number is returned as well;
-    None: the weights are those of the last round.
-
-    Rounds are as the radio network has `driven` them: vehicles that it loses are lost in theirs, and the cloud's rounds
-    need all edge servers. A privacy budget may end them before the schedule's end, and of asynchronous rounds each
-    budget. Where rules make arrays personal, the weights have the mean of the regions' arrays, and each region's model
-    is in the same folder, as are regional models.
+    If the training diverges, it stops with the weights of the last sound round, whose number is returned as well (None:
+    those of the last round). `driven`: the rounds as simulated on the radio network; a vehicle whose connection is lost
+    is missing from its round, while the cloud needs all edge servers. A privacy budget may end the rounds before
+    the schedule does, and so may any budget in asynchronous rounds. Where rules make arrays personal, the weights hold
+    the mean of the regions' arrays, and the regions' models are written to the same folder, as are regional models.
     """
     learning, task, cloud, rules = own.learning, own.learning.task, own.cloud, driven.rules
     state, states = FederationState(), {region: FederationState() for region in own.regions if cloud is not None}
     afforded, schedule = own.afford(rules, own.schedule.rounds, driven.buffers), own.schedule
     if cloud is not None:
-        schedule = replace(schedule, rounds=afforded)  # rates fall over these
+        schedule = replace(schedule, rounds=afforded)  # learning rates decay over these rounds
         rules.check_personal(to_arrays(own.network))
     server = EDGE if cloud is None else CLOUD
     checkpoints = FederationCheckpoints(
@@ -289,7 +293,7 @@ def federate_stage(
         own.folder,
         own.book,
         own.report,
-        {server: state, **{f"{EDGE}/{region}": each for region, each in states.items()}},
+        {server: state, **{f"{EDGE}/{region}": edge for region, edge in states.items()}},
         describe_federation(own.strategies.edge if cloud is None else own.strategies, rules),
         schedule.rounds,
         rules.privacy,
@@ -297,10 +301,10 @@ def federate_stage(
         own.first_loss,
     )
     start, done = checkpoints.resume(to_arrays(own.network))
-    named = {EDGE if cloud is None else f"{EDGE}/{region}": each for region, each in own.regions.items()}
-    checkpoints.keep_secrets({name: rules.secret_parties([*each.clients]) for name, each in named.items()})
+    named = {EDGE if cloud is None else f"{EDGE}/{region}": start for region, start in own.regions.items()}
+    checkpoints.keep_secrets({name: rules.secret_parties([*region.clients]) for name, region in named.items()})
     everybody = {name: client for region in own.regions for name, client in own.list_vehicles(region).items()}
-    if where.timed and not rules.hides_draws:
+    if where.timed and not rules.hides_draws:  # times would reveal which clients were drawn
         everybody = time_clients(everybody, own.folder)
     clients, within = own.conduct.enlist(everybody), own.conduct.within
     wireless = Account(own.book, server, task.name, "wireless", driven.outages, within)
@@ -328,31 +332,31 @@ def federate_stage(
 
 
 def _lay_out(
-    own: StageFederation,
+    stage: StageFederation,
     driven: DrivenStage,
     clients: Mapping[str, Trainable],
     runtime: "Runtime | PartlyDeployed | None",
     state: FederationState,
 ) -> RunRounds:
-    """Return the rounds of a region's vehicles, to be run from some weights after some rounds."""
-    ((region, at),) = own.regions.items()
+    """Return the function that runs the rounds of a region's vehicles, from given weights after given rounds."""
+    ((region, at),) = stage.regions.items()
 
     def run(weights: Weights, account: Account, done: int, on_round: OnRound) -> LocalUpdate:
         return federate(
             clients,
             weights,
-            own.schedule,
+            stage.schedule,
             account,
-            strategy=own.strategies.edge,
+            strategy=stage.strategies.edge,
             rules=driven.rules,
             state=state,
             done=done,
             earlier=at.earlier,
-            before_round=partial(own.prepare, clients, runtime),
-            ask_after=own.conduct.follow,
+            before_round=partial(stage.prepare, clients, runtime),
+            ask_after=stage.conduct.follow,
             on_round=on_round,
             runtime=runtime,
-            distiller=own.shared,
+            distiller=stage.shared,
             buffers=driven.buffers.get(region),
         )
 
@@ -360,7 +364,7 @@ def _lay_out(
 
 
 def _keep_round(
-    own: StageFederation,
+    stage: StageFederation,
     servers: Mapping[str, EdgeServer],
     state: FederationState,
     checkpoints: FederationCheckpoints,
@@ -368,27 +372,27 @@ def _keep_round(
     weights: Weights,
     loss: float | None,
 ) -> None:
-    """Keep the checkpoint after a round; in stage III also the divergence of the regions, and their statistics.
+    """Write the checkpoint after a round; in stage III also the divergence of the regions, and their statistics.
 
-    The checkpoint has the mean of the regions' personal arrays. Raises `RoundsOver` where no other round is to begin.
+    The checkpoint has the mean of the regions' personal arrays. Raises `RoundsOver` where no further round is to begin.
     """
     regions = [*servers.values()]
     if len(regions) > 1:
-        both = ([each.begun for each in regions], [each.trained for each in regions])
+        both = ([edge.begun for edge in regions], [edge.trained for edge in regions])
         divergence = RoundDivergence(*(measure_divergence(models) for models in both))
         state.records[-1] = replace(state.records[-1], divergence=divergence)
-    for region, server in servers.items() if own.cloud is not None and own.cloud.keeps_statistics else ():
-        keep_statistics(server.trained, own.folder, region)
-    personal = [each.state.personal for each in regions if each.state.personal and each.rules.personal_arrays]
+    for region, server in servers.items() if stage.cloud is not None and stage.cloud.keeps_statistics else ():
+        keep_statistics(server.trained, stage.folder, region)
+    personal = [edge.state.personal for edge in regions if edge.state.personal and edge.rules.personal_arrays]
     checkpoints.save(number, {**weights, **(average(personal, [1.0] * len(personal)) if personal else {})}, loss)
-    if own.conduct.over or checkpoints.kept is not None:
+    if stage.conduct.over or checkpoints.kept is not None:
         raise RoundsOver
 
 
 def _save_regional_models(
     learning: Learning, folder: Path, states: Mapping[str, FederationState], regions: Iterable[str]
 ) -> None:
-    """Write each region's personal model: the common weights with the arrays that its edge server keeps, if any."""
+    """Write the regions' personalised models: the common weights with the arrays that edge servers keep, if any."""
     for region in regions:
         model = load_stage_network(learning.task, folder)
         from_arrays(model, {**to_arrays(model), **(states[region].personal if region in states else {})})

@@ -1,4 +1,4 @@
-"""Settings that several kinds of steps have in common, and the shares of tasks and regions in the budgets."""
+"""Settings common to several kinds of steps, and the shares of tasks and regions in the budgets."""
 
 from collections.abc import Callable, Mapping
 
@@ -21,63 +21,63 @@ class StepSettings(Config):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes, some more than once."""
+        """The names of the steps whose results it takes, some more than once."""
         return ()
 
 
 class LearningSettings(Config):
-    """Settings of a task's training, from which `flcav.runs.training.learning.Learning` is made."""
+    """Settings of a task's training, as JSON values: see `flcav.runs.training.learning.Learning`."""
 
     task: str
     network: str | None  # name of the configuration; None: the task's first
     training: Training
-    seed: int  # a retraining has one of its own
+    seed: int  # another one in a retraining
 
     def resolve(self) -> Learning:
-        """Return the settings with the task itself."""
+        """Return the settings with the task object in place of its name."""
         return Learning(task_named(self.task), self.network, self.training, self.seed)
 
 
 class RegionInputs(StepSettings):
-    """The steps that a stage of a task in a region rests on, and what chooses its vehicles' frames."""
+    """The steps that a stage of a task in a region depends on, and how its vehicles' frames are chosen."""
 
     region: str
-    plan: str  # that the stage is carried out by
+    plan: str  # by which the stage is carried out
     pretrain: str
     frames: str  # recording of the vehicles' training data
-    place: str  # placement of the arm's own sensors
-    errors: str | None = None  # registration of the task's errors, whose messages come before the rounds
-    edge: str | None = None  # stage II that the stage goes on from
+    place: str  # placement of the arm's sensors
+    errors: str | None = None  # registration of the task's errors, whose messages precede the rounds
+    edge: str | None = None  # stage II that is continued
     tracks: str | None = None  # tracks of the vehicles' frames, where labels come from them
     sites: tuple[str, ...] = ()  # placements of all arms: vehicles train on frames near one of their sensors
-    group_range_m: float  # as near as that [m]
+    group_range_m: float  # largest distance of such a frame from a sensor [m]
     recorded: bool  # whether the region is a recorded dataset, whose poles are those that it was recorded from
     pools: Mapping[str, str] = {}  # recordings of the candidates for upload, by region, where vehicles share frames
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of all these steps."""
+        """The names of all these steps."""
         named = (self.plan, self.pretrain, self.errors, self.frames, self.place, self.edge, self.tracks)
         return (*(name for name in named if name is not None), *self.sites, *self.pools.values())
 
 
 class FederationSettings(StepSettings):
-    """Settings that the federations of stages II and III have in common."""
+    """Settings common to the federations of stages II and III."""
 
     learning: LearningSettings
     federation: Federation
     budgets_mb: Budgets  # of the run
-    vehicles: Mapping[str, int]  # of each federating region
+    vehicles: Mapping[str, int]  # number by federating region
     labels: str  # kind of labels, see `LABEL_SOURCES`
     fault: Fault | None = None  # of the labels, the rest of which are ground truth
     distillation: Distillation | None = None  # of the labels "road-average"
     navigation: PoseSource = NavigationErrors()  # of the vehicles
-    train_s: float = 0.0  # time that a vehicle of speed 1 trains in a round [s], on a network
-    speeds: Mapping[str, float] = {}  # by "region/vehicle"; others have 1
+    train_s: float = 0.0  # time that a vehicle of speed 1 trains in a round [s]; 0 without a radio network
+    speeds: Mapping[str, float] = {}  # relative computing speeds by "region/vehicle"; others have 1
 
 
 def make_step(name: str, run: Callable[..., None], settings: StepSettings, workers: int = 1) -> Step:
-    """Return the step that calls `run` with its settings, after those that they name, on so many workers at most."""
+    """Return the step that calls `run` with `settings`, after the steps that they need, on so many workers at most."""
     return Step(name, run, {"settings": settings}, tuple(dict.fromkeys(settings.needs)), workers=workers)
 
 
@@ -88,34 +88,34 @@ def share_budget(budget: LinkMegabytes, planned: Mapping[str, tuple[float, float
     """
     parts = []
     for link, whole_mb in enumerate((budget.wireless_mb, budget.wireline_mb)):
-        total = sum(each[link] for each in planned.values())
+        total = sum(traffic[link] for traffic in planned.values())
         share = planned[task][link] / total if total else 1 / len(planned)
         parts.append(whole_mb if len(planned) == 1 else np.floor(share * whole_mb * 1e6) / 1e6)
     return LinkMegabytes(*map(float, parts))
 
 
 def share_plan_budget(plan: Plan, budgets_mb: Budgets, task: str) -> LinkMegabytes:
-    """Return the share of both budgets that a plan gives to a task."""
-    planned = {name: (own.wireless_mb, own.wireline_mb) for name, own in plan.tasks.items()}
+    """Return the share of both budgets that a plan gives to a task [MB]."""
+    planned = {name: (entry.wireless_mb, entry.wireline_mb) for name, entry in plan.tasks.items()}
     return share_budget(LinkMegabytes(budgets_mb.wireless, budgets_mb.wireline), planned, task)
 
 
 def region_budget(stage_one: Ledger, vehicles: Mapping[str, int], region: str) -> LinkMegabytes:
-    """Return the budget of a region's stage II: its share, by vehicles, of the wireless budget that stage I left."""
+    """Return the budget of a region's stage II [MB]: its share, by vehicles, of the wireless budget left by stage I."""
     share = vehicles[region] / sum(vehicles.values())
     return LinkMegabytes(share * stage_one.left_mb("wireless"), 0.0)
 
 
 def read_entries(work: Work, *steps: str) -> list[LedgerEntry]:
-    """Return the ledger entries of several steps, one after another."""
+    """Read the ledger entries of several steps, concatenated."""
     return [entry for step in steps for entry in Ledger.load(work.inputs[step] / LEDGER).entries]
 
 
 def open_region_book(
     work: Work, share: LinkMegabytes, pretrained: str, vehicles: Mapping[str, int], region: str
 ) -> Ledger:
-    """Return an empty ledger of a region's stage II; `share`: the task's in both budgets, before stage I.
+    """Return an empty ledger for a region's stage II; `share`: that of the task in both budgets, before stage I.
 
-    `pretrained` is the step of stage I, `vehicles` the number of each federating region.
+    `pretrained`: the step of stage I; `vehicles`: numbers of vehicles by federating region.
     """
     return Ledger(region_budget(Ledger(share, read_entries(work, pretrained)), vehicles, region))

@@ -1,4 +1,4 @@
-"""The steps that test networks, validate rounds, and look at a sweep before and after."""
+"""The steps that test networks, validate rounds, and compare detections in a sweep before and after training."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -35,16 +35,16 @@ class TestSettings(StepSettings):
     trained: str  # step that trained the network
     frames: str  # recording of the test frames
     seed: int  # of the bootstrap over scenes
-    model: str | None  # region whose own model is tested; None: the network of all
+    model: str | None  # region whose personalised model is tested; None: the common network
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (self.trained, self.frames)
 
 
 class RoundsSettings(StepSettings):
-    """Settings of the validation of a federation after each of its rounds, in a region."""
+    """Settings of the validation of a federation in a region after every round."""
 
     task: str
     region: str
@@ -52,12 +52,12 @@ class RoundsSettings(StepSettings):
     start: str  # step that pretrained the network
     trained: str  # step of the federation, or of pretraining
     frames: str  # recording of the validation frames, used for nothing else
-    averaged: int  # last rounds whose mean weights a result has
-    share: float  # of the pretrained weights in it
+    averaged: int  # number of last rounds over which the weights of the result are averaged
+    share: float  # share of the pretrained weights in the result, in [0, 1]
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (self.start, self.trained, self.frames)
 
 
@@ -65,12 +65,12 @@ class LookSettings(StepSettings):
     """Settings of the comparison of detections in one test sweep."""
 
     before: str  # step that trained the first network
-    after: str  # and the second
+    after: str  # step that trained the second network
     frames: str  # recording of the test frames
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return (self.before, self.after, self.frames)
 
 
@@ -101,15 +101,17 @@ def test_step(work: Work, settings: TestSettings) -> None:
 
 
 def rounds_step(work: Work, settings: RoundsSettings) -> None:
-    """Validate the network that a federation would end with after each of its rounds; a pretrained one as round 0."""
-    task, split = task_named(settings.task), Frames.open(work.inputs[settings.frames])
-    start, folder = load_stage_network(task, work.inputs[settings.start]), work.inputs[settings.trained]
+    """Validate the network that a federation would end with after every round; a pretrained one counts as round 0."""
+    task = task_named(settings.task)
+    split = Frames.open(work.inputs[settings.frames])
+    start = load_stage_network(task, work.inputs[settings.start])
+    folder = work.inputs[settings.trained]
     networks = {0: start}
     if settings.stage != PRETRAIN:
         how = (settings.averaged, settings.share)
         result = StageResult.load(folder)
         numbers = range(1, (result.rounds if result.kept is None else result.kept) + 1)
-        networks = {each: load_round_network(task, start, folder, each, *how) for each in numbers}
+        networks = {round_: load_round_network(task, start, folder, round_, *how) for round_ in numbers}
     rounds = []
     for number, network in networks.items():
         rounds.append(ScoredRound(number, score_network(task, network, split.data, split.vehicles)))
@@ -127,27 +129,27 @@ SHOWN_SCORE = 0.3  # lowest score of a detection that is shown
 
 
 def detect_before_after(before: Path, after: Path, split: Frames) -> SweepComparison:
-    """Return the detections of two networks in the test frame of median gain: of those the one with the most targets.
+    """Return the detections of two networks in the test frame with the median gain; among ties, with most targets.
 
-    Gain is how many more targets are found, less how many more false boxes there are. `before`, `after`: folders of the
-    steps that trained the networks. Detections score `SHOWN_SCORE` or more.
+    The gain is the increase in found targets minus the increase in false boxes. `before`, `after`: folders of the steps
+    that trained the networks. Detections score `SHOWN_SCORE` or more.
     """
     networks = [load_stage_network(OBJECTS, folder) for folder in (before, after)]
     looks = []
     for i in split.vehicles:
         frame = split.data.frame(i)
         truth = asked_of(frame, networks[0].config)
-        seen = [_matched(detect_in(each, [frame], score_threshold=SHOWN_SCORE)[0], truth) for each in networks]
+        seen = [_matched(detect_in(network, [frame], score_threshold=SHOWN_SCORE)[0], truth) for network in networks]
         looks.append(SweepComparison(i, _rows(truth.targets), *seen))
-    gains = np.array([_right(each.after) - _right(each.before) for each in looks])
-    held = np.array([len(each.targets) for each in looks])
-    asked = np.sort(gains[held >= min(1, held.max())])
-    median = asked[len(asked) // 2]
+    gains = np.array([_right(look.after) - _right(look.before) for look in looks])
+    held = np.array([len(look.targets) for look in looks])
+    ranked = np.sort(gains[held >= min(1, held.max())])  # frames without targets show nothing, unless all have none
+    median = ranked[len(ranked) // 2]
     return looks[int(np.where(gains == median, held, -1).argmax())]
 
 
 def _right(seen: SweepDetections) -> int:
-    """Return the number of found targets minus the number of false boxes."""
+    """Return the number of found targets minus that of false boxes."""
     return sum(seen.found) - (len(seen.hit) - sum(seen.hit))
 
 
@@ -168,7 +170,7 @@ LOOK = "look"
 
 
 def list_tests(outline: Outline, arm: Setting) -> Iterator[Step]:
-    """Yield the tests of an arm; of the run itself also the look at a sweep, and the validations of all stages."""
+    """Yield the tests of an arm; for the run itself also the comparison in a sweep, and all validations."""
     names = outline.names
     for stage, region, task in outline.tested(arm):
         trained, frames = names.stage(arm.name, stage, region, task), names.recording(region, "test", task)
@@ -183,7 +185,7 @@ def list_tests(outline: Outline, arm: Setting) -> Iterator[Step]:
 
 
 def list_validations(outline: Outline, stage: str, task: str) -> Iterator[Step]:
-    """Yield the validations of a stage of the run itself in the federating regions."""
+    """Yield the validations of a stage of the run itself, by federating region."""
     names, main = outline.names, outline.settings[MAIN]
     for region in main.regions:
         trained, training = names.stage(MAIN, stage, region, task), main.training[task]
@@ -202,9 +204,9 @@ def list_validations(outline: Outline, stage: str, task: str) -> Iterator[Step]:
 
 
 def _list_looks(outline: Outline, main: Setting) -> Iterator[Step]:
-    """Yield the look at a sweep of the first region before and after the stages; none where no objects are learned."""
+    """Yield the comparison in a sweep of the first region before and after the stages, if objects are learned."""
     if OBJECTS.name in outline.recipe.tasks:
         names, region, stage = outline.names, main.regions[0], main.stages[-1]
-        before, after = (names.stage(MAIN, each, region, OBJECTS.name) for each in (PRETRAIN, stage))
+        before, after = (names.stage(MAIN, at, region, OBJECTS.name) for at in (PRETRAIN, stage))
         frames = names.recording(region, "test", OBJECTS.name)
         yield make_step(LOOK, look_step, LookSettings(before=before, after=after, frames=frames))

@@ -29,16 +29,18 @@ class TrackSettings(StepSettings):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return self.inputs.needs
 
 
 def track_step(work: Work, settings: TrackSettings) -> None:
-    """Track the objects around each training frame of a region's vehicles, by the pretrained network's detections."""
-    inputs, kind = settings.inputs, LABEL_SOURCES[settings.labels]
+    """Track the objects around the training frames of a region's vehicles, by detections of the pretrained network."""
+    inputs = settings.inputs
+    kind = LABEL_SOURCES[settings.labels]
     split = Frames.open(work.inputs[inputs.frames])
     network = load_stage_network(task_named(settings.task), work.inputs[inputs.pretrain])
-    frames, poles = select_group(work, split, inputs), choose_poles(work, split, inputs, kind)
+    frames = select_group(work, split, inputs)
+    poles = choose_poles(work, split, inputs, kind)
     check_windows(split, frames, inputs.region)
     spins = {i: (split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
     views = road_views(split, poles, kind.trained, set(spins.values()))
@@ -52,9 +54,9 @@ def track_step(work: Work, settings: TrackSettings) -> None:
 
 
 def check_windows(split: Frames, frames: Sequence[int], region: str) -> None:
-    """Raise `InputError` where no vehicle recorded a second sweep around any of a region's `frames`, to track through.
+    """Raise `InputError` where none of a region's `frames` has a second sweep of its vehicle nearby, to track through.
 
-    Frames of a simulated town have them; a recorded or imported dataset has where its sweeps follow one another.
+    Frames of a simulated town have such sweeps; a recorded or imported dataset has them if it holds sequences.
     """
     if frames and all(len(list_window(split, (i,), WINDOW_S)) == 1 for i in frames):
         raise InputError(
@@ -64,7 +66,7 @@ def check_windows(split: Frames, frames: Sequence[int], region: str) -> None:
 
 
 def list_tracks(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
-    """Yield the tracks of an arm for a task in each of its regions, where its labels come from them."""
+    """Yield the tracking steps of an arm for a task, by region, if its labels come from tracks."""
     for region in arm.regions if LABEL_SOURCES[arm.labels[task]].tracked else ():
         inputs = outline.inputs(arm, region, task, TRACKING)
         settings = TrackSettings(

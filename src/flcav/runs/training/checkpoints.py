@@ -1,6 +1,6 @@
-"""Checkpoints of a federation: what it writes after each round, to go on from, and the network that it comes to.
+"""Checkpoints of a federation, written after every round, and the network that its rounds result in.
 
-A record has the SHA-256 of each file that belongs to it. The last two are kept, so that one damaged file costs one
+A checkpoint has the SHA-256 of the files that belong to it. The last two are kept, so that a damaged file costs one
 round.
 """
 
@@ -34,41 +34,42 @@ from flcav.runs.results.training import PrivacySpent, diverges, last_sound_round
 from flcav.storage.files import flush_all, sha256, write_bytes, write_in_pieces, write_json
 from flcav.storage.records import Record
 
-LOSS = "loss"  # begins the note of a round
+LOSS = "loss"  # first word of a round's note
 
 
 @dataclass
 class FederationCheckpoints:
-    """Checkpoints of a federation: weights, loss, ledger and states after each round, to resume from."""
+    """Checkpoints of a federation: weights, loss, ledger and states after every round, to resume from."""
 
     task: Task
     folder: Path
     book: Ledger
     report: Report
-    states: Mapping[str, FederationState]  # what federations keep, by name, restored in place; also of edge servers
-    identity: str  # what the federation is by: a checkpoint of another one is refused
-    rounds: int = 0  # of the federation, told with each
-    privacy: Privacy | None = None  # of the updates, whose delta is told with epsilon
+    states: Mapping[str, FederationState]  # by name of the federation, also of edge servers; restored in place
+    identity: str  # strategy and rules of the federation: a checkpoint of another one is refused
+    rounds: int = 0  # planned number, for reports
+    privacy: Privacy | None = None  # of the updates; its delta is reported with epsilon
     score: Callable[[int], Mapping[str, float]] | None = None  # on validation frames after a round, by region
-    first_loss: float | None = None  # of the stage before, which a training is judged by; None: of its own first round
-    losses: list[float | None] = field(default_factory=list)  # of each round
-    scores: list[Mapping[str, float]] = field(default_factory=list)
-    _hashes: dict[str, str] = field(default_factory=dict)  # of the files of weights, by name
-    _told: dict[str, int] = field(default_factory=dict)  # of how many records failures were told, by state
-    _goes_on: bool = False  # after rounds that were carried out before, to an end that it has not reached
-    _broken: bool = False  # whether the round after these gave updates that are not finite
+    first_loss: float | None = None  # of the previous stage, to detect divergence; None: that of the first round
+    losses: list[float | None] = field(default_factory=list)  # mean training loss by round
+    scores: list[Mapping[str, float]] = field(default_factory=list)  # by round and region
+    _hashes: dict[str, str] = field(default_factory=dict)  # SHA-256 of the files of weights, by name
+    _reported: dict[str, int] = field(default_factory=dict)  # number of records whose failures were reported, by state
+    _resumed: bool = False  # whether earlier rounds of an unfinished federation are continued
+    _broken: bool = False  # whether updates of the round after `losses` were not finite
 
     def resume(self, weights: Weights) -> tuple[Weights, int]:
-        """Return the last round's weights, in the order of `weights`, and number, restoring ledger, losses and states.
+        """Restore ledger, losses and states; return the weights and the number of the last round.
 
-        Without a checkpoint, returns `weights` and 0; where one is damaged, the round before. Raises `InputError` for
-        the checkpoint of another strategy, and where the last two are damaged.
+        The weights have the order of `weights`. Without a checkpoint, returns `weights` and 0; where the last one is
+        damaged, the round before it. Raises `InputError` for a checkpoint of another strategy or other rules, and where
+        the last two are damaged.
         """
         found, damage = find_checkpoint(self.folder)
         number = 0 if found is None else found.round
         if damage:
             self.report(number, max(number, 1), damage)
-        self._goes_on = bool(damage) or (found is not None and not (self.folder / LEDGER).exists())
+        self._resumed = bool(damage) or (found is not None and not (self.folder / LEDGER).exists())
         if found is None:
             return weights, 0
         if found.by != self.identity:
@@ -76,40 +77,44 @@ class FederationCheckpoints:
         kept = Ledger.load(self.folder / _ledger_name(number)).entries[: found.entries]
         for entry in kept[len(self.book.entries) :]:
             self.book.enter(entry)
-        self.losses, self.scores = [*found.losses], [*found.scores]
-        state, names = _state_name(number), [round_path(self.folder, each).name for each in range(1, number + 1)]
+        self.losses = [*found.losses]
+        self.scores = [*found.scores]
+        state = _state_name(number)
+        names = [round_path(self.folder, round_).name for round_ in range(1, number + 1)]
         self._hashes = {name: found.sha256[name] for name in names}
         arrays = load_file(self.folder / state) if state in found.sha256 else {}
-        for name, own in self.states.items():
+        for name, kept_state in self.states.items():
             begins = f"{name}|"
-            mine = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
-            own.restore(mine, found.records[name])
-            self._told[name] = len(own.records)
+            restored = {key.removeprefix(begins): array for key, array in arrays.items() if key.startswith(begins)}
+            kept_state.restore(restored, found.records[name])
+            self._reported[name] = len(kept_state.records)
         last = load_file(round_path(self.folder, number))
-        return {name: last[name] for name in weights}, number  # files order names otherwise, and noise follows them
+        # Files have another order of names, and noise is drawn array by array: the order must be that of `weights`.
+        return {name: last[name] for name in weights}, number
 
     def keep_secrets(self, parties: Mapping[str, Sequence[str]]) -> None:
-        """Restore the secrets of the parties of each state, by its name, or draw them before the first round.
+        """Restore the secrets of the `parties`, by name of their state, or draw them before the first round.
 
-        To be called after `resume`. They are kept in a file, so that a round that is repeated has the same noise;
-        `finish` removes it. Raises `InputError` where it is damaged, or missing though secrets were drawn.
+        To be called after `resume`. Secrets are kept in a file, so that a repeated round has the same noise: with other
+        noise it would spend its privacy twice. `finish` removes the file. Raises `InputError` where it is damaged, or
+        missing although secrets were drawn.
         """
-        asked = {f"{name}|{party}": (name, party) for name, found in parties.items() for party in found}
-        if not asked:
+        owners = {f"{name}|{party}": (name, party) for name, members in parties.items() for party in members}
+        if not owners:
             return
-        kept = read_secrets(self.folder, asked, self._goes_on)
-        for key, (name, party) in asked.items():
+        kept = read_secrets(self.folder, owners, self._resumed)
+        for key, (name, party) in owners.items():
             if key in kept:
                 self.states[name].secrets[party] = kept[key]
-        drawn = {key: self.states[name].keep_secret(party) for key, (name, party) in asked.items()}
+        drawn = {key: self.states[name].keep_secret(party) for key, (name, party) in owners.items()}
         write_secrets(self.folder, drawn)
 
     @contextlib.contextmanager
     def refusals(self) -> Iterator[None]:
-        """Remove the secrets where the federation is refused within the context, so that it never goes on.
+        """Remove the secrets if the federation is refused within the context, and so never continues.
 
-        That is before it has sent an update; later only where it would exceed a budget, since damaged data can be made
-        good.
+        A refusal is final before an update was sent; later only where a budget would be exceeded, since damaged data
+        can be repaired.
         """
         begun = len(self.book.entries)
         try:
@@ -122,23 +127,23 @@ class FederationCheckpoints:
 
     @property
     def kept(self) -> int | None:
-        """Return the round whose weights are kept, since the training diverges; None: the last."""
+        """The round whose weights are kept because the training diverges; None: the last."""
         before = [] if self.first_loss is None else [self.first_loss]
         losses = [*before, *self.losses]
         return max(last_sound_round(losses) - len(before), 0) if self._broken or diverges(losses) else None
 
     @contextlib.contextmanager
     def divergence(self) -> Iterator[None]:
-        """Stop the federation where, after a round or more, the clients' updates are no longer finite, and say so."""
+        """Stop the federation, and report it, where after the first round the clients' updates are not finite."""
         try:
             yield
         except Diverged as error:
             if not self.losses:
                 raise
             self._broken = True
-            self.report(len(self.losses), self.rounds, f"{error}: {self._tell_divergence()}")
+            self.report(len(self.losses), self.rounds, f"{error}: {self._describe_divergence()}")
 
-    def _tell_divergence(self) -> str:
+    def _describe_divergence(self) -> str:
         at = f"after round {self.kept}" if self.kept else "that it began with"
         return f"the training diverges and stops, with the weights {at}"
 
@@ -147,51 +152,55 @@ class FederationCheckpoints:
         self.losses.append(loss)
         self._write(round_path(self.folder, round_).name, save(dict(weights)), self._hashes)
         self.scores += [self.score(round_)] if self.score is not None else []
-        arrays = {f"{name}|{key}": array for name, own in self.states.items() for key, array in own.to_arrays().items()}
+        states = self.states.items()
+        arrays = {f"{name}|{key}": array for name, state in states for key, array in state.to_arrays().items()}
         hashes = dict(self._hashes)
         if arrays:
             self._write(_state_name(round_), save(arrays), hashes)
         self.book.save(self.folder / _ledger_name(round_))
         hashes[_ledger_name(round_)] = sha256(self.folder / _ledger_name(round_))
-        records = {name: tuple(own.records) for name, own in self.states.items()}
+        records = {name: tuple(state.records) for name, state in states}
         done = (round_, len(self.book.entries), tuple(self.losses), self.identity, hashes, records)
+        # The record comes last: until it is written, the files of this round do not count, and the round is repeated.
         Checkpoint(*done, tuple(self.scores)).keep(self.folder)
         for name in (_state_name(round_ - 2), _ledger_name(round_ - 2)):
             (self.folder / name).unlink(missing_ok=True)
-        note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._tell_privacy()]
-        note += [self._tell_divergence()] if self.kept is not None else []
+        note = [f"{LOSS} {loss:.3f}" if loss is not None else f"no {LOSS}", *self._describe_privacy()]
+        note += [self._describe_divergence()] if self.kept is not None else []
         note += [f"{region} {score:.3f}" for region, score in (self.scores[-1] if self.score else {}).items()]
-        self.report(round_, self.rounds, ", ".join([*note, *self._tell_failures()]))
+        self.report(round_, self.rounds, ", ".join([*note, *self._describe_failures()]))
 
-    def _tell_privacy(self) -> list[str]:
-        """Return the largest epsilon after the last round, in words, with its delta and limit; none without noise."""
-        spent = [own.records[-1].epsilon for own in self.states.values() if own.records]
+    def _describe_privacy(self) -> list[str]:
+        """Describe the largest epsilon after the last round, with its delta; empty without noise."""
+        spent = [state.records[-1].epsilon for state in self.states.values() if state.records]
         private = [epsilon for epsilon in spent if epsilon is not None]
         if self.privacy is None or not private:
             return []
         return [PrivacySpent(max(private), self.privacy.delta, self.privacy.seeded).describe()]
 
-    def _tell_failures(self) -> list[str]:
+    def _describe_failures(self) -> list[str]:
         """Describe the empty rounds and the failed or lost clients since the last note.
 
-        Those of stage III are all rounds of edge servers.
+        In stage III these are of all rounds of the edge servers.
         """
-        records = [record for name, own in self.states.items() for record in own.records[self._told.get(name, 0) :]]
-        self._told = {name: len(own.records) for name, own in self.states.items()}
-        told = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
-        return [each for each in told if each]
+        states = self.states.items()
+        new = [record for name, state in states for record in state.records[self._reported.get(name, 0) :]]
+        self._reported = {name: len(state.records) for name, state in states}
+        notes = describe_empty([record.empty for record in new]), describe_failures([record.failed for record in new])
+        return [note for note in notes if note]
 
     def _write(self, name: str, data: bytes, hashes: dict[str, str]) -> None:
         write_bytes(self.folder / name, data)
         hashes[name] = hashlib.sha256(data).hexdigest()
 
     def finish(self, start: Any, averaged: int, start_share: float = 0.0) -> tuple[float | None, ...]:
-        """Write the ledger and the final weights, see `load_round_network`; return the loss of each round.
+        """Write the ledger and the final weights, see `load_round_network`; return the losses by round.
 
         Without rounds the weights are those of `start`; where the training diverges, those of the last sound round.
         Secrets are removed.
         """
-        network, rounds = start, len(self.losses) if self.kept is None else self.kept
+        network = start
+        rounds = len(self.losses) if self.kept is None else self.kept
         if rounds:
             network = load_round_network(self.task, start, self.folder, rounds, averaged, start_share)
         save_network(self.task, network, self.folder / WEIGHTS)
@@ -223,12 +232,13 @@ def load_round_network(
 ) -> NetworkT:
     """Return the network of a federation that ends with a round: the mean of the last `averaged` rounds' weights.
 
-    `start_share` of it are the weights of the network `start` that the federation began with, as in Wortsman et al.,
-    Robust fine-tuning of zero-shot models, CVPR 2022, equation 1.
+    A share `start_share` of it are the weights of the network `start` at the federation's beginning, as in Wortsman et
+    al., Robust fine-tuning of zero-shot models, CVPR 2022, equation 1.
     """
     last = range(max(round_ - averaged, 0) + 1, round_ + 1)
-    first, rounds = to_arrays(start), [load_file(round_path(folder, number)) for number in last]
-    parts = [first, *({name: own[name] for name in first} for own in rounds)]  # files order names otherwise
+    first = to_arrays(start)
+    rounds = [load_file(round_path(folder, number)) for number in last]
+    parts = [first, *({name: weights[name] for name in first} for weights in rounds)]  # files have another order
     config: Any = start.config
     network = task.build(config)
     from_arrays(network, average(parts, [start_share, *((1 - start_share) / len(last) for _ in last)]))
@@ -236,7 +246,7 @@ def load_round_network(
 
 
 LAST, BEFORE = "round.json", "round-before.json"  # the last checkpoint, and the one before
-OWN = "own_sha256"  # of all other fields of the record
+RECORD_HASH = "own_sha256"  # field with the SHA-256 of all other fields of the record
 
 
 @dataclass(frozen=True)
@@ -244,12 +254,12 @@ class Checkpoint(Record):
     """The checkpoint of a federation after a round."""
 
     round: int
-    entries: int  # of the ledger then
-    losses: tuple[float | None, ...]  # of each round
-    by: str  # what the federation is by: strategy and rules
-    sha256: Mapping[str, str]  # of each file, by name: weights of all rounds, ledger, and state where there is any
+    entries: int  # number of ledger entries at that time
+    losses: tuple[float | None, ...]  # mean training loss by round
+    by: str  # strategy and rules of the federation
+    sha256: Mapping[str, str]  # by file name: weights of all rounds, ledger, and state where there is any
     records: Mapping[str, tuple[RoundRecord, ...]] = field(default_factory=dict)  # of the rounds, by federation
-    scores: tuple[Mapping[str, float], ...] = ()  # on validation frames after each round, by region
+    scores: tuple[Mapping[str, float], ...] = ()  # on validation frames, by round and region
 
     def find_damage(self, folder: Path) -> str | None:
         """Return the name of a missing or damaged file; None if all are intact."""
@@ -259,34 +269,34 @@ class Checkpoint(Record):
         return None
 
     def keep(self, folder: Path) -> None:
-        """Write the checkpoint, and keep the last one as the previous one."""
+        """Write the checkpoint as the last one, after moving the present last one to `BEFORE`."""
         if (folder / LAST).exists():
             write_bytes(folder / BEFORE, (folder / LAST).read_bytes())
         values = self.as_json()
-        write_json(folder / LAST, values | {OWN: hash_json(values)}, sort=False)
+        write_json(folder / LAST, values | {RECORD_HASH: hash_json(values)}, sort=False)
 
     @classmethod
     def read(cls, folder: Path, name: str) -> "Checkpoint":
-        """Return the checkpoint that `keep` wrote; raises `InputError` where it is another now."""
+        """Read a checkpoint that `keep` wrote; raises `InputError` where it has changed since."""
         values = read_json(folder / name)
-        known = values.pop(OWN, None) if isinstance(values, dict) else None
+        known = values.pop(RECORD_HASH, None) if isinstance(values, dict) else None
         if known != hash_json(values):
             raise InputError(f"{folder / name} {DAMAGED}")
         return cls.from_json(values, str(folder / name))
 
 
 def hash_json(values: Json) -> str:
-    """Return the SHA-256 of a JSON value, whatever the order of its keys."""
+    """Return the SHA-256 of a JSON value, independent of the order of its keys."""
     return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()
 
 
 def find_checkpoint(folder: Path) -> tuple[Checkpoint | None, str]:
-    """Return the last checkpoint of which nothing is damaged, and a sentence about those that are; "" where none is.
+    """Return the last intact checkpoint, and a sentence about damaged ones ("" where there is none).
 
-    None means the beginning: there is no checkpoint, or the first is damaged. Raises `InputError` where the last two
-    are.
+    None means the beginning: there is no checkpoint, or the only one is damaged. Raises `InputError` where the last two
+    are damaged.
     """
-    told = []
+    damages = []
     for name in (LAST, BEFORE):
         if not (folder / name).exists():
             continue
@@ -297,11 +307,11 @@ def find_checkpoint(folder: Path) -> tuple[Checkpoint | None, str]:
             damaged = name
         else:
             if damaged is None:
-                return found, "; ".join(told)
-        told.append(f"{folder / damaged} {DAMAGED}, the checkpoint before it is used")
-    if len(told) == 2:
+                return found, "; ".join(damages)
+        damages.append(f"{folder / damaged} {DAMAGED}, the checkpoint before it is used")
+    if len(damages) == 2:
         raise InputError(f"{folder}: the last two checkpoints are damaged; remove the folder to begin anew")
-    return None, "; ".join(told)
+    return None, "; ".join(damages)
 
 
 SECRETS, SECRETS_HASH, PART = "secrets.safetensors", "secrets.sha256", ".secrets."
@@ -309,12 +319,14 @@ HASH = re.compile(rb"[0-9a-f]{64}")
 
 
 def read_secrets(folder: Path, names: Collection[str], begun: bool) -> dict[str, Secret]:
-    """Return the secrets of a federation, by name: none before they are drawn.
+    """Read the secrets of a federation, by name; empty before they are drawn.
 
-    `names` are those that it needs; `begun` says that it has sent messages, which the hash says, too. Raises
-    `InputError` where the file or its hash is not what was written, or lacks secrets although they were drawn.
+    `names`: the secrets that it needs. `begun`: whether it has sent messages, which the presence of the hash also
+    indicates. Raises `InputError` where the file or its hash has changed, or secrets are missing although they were
+    drawn.
     """
-    path, known = folder / SECRETS, folder / SECRETS_HASH
+    path = folder / SECRETS
+    known = folder / SECRETS_HASH
     written = known.read_bytes() if known.exists() else None
     if written is not None and not HASH.fullmatch(written):
         raise _lost(known, "is damaged")
@@ -337,12 +349,12 @@ def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
     """Write the secrets of a federation, by name, to a file that only its owner may read; then the file's hash.
 
     Where there is a hash, both were written before, and stay as they are: `read_secrets` has compared them. Raises
-    `InputError` where somebody else has written others since.
+    `InputError` where another process has written other secrets since.
     """
     if (folder / SECRETS_HASH).exists():
         return
     folder.mkdir(parents=True, exist_ok=True)
-    file, name = tempfile.mkstemp(prefix=PART, dir=folder)  # that nobody else may read
+    file, name = tempfile.mkstemp(prefix=PART, dir=folder)  # with permissions 0600
     os.close(file)
     try:
         write_in_pieces(Path(name), save(dict(secrets)))
@@ -353,7 +365,7 @@ def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
         Path(name).unlink()
     flush_all([folder])
     kept = load_file(folder / SECRETS)
-    if kept.keys() != secrets.keys() or not all(np.array_equal(kept[each], secrets[each]) for each in kept):
+    if kept.keys() != secrets.keys() or not all(np.array_equal(kept[party], secrets[party]) for party in kept):
         raise InputError(f"{folder / SECRETS}: of another process, which federates here at the same time")
     write_bytes(folder / SECRETS_HASH, sha256(folder / SECRETS).encode())
 
@@ -361,10 +373,10 @@ def write_secrets(folder: Path, secrets: Mapping[str, Secret]) -> None:
 def remove_secrets(folder: Path, *, used: bool = False) -> None:
     """Remove the secrets of a federation that has ended, or was refused.
 
-    Where they are `used`, and the federation is not at its end, their hash stays: alone it means that they are gone, so
-    that no round is repeated with others.
+    `used`: they have hidden updates of a federation that is not at its end. Their hash then stays: without the file it
+    means that they are lost, so that no round is repeated with other secrets.
     """
     if not used:
         (folder / SECRETS_HASH).unlink(missing_ok=True)
-    for path in (folder / SECRETS, *folder.glob(f"{PART}*")):  # the latter of processes that were killed
+    for path in (folder / SECRETS, *folder.glob(f"{PART}*")):  # the latter are left by killed processes
         path.unlink(missing_ok=True)

@@ -1,4 +1,4 @@
-"""Settings of a task's training in a run, the clients of its federations, and the networks that stages end with."""
+"""Settings of a task's training in a run, the clients of its federations, and the networks that stages result in."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -36,16 +36,16 @@ class Learning:
 
     @property
     def batch(self) -> int:
-        """Return the batch size: samples of an optimiser step."""
+        """The batch size: number of samples in an optimiser step."""
         return self.training.batch or self.task.practice.batch
 
     @property
     def config(self) -> Any:
-        """Return the network's configuration."""
+        """The network's configuration."""
         return find_configuration(self.task, self.network)
 
     def build_network(self) -> Any:
-        """Return a network with initial weights drawn from the seed."""
+        """Build a network with initial weights drawn from the seed."""
         return build_network(self.task, self.config, self.seed)
 
     def schedule(
@@ -53,21 +53,23 @@ class Learning:
     ) -> Schedule:
         """Return the clients' schedule of `rounds` rounds with `steps` local steps; `names` seed the stream.
 
-        The learning rate falls over the first rounds after pretraining; where there were `earlier` ones, it stays at
-        its end. Restarted, at `restart`, it loses what the earlier rounds reached: reproductions/runs/retraining.
+        The learning rate decays over the first rounds after pretraining; after `earlier` rounds it stays at its final
+        value. `restart`: share of the task's rate to restart at, which loses what the earlier rounds reached
+        (reproductions/runs/retraining).
         """
-        rate, training = self.task.practice.learning_rate, self.training
+        rate = self.task.practice.learning_rate
+        training = self.training
         first = restart or (training.final_rate if earlier else training.local_rate)
         return Schedule(rounds, steps, first * rate, training.final_rate * rate, derive_seed(self.seed, *names))
 
 
 def regional_weights(region: str) -> str:
-    """Return the file name of a region's personal model after a stage III with personal arrays."""
+    """Return the file name of a region's personalised model after a stage III with personal arrays."""
     return f"weights-{region}.safetensors"
 
 
 def load_stage_network(task: Task, folder: Path, region: str | None = None) -> Any:
-    """Load the trained network of the stage in `folder`; with `region`, that region's personal model."""
+    """Load the trained network of the stage in `folder`; with `region`, that region's personalised model."""
     return load_network(task, folder / (WEIGHTS if region is None else regional_weights(region)))
 
 
@@ -89,12 +91,12 @@ def make_clients(learning: Learning, config: Any, samples: Mapping[str, Sequence
 
 
 def give_outputs(clients: Mapping[str, TaskClient], shared: SharedSamples, start: Weights) -> dict[str, OutputClient]:
-    """Return clients that send outputs on `shared` samples, and begin with a network of the weights `start`."""
+    """Return clients that send outputs on `shared` samples, and whose networks begin with the weights `start`."""
     return {name: OutputClient(client, shared, start) for name, client in clients.items()}
 
 
 def describe_federation(strategy: Strategy | Strategies, rules: Rules) -> str:
-    """Return strategies and rules, as far as they are not the defaults, in words: what a checkpoint is of."""
+    """Describe strategies and rules that differ from the defaults: the identity of a checkpoint."""
     changed = rules.model_dump(mode="json", include=set(Rules.model_fields), exclude_defaults=True)
     return f"{strategy} by {json.dumps(changed)}" if changed else str(strategy)
 
@@ -107,18 +109,21 @@ def keep_statistics(weights: Weights, folder: Path, region: str) -> None:
 def score_statistics(
     task: Task, network: Any, folder: Path, validation: Mapping[str, Frames]
 ) -> tuple[StatisticsScore, ...]:
-    """Return the scores of `network` on each region's validation frames, with averaged and with regional statistics.
+    """Return the scores of `network` on the regions' validation frames, with averaged and with regional statistics.
 
-    The averaged ones are in `network`, the regional ones were written to `folder` by `keep_statistics`. Without a cloud
-    round there are none, and the result is empty.
+    The averaged statistics of batch normalisation are in `network`, the regional ones were written to `folder` by
+    `keep_statistics`. Without a cloud round there are none, and the result is empty.
     """
-    arrays, scores = to_arrays(network), []
+    arrays = to_arrays(network)
+    scores = []
     for region, split in validation.items():
         if not _path(folder, region).exists():
             continue
-        own = task.build(network.config)
-        from_arrays(own, {**arrays, **load_file(_path(folder, region))})
-        averaged, kept = (score_network(task, each, split.data, split.vehicles) for each in (network, own.eval()))
+        regional = task.build(network.config)
+        from_arrays(regional, {**arrays, **load_file(_path(folder, region))})
+        averaged, kept = (
+            score_network(task, model, split.data, split.vehicles) for model in (network, regional.eval())
+        )
         scores.append(StatisticsScore(region, len(split.vehicles), averaged, kept))
     return tuple(scores)
 
@@ -131,14 +136,14 @@ SHIPPED = ("shipped", PACKAGED)  # names of the weights that come with the packa
 
 
 class StartingWeights(Config):
-    """A file of weights from which stage I goes on."""
+    """A file of weights at which stage I starts."""
 
     path: str
     version: str  # SHA-256 of the file
 
 
 def find_start(task: Task, own: TaskRecipe, beside: Path) -> StartingWeights | None:
-    """Return the weights that a task begins with, None for random ones.
+    """Return the weights at which a task starts, None for random ones.
 
     Raises `InputError` where the file is not in `beside`, or its network has other arrays than the recipe's.
     """
@@ -147,7 +152,8 @@ def find_start(task: Task, own: TaskRecipe, beside: Path) -> StartingWeights | N
     path = find_shipped(task) if own.weights in SHIPPED else find_path(own.weights, beside)
     if path is None:
         raise InputError(f"tasks.{task.name}.weights: there is no file {shorten(own.weights)} in {beside}")
-    held, wanted = load_network(task, path), build_network(task, find_configuration(task, own.network), 0)
+    held = load_network(task, path)
+    wanted = build_network(task, find_configuration(task, own.network), 0)
     if _shapes(held) != _shapes(wanted):
         network = own.network or next(iter(task.configurations))
         raise InputError(f"{path}: weights of another network than '{network}', which the recipe has for '{task.name}'")
@@ -155,7 +161,7 @@ def find_start(task: Task, own: TaskRecipe, beside: Path) -> StartingWeights | N
 
 
 def load_start(task: Task, start: StartingWeights) -> Any:
-    """Return the network to go on from; raises `InputError` where its file has changed since `find_start`."""
+    """Load the network at which stage I starts; raises `InputError` where its file has changed since `find_start`."""
     path = Path(start.path)
     if sha256(path) != start.version:
         raise InputError(f"{path}: the weights were changed while the run was under way")

@@ -23,7 +23,7 @@ from flcav.statistics.streams import stream
 
 
 def release_network(book: Ledger, task: Task, network: Any, region: str, drive: Frames) -> Any:
-    """Return a network as the vehicles receive it: from the cloud to the edge server by wireline, then by wireless."""
+    """Send a network to a region's vehicles, and return it as received: by wireline, then by wireless."""
     vehicles = sorted({drive.data.keys[i].agent for i in drive.vehicles})
     clients = [f"{region}/{vehicle}" for vehicle in vehicles]
     from_arrays(network, unpack_arrays(send_to_vehicles(book, pack_arrays(to_arrays(network)), task, region, clients)))
@@ -31,7 +31,7 @@ def release_network(book: Ledger, task: Task, network: Any, region: str, drive: 
 
 
 def send_to_vehicles(book: Ledger, message: bytes, task: Task, region: str, clients: Iterable[str]) -> bytes:
-    """Return a message as a region's vehicles receive it: from the cloud by wireline, then to each by wireless."""
+    """Send a message from the cloud to a region's vehicles, and return it as received: by wireline, then wireless."""
     about: Any = {"stage": EDGE, "task": task.name, "direction": "down"}
     received = at_edge = send_message(book, message, **about, link="wireline", client=region)
     for client in clients:
@@ -40,9 +40,9 @@ def send_to_vehicles(book: Ledger, message: bytes, task: Task, region: str, clie
 
 
 def report_errors(book: Ledger, task: Task, found: Registry, region: str, drive: Frames) -> Registry:
-    """Return the error registry of the edge server, from one message per frame of each vehicle.
+    """Return the error registry of the edge server, received in one message per frame with errors.
 
-    Such a message is the vehicle's request to learn. A task that does not tell frames apart sends its registry at once.
+    Such a message is the vehicle's request to learn. A task whose errors have no frames sends its registry at once.
     """
     about: Any = {"stage": EDGE, "task": task.name, "link": "wireless", "direction": "up"}
     if found.found is None:
@@ -58,13 +58,13 @@ def report_errors(book: Ledger, task: Task, found: Registry, region: str, drive:
 
 @dataclass(frozen=True)
 class SharedFrames:
-    """Frames as the messages that carry them, and what a task makes of them."""
+    """Frames shared among vehicles: their messages, and the task's samples of them."""
 
     messages: tuple[bytes, ...]
     samples: SharedSamples
 
     def send(self, book: Ledger, network: Any, region: str, clients: Sequence[str]) -> None:
-        """Send the frames to a region's vehicles, and the initial network to those without it."""
+        """Send the frames to a region's vehicles, and the initial network to vehicles that lack it."""
         have = {entry.client for entry in book.entries if (entry.stage, entry.direction) == (EDGE, "down")}
         if lacking := [client for client in clients if client not in have]:
             send_to_vehicles(book, pack_arrays(to_arrays(network)), self.samples.task, region, lacking)
@@ -83,9 +83,10 @@ def send_region_network(book: Ledger, task: Task, weights: Weights, clients: Ite
 def share_frames(
     work: Work, learning: Learning, config: Any, strategy: FedMD, pools: Mapping[str, str], pretrained: str
 ) -> SharedFrames:
-    """Return the frames of a federation by `strategy`: drawn from those that the step `pretrained` uploaded.
+    """Draw the shared frames of a federation by `strategy` from those uploaded in the step `pretrained`.
 
-    `pools` are the steps that recorded them, by region. Raises `InputError` where they have no samples of the task.
+    `pools`: the steps that recorded these, by region. Raises `InputError` where the drawn frames have no samples of the
+    task.
     """
     every = [
         (region, i) for region, frames in Pretrained.load(work.inputs[pretrained]).uploaded.items() for i in frames
@@ -94,7 +95,8 @@ def share_frames(
     chosen: dict[str, list[int]] = {}
     for region, frame in (every[number] for number in drawn):
         chosen.setdefault(region, []).append(frame)
-    shared, messages = as_shared(learning.task), []
+    shared = as_shared(learning.task)
+    messages = []
     for region, frames in chosen.items():
         messages += shared.pack_samples(Frames.open(work.inputs[pools[region]]).data, config, frames)
     samples = shared.unpack_samples(messages, config)
@@ -117,9 +119,9 @@ def choose_uploads(pools: Mapping[str, Sequence[int]], samples: int, seed: int) 
 def choose_planned_uploads(
     pools: Mapping[str, Mapping[str, Sequence[int]]], uploads: Mapping[str, int], seed: int
 ) -> dict[str, tuple[int, ...]]:
-    """Draw the frames that each vehicle uploads from its own, as many as `uploads` says; return them by region.
+    """Draw the frames that vehicles upload, in the numbers of `uploads` by vehicle; return them by region.
 
-    pools: by region the frames of each vehicle, "region/vehicle".
+    `pools`: frame numbers by region and "region/vehicle".
     """
     chosen: dict[str, tuple[int, ...]] = {}
     for region, vehicles in pools.items():
@@ -135,13 +137,13 @@ def choose_planned_uploads(
 def upload_samples(
     book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int], stage: str = PRETRAIN
 ) -> Sequence[Any]:
-    """Return the samples of frames as they reach the cloud: from vehicle to edge server (wireless), then by wireline.
+    """Upload the `chosen` frames from vehicles to the cloud (wireless, then wireline); return the received samples.
 
-    Messages enter `book` under `stage`.
-
-    Samples of a task without messages of its own are read from the recording, each on access.
+    Messages enter `book` under `stage`. The samples of a task that does not define messages are read from the recording
+    on access.
     """
-    shared, received = as_shared(task), []
+    shared = as_shared(task)
+    received = []
     about: Any = {"stage": stage, "task": task.name, "direction": "up"}
     for frame, message in zip(chosen, shared.pack_samples(pool.data, config, chosen), strict=True):
         key = pool.data.keys[frame]

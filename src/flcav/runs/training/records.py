@@ -1,4 +1,4 @@
-"""Records of a run's rounds: read from each federation's checkpoint; a table (Parquet) and curves (TensorBoard)."""
+"""Records of a run's rounds, read from its federations' checkpoints: a table (Parquet) and curves (TensorBoard)."""
 
 import shutil
 from collections import Counter
@@ -16,7 +16,7 @@ from flcav.runs.results.training import FederatedRound, StageResult
 from flcav.runs.training.checkpoints import LAST, Checkpoint
 from flcav.storage.records import write_any_table
 
-ROUNDS, EVENTS = "rounds.parquet", "events"  # of a run, beside its results
+ROUNDS, EVENTS = "rounds.parquet", "events"  # in the folder of a run's results
 SCHEMA = pa.schema(
     [
         *((name, pa.string()) for name in ("arm", "stage", "task", "server")),
@@ -37,11 +37,11 @@ SCHEMA = pa.schema(
 def read_rounds(
     folder: Path, region: str | None, before: int, seconds: Mapping[str, Sequence[float]] = {}
 ) -> tuple[FederatedRound, ...]:
-    """Return the rounds of the federation in `folder`, with the bytes of their messages.
+    """Read the rounds of the federation in `folder`, with the bytes of their messages.
 
-    region: of stage II; of stage III None, and the cloud's rounds come before those of the edge servers. before: number
-    of entries that its ledger begins with, of messages before the first round. seconds: of each round, by server, where
-    there is a network.
+    `region`: that of a stage II; None for stage III, where the cloud's rounds precede those of the edge servers.
+    `before`: number of ledger entries before the first round. `seconds`: durations of the rounds [s], by server; empty
+    without a network.
     """
     if not (folder / LAST).exists():
         return ()
@@ -53,19 +53,19 @@ def read_rounds(
         for record in records:
             sent = Counter[str]()
             for entry in entries:
-                own = server == CLOUD or entry.client.startswith(f"{server}/")
-                if own and (entry.link, entry.round) == (link, record.round):
+                concerned = server == CLOUD or entry.client.startswith(f"{server}/")
+                if concerned and (entry.link, entry.round) == (link, record.round):
                     sent[entry.direction] += entry.bytes
             about = (record.clients, record.failed, record.samples, record.loss)
             took = seconds.get(server)
             lasted = took[record.round - 1] if took else None
-            told = (sent["up"], sent["down"], record.epsilon, lasted, record.divergence, record.empty)
-            found.append(FederatedRound(server, record.round, *about, *told))
+            measured = (sent["up"], sent["down"], record.epsilon, lasted, record.divergence, record.empty)
+            found.append(FederatedRound(server, record.round, *about, *measured))
     return tuple(found)
 
 
 def list_rounds(run: Run) -> Iterator[tuple[str, StageResult, FederatedRound]]:
-    """Yield arm, stage and record of every round of a run; steps that arms share come with each of them."""
+    """Yield arm, stage and record of every round of a run; steps that arms share are repeated for all of these."""
     for arm, result in run.arms.items():
         for stage in result.stages:
             for record in stage.records or ():
@@ -73,7 +73,7 @@ def list_rounds(run: Run) -> Iterator[tuple[str, StageResult, FederatedRound]]:
 
 
 def tabulate_federated_rounds(run: Run) -> pa.Table:
-    """Return a table with a row per arm, stage, task, server and round."""
+    """Return a table with one row per arm, stage, task, server and round."""
     rows = [
         {
             **vars(record),
@@ -90,7 +90,7 @@ def tabulate_federated_rounds(run: Run) -> pa.Table:
 def write_rounds(run: Run, out: Path) -> None:
     """Write `tabulate_federated_rounds` to `out`/rounds.parquet, and the curves of every federation to `out`/events.
 
-    There is a folder of TensorBoard's event files for each arm, stage, task and server.
+    There is a folder of TensorBoard event files per arm, stage, task and server.
     """
     write_any_table(tabulate_federated_rounds(run), out / ROUNDS)
     shutil.rmtree(out / EVENTS, ignore_errors=True)

@@ -1,6 +1,6 @@
-"""Time that clients train in a round, measured where they train and kept beside the checkpoints of their federation.
+"""Training times of clients, measured where they train and kept in the folder of their federation's checkpoints.
 
-It is CPU time: that of a machine on which nothing else runs. No result depends on it.
+They are CPU times, as on a machine on which nothing else runs. No result depends on them.
 """
 
 import contextlib
@@ -21,16 +21,16 @@ TIMES = "train_s.csv"  # in the folder of a federation
 
 @dataclass(frozen=True)
 class TrainTimes(Saved):
-    """Times of local training, and the speeds of vehicles, as a run recipe has them."""
+    """Times of local training, and relative speeds of vehicles, as a run recipe takes them."""
 
-    train_s: Mapping[str, float]  # by task: median of all trainings of all vehicles [s]
-    vehicle_train_s: Mapping[str, Mapping[str, float]]  # by task and "region/vehicle": median of its own trainings [s]
-    speed: Mapping[str, Mapping[str, float]]  # by region and vehicle: train_s over its own, each summed over its tasks
+    train_s: Mapping[str, float]  # by task: median over all trainings of all vehicles [s]
+    vehicle_train_s: Mapping[str, Mapping[str, float]]  # by task and "region/vehicle": median over its trainings [s]
+    speed: Mapping[str, Mapping[str, float]]  # by region and vehicle: ratio of `train_s` to its time, summed over tasks
 
 
 @dataclass(frozen=True)
 class TimedClient:
-    """A client that appends the CPU time of each local training [s] to a file."""
+    """A client that appends the CPU times of its local trainings [s] to a file."""
 
     name: str
     client: Trainable
@@ -41,7 +41,7 @@ class TimedClient:
         begun = time.process_time()
         update = self.client.train(weights, **how)
         spent = time.process_time() - begun
-        with contextlib.suppress(OSError), self.path.open("a") as file:  # a full disk is the checkpoint's to tell
+        with contextlib.suppress(OSError), self.path.open("a") as file:  # of a full disk the checkpoint reports
             file.write(f"{self.name},{spent:.6f}\n")
         return update
 
@@ -51,7 +51,7 @@ class TimedClient:
 
 
 def time_clients(clients: Mapping[str, Trainable], folder: Path) -> dict[str, TimedClient]:
-    """Return clients whose times of training are kept in `folder`; a line there that was cut off is removed."""
+    """Return clients whose training times are kept in `folder`; an incomplete last line there is removed."""
     folder.mkdir(parents=True, exist_ok=True)
     path = (folder / TIMES).resolve()  # actors may have another working directory
     if path.exists():
@@ -60,11 +60,13 @@ def time_clients(clients: Mapping[str, Trainable], folder: Path) -> dict[str, Ti
 
 
 def read_times(folder: Path) -> dict[str, list[float]]:
-    """Return the times of all trainings of a federation by client [s]; none where they were not measured."""
+    """Read the times of all trainings of a federation [s], by client; empty where they were not measured."""
     if not (folder / TIMES).exists():
         return {}
     times: dict[str, list[float]] = {}
-    *whole, _ = (folder / TIMES).read_text().split("\n")  # a line that is cut off was being written at a kill
+    *whole, _ = (
+        (folder / TIMES).read_text().split("\n")
+    )  # an incomplete line was being written when the process was killed
     for line in whole:
         name, _, spent = line.rpartition(",")
         times.setdefault(name, []).append(float(spent))
@@ -72,20 +74,22 @@ def read_times(folder: Path) -> dict[str, list[float]]:
 
 
 def summarise_times(measured: Mapping[str, Mapping[str, Sequence[float]]]) -> TrainTimes:
-    """Return medians and speeds of the times of trainings [s] by task and client, "region/vehicle".
+    """Return medians and relative speeds from the times of trainings [s], by task and "region/vehicle".
 
     A vehicle of speed 0.5 takes twice the `train_s` for a round. Tasks without a training are left out.
     """
-    own = {
+    medians = {
         task: {name: float(np.median(times)) for name, times in sorted(clients.items())}
         for task, clients in measured.items()
         if clients
     }
-    typical = {task: float(np.median([spent for times in measured[task].values() for spent in times])) for task in own}
+    typical = {
+        task: float(np.median([spent for times in measured[task].values() for spent in times])) for task in medians
+    }
     speed: dict[str, dict[str, float]] = {}
-    for client in sorted({name for clients in own.values() for name in clients}):
-        tasks = [task for task in own if client in own[task]]
+    for client in sorted({name for clients in medians.values() for name in clients}):
+        tasks = [task for task in medians if client in medians[task]]
         region, _, vehicle = client.rpartition("/")
-        taken = sum(own[task][client] for task in tasks)
+        taken = sum(medians[task][client] for task in tasks)
         speed.setdefault(region, {})[vehicle] = sum(typical[task] for task in tasks) / taken
-    return TrainTimes(typical, own, speed)
+    return TrainTimes(typical, medians, speed)

@@ -1,4 +1,4 @@
-"""Forms and sizes of the updates that vehicles send, and the rounds that a plan gives each vehicle."""
+"""Forms and sizes of the updates that vehicles send, and the rounds in which a plan has them take part."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -26,12 +26,12 @@ class UpdateForm(Config):
     """The form in which a client's update is sent, as far as its size depends on it."""
 
     upload: Upload = Upload()
-    exchanging: bool = False  # with an array beside each that is learned
+    exchanging: bool = False  # with a second array for every learned one
     frames: int | None = None  # class probabilities of so many shared frames instead; None: weights
 
 
 def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
-    """Return the different forms of the arms' updates, in the order of the arms."""
+    """Return the distinct forms of the arms' updates, in the order of the arms."""
     forms = []
     for setting in settings:
         how = setting.federation
@@ -44,9 +44,9 @@ def update_forms(settings: Iterable[Setting]) -> list[UpdateForm]:
 
 
 def follow_plan(how: Federation, plan: TaskPlan, *, after_edge: bool) -> Rules:
-    """Return the rules by which vehicles join the rounds that the plan gives them, of stage II or after it.
+    """Return the rules by which vehicles join their planned rounds, in stage II or after it.
 
-    Another selection than that of all vehicles goes before the plan's.
+    A selection in the recipe other than all vehicles has precedence over the plan.
     """
     if plan.joins is None or how.selection.rule != "all":
         return how
@@ -55,7 +55,7 @@ def follow_plan(how: Federation, plan: TaskPlan, *, after_edge: bool) -> Rules:
 
 
 def model_mb(task: Task, network: str | None, forms: Sequence[UpdateForm] = (UpdateForm(),)) -> float:
-    """Return the serialised size of one model update [MB], the largest of its `forms`, by a dry run of the message."""
+    """Measure the serialised size of a model update [MB], the largest of its `forms`, by a dry run of the message."""
     weights = to_arrays(build_network(task, find_configuration(task, network), 0))
     return max(update_bytes(weights, form.upload, exchanging=form.exchanging) for form in forms) / BYTES_PER_MB
 
@@ -63,13 +63,14 @@ def model_mb(task: Task, network: str | None, forms: Sequence[UpdateForm] = (Upd
 def measure_exchange(
     task: Task, config: Any, pools: Sequence[Frames], forms: Sequence[UpdateForm], most: int, seed: int
 ) -> float | None:
-    """Return what a vehicle sends in a round to be combined [MB], the largest of the `forms`.
+    """Measure what a vehicle sends in a round to be combined [MB], the largest of the `forms`.
 
-    None where all of them are updates of weights. `most` frames are uploaded, of which those that are shared are drawn.
+    None where all of them are updates of weights. `most`: number of uploaded frames, from which shared ones are drawn.
     """
     if not any(form.frames for form in forms):
         return None
-    weights, sizes = to_arrays(build_network(task, config, 0)), []
+    weights = to_arrays(build_network(task, config, 0))
+    sizes = []
     every = [(pool, i) for pool in pools for i in pool.vehicles]
     drawn = [every[number] for number in stream(seed, "shared").permutation(len(every)).tolist()]
     for form in forms:
@@ -85,7 +86,7 @@ def measure_exchange(
 
 @dataclass(frozen=True)
 class RegionDrive:
-    """A drive of a region before its training, and how many training frames its vehicles will hold."""
+    """A drive of a region before its training, and the number of training frames that its vehicles will hold."""
 
     drive: Frames
     recorded: bool  # whether the region is a recorded dataset, whose poles are those that it was recorded from
@@ -95,9 +96,9 @@ class RegionDrive:
 
 @dataclass(frozen=True)
 class Sensors:
-    """The roadside sensors near which vehicles label their frames, as far as they are known before they are placed."""
+    """The roadside sensors near which vehicles label their frames, as far as known before their placement."""
 
-    poles: tuple[int, ...]  # numbers of those that are named
-    count: int  # of others, in each region
+    poles: tuple[int, ...]  # numbers of poles that the recipe names
+    count: int  # number of other sensors in a region
     traffic_m: float  # radius of the traffic around a pole [m]
     near_m: float  # vehicles label frames recorded within this distance of a sensor [m]

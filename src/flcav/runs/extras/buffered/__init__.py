@@ -1,1 +1,1 @@
-"""Buffered asynchronous rounds on the radio network: vehicles go on at their own pace, and nobody waits for them."""
+"""Buffered asynchronous rounds on the radio network: vehicles train at their speed, and nobody waits for them."""

@@ -1,8 +1,9 @@
 """Buffered asynchronous rounds of a run's vehicles on the radio network: the schedule that federations follow.
 
-The scenes of a region's training data follow one another without a gap, and repeat. Stage III is asynchronous below
-and synchronous above: a region's edge server waits, after its buffers of a cloud round, until the slowest region's are
-full and the models have gone up and down by wireline. Meanwhile vehicles go on, and none begins.
+The scenes of a region's training data follow one another without a gap, and repeat. Stage III is asynchronous among
+vehicles and synchronous among edge servers: after its buffers of a cloud round, an edge server waits until those of the
+slowest region are full and the models have been transferred up and down by wireline. Meanwhile vehicles continue their
+work, but none begins anew.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,37 +30,37 @@ from flcav.runs.stages.rounds import RegionStart, StageFederation
 from flcav.runs.stages.settings import FederationSettings, RegionInputs
 from flcav.runs.training.learning import Learning
 
-ALL_SCENES = 10**6  # more than there are
+ALL_SCENES = 10**6  # more than any dataset has
 
 
 @dataclass(frozen=True)
 class BufferedFleet:
-    """The vehicles of a region that fill buffers: their work, the scenes that they drive in, and rounds before."""
+    """The vehicles of a region that fill buffers: their work, the scenes in which they drive, and earlier rounds."""
 
     fleet: Fleet
     scenes: Sequence[RadioLinks]
-    before: Mapping[str, int]  # in how many rounds each client took part
+    before: Mapping[str, int]  # number of earlier rounds with updates, by client
 
     def open_clock(self, strategy: FedBuff, settings: NetworkSettings) -> BufferClock:
-        """Return the clock of the region's buffers."""
+        """Return the simulated clock of the region's buffers."""
         work = [self.fleet.work(client) for client in self.fleet.clients]
         return BufferClock(self.scenes, work, strategy.buffer, settings.rounds)
 
     def read(self, rules: Rules, timings: Sequence[BufferTiming]) -> DrivenRounds:
-        """Return the rounds of these buffers."""
+        """Return the rounds from the simulated times of their buffers."""
 
         def named(timing: ClientTiming) -> ClientTiming:
             return replace(timing, client=f"{self.fleet.region}/{timing.client}")
 
         rounds = []
-        for each in timings:
+        for filled in timings:
             broken = tuple(
-                BrokenUpdate(own.client, own.dropped, own.downloaded_bytes, own.uploaded_bytes)
-                for own in map(named, each.broken)
+                BrokenUpdate(update.client, update.dropped, update.downloaded_bytes, update.uploaded_bytes)
+                for update in map(named, filled.broken)
             )
-            versions = {f"{self.fleet.region}/{vehicle}": version for vehicle, version in each.versions.items()}
+            versions = {f"{self.fleet.region}/{vehicle}": version for vehicle, version in filled.versions.items()}
             rounds.append(FilledBuffer(versions, broken))
-        records = tuple(each.as_round() for each in timings)
+        records = tuple(filled.as_round() for filled in timings)
         return DrivenRounds(rules, {}, records, Buffers(tuple(rounds), self.before))
 
 
@@ -72,29 +73,30 @@ def drive_buffers(
     cloud_rounds: int = 1,
     ways_s: float | None = None,
 ) -> tuple[dict[str, DrivenRounds], DrivenStage]:
-    """Return the buffered rounds of a stage by region, and all together; raises `InputError` as `BufferClock`.
+    """Simulate the buffered rounds of a stage; return them by region, and joined. Raises `InputError` as `BufferClock`.
 
     Args:
         fleets: vehicles by region.
-        strategy: of the regions.
-        settings: of radio and the rounds of vehicles.
+        strategy: of the regions' edge servers.
+        settings: of the radio and of the vehicles' rounds.
         rules: of all regions.
-        each: number of buffers of a region, in a cloud round.
+        each: number of buffers in a cloud round, by region.
         cloud_rounds: number of cloud rounds.
-        ways_s: that the ways of a model down and up by wireline take [s]; None: there is no cloud.
+        ways_s: time of a model's transfers down and up by wireline [s]; None: there is no cloud.
     """
-    clocks = {region: own.open_clock(strategy, settings) for region, own in fleets.items()}
+    clocks = {region: fleet.open_clock(strategy, settings) for region, fleet in fleets.items()}
     timings: dict[str, list[BufferTiming]] = {region: [] for region in fleets}
-    ended, seconds = 0.0, list[float]()
+    ended = 0.0
+    seconds = list[float]()
     for _ in range(cloud_rounds):
         for region, clock in clocks.items():
             timings[region] += [clock.fill() for _ in range(each[region])]
-        ends = max((own[-1].end_s for own in timings.values() if own), default=ended) + (ways_s or 0.0)
+        ends = max((filled[-1].end_s for filled in timings.values() if filled), default=ended) + (ways_s or 0.0)
         for clock in clocks.values():
             clock.hold(ends)
         seconds.append(ends - ended)
         ended = ends
-    driven = {region: own.read(rules, timings[region]) for region, own in fleets.items()}
+    driven = {region: fleet.read(rules, timings[region]) for region, fleet in fleets.items()}
     joined = join_regions(driven)
     return driven, joined if ways_s is None else replace(joined, seconds={**joined.seconds, CLOUD: seconds})
 
@@ -102,43 +104,44 @@ def drive_buffers(
 def count_buffers(
     strategy: Strategy, rounds: int, starts: Mapping[str, RegionStart], cloud: bool
 ) -> tuple[int, Mapping[str, RegionStart]]:
-    """Return rounds and regions, with as many buffers as hold the updates of so many rounds.
+    """Convert rounds to buffers that hold as many updates; return their number, and the regions with theirs.
 
-    In a cloud round each region fills one at least. Raises `InputError` where a region has fewer vehicles than a buffer
+    In a cloud round a region fills at least one. Raises `InputError` where a region has fewer vehicles than a buffer
     has updates.
     """
     if not isinstance(strategy, FedBuff):
         return rounds, starts
-    for region, own in starts.items():
-        strategy.check_buffer(len(own.clients))
+    for region, start in starts.items():
+        strategy.check_buffer(len(start.clients))
         if cloud:
-            k = max(strategy.count_rounds(own.edge_rounds, len(own.clients)), 1)
-            starts = {**starts, region: replace(own, edge_rounds=k)}
+            k = max(strategy.count_rounds(start.edge_rounds, len(start.clients)), 1)
+            starts = {**starts, region: replace(start, edge_rounds=k)}
         else:
-            rounds = strategy.count_rounds(rounds, len(own.clients))
+            rounds = strategy.count_rounds(rounds, len(start.clients))
     return rounds, starts
 
 
 def drive_stage(
     work: Work, settings: StageSettings, federation: StageFederation, ways_s: float | None
 ) -> DrivenStage | None:
-    """Return the buffered rounds of a stage, and write their clock; None for another strategy or without a network.
+    """Simulate the buffered rounds of a stage, and write their times; None for another strategy or without a network.
 
-    ways_s: that the ways of a model down and up by wireline take [s]; None: there is no cloud.
+    `ways_s`: time of a model's transfers down and up by wireline [s]; None: there is no cloud.
     """
-    strategy, network = federation.strategies.edge, settings.federation.network
+    strategy = federation.strategies.edge
+    network = settings.federation.network
     if not isinstance(strategy, FedBuff) or network is None:
         return None
     fleets = {
-        region: open_buffered_fleet(work, settings, federation.learning, settings.regions[region], [*own.clients])
-        for region, own in federation.regions.items()
+        region: open_buffered_fleet(work, settings, federation.learning, settings.regions[region], [*start.clients])
+        for region, start in federation.regions.items()
     }
     rounds = federation.schedule.rounds
-    each = {name: rounds if ways_s is None else own.edge_rounds for name, own in federation.regions.items()}
+    counts = {name: rounds if ways_s is None else start.edge_rounds for name, start in federation.regions.items()}
     times = 1 if ways_s is None else rounds
-    driven, stage = drive_buffers(fleets, strategy, network, settings.federation, each, times, ways_s)
-    for region, own in driven.items():
-        save_clock(own, work, region)
+    driven, stage = drive_buffers(fleets, strategy, network, settings.federation, counts, times, ways_s)
+    for region, regional in driven.items():
+        save_clock(regional, work, region)
     return stage
 
 
@@ -146,12 +149,13 @@ def open_buffered_fleet(
     work: Work, settings: FederationSettings, learning: Learning, inputs: RegionInputs, clients: Sequence[str]
 ) -> BufferedFleet:
     """Return the vehicles of a region that fill buffers, in all scenes of its training data."""
-    network, before = settings.federation.network, ()
-    assert network is not None  # of recipes that are checked
+    network = settings.federation.network
+    before = ()
+    assert network is not None  # see `check_buffers`
     if inputs.edge is not None:
         before = StageResult.load(work.inputs[inputs.edge]).records or ()
     scenes = link_stage_scenes(work, inputs, network, ALL_SCENES, learning.seed)
-    took_part = count_participations([(each.clients, [*each.failed]) for each in before])
+    took_part = count_participations([(record.clients, [*record.failed]) for record in before])
     return BufferedFleet(open_region_fleet(settings, learning, inputs.region, clients), scenes, took_part)
 
 

@@ -1,4 +1,4 @@
-"""Checks of labels by the road average in a recipe, and how an arm has them."""
+"""Checks of labels by the road average in a recipe, and an arm's settings of them."""
 
 from flcav.config import InputError, parse_config
 from flcav.federation.strategies import Strategy
@@ -19,7 +19,7 @@ def _join(recipe: RunRecipe, arm: Arm) -> dict[str, object]:
 
 
 def check_arms(recipe: RunRecipe) -> None:
-    """Raise ValueError where an arm has fields or values that `Distillation` has not."""
+    """Raise `ValueError` where an arm has fields or values that `Distillation` does not accept."""
     for name, arm in recipe.arms.items():
         try:
             parse_config(Distillation, _join(recipe, arm), f"arms.{name}.distillation")
@@ -28,9 +28,10 @@ def check_arms(recipe: RunRecipe) -> None:
 
 
 def check_averaged(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where noise or masks hide what each vehicle learns of the labels that they make together.
+    """Check that labels by the road average go with an arm's other settings.
 
-    Also where these labels, whose loss is another, come with imitation, and for a pose graph without GTSAM.
+    Raises `InputError` where noise or masks hide updates, since the messages for these labels are not covered; where
+    imitation is asked for, since these labels have another loss; and for a pose graph without GTSAM.
     """
     how = setting.federation
     averaged = [task for task, kind in setting.labels.items() if LABEL_SOURCES[kind].averaged]

@@ -1,10 +1,10 @@
-"""Labels by the road average in a region's rounds: vehicles send what they detect, the edge server averages.
+"""Labels by the road average in a region's rounds: vehicles send their detections, the edge server averages them.
 
-Before each round every vehicle detects with the weights that the round begins with, in its frames and in what it
-recorded around them, sends boxes and its own poses up, and receives the road average of its frames' windows; its
-samples are then relabelled. A window is centred on its frame: labels are made after the drive, so that what came
-after the frame is known, too. All messages are entered in the ledger; what a vehicle tells of a spin is sent once, for
-all windows that the spin is in. After stage II samples are labelled once, before the first round.
+Before a round, a vehicle detects objects with the weights that the round begins with, in its frames and in the sweeps
+that it recorded around them, sends boxes and poses to the edge server, and receives the road average in the windows of
+its frames; its samples are then relabelled. A window is centred on its frame: labels are made after the drive, when the
+sweeps after the frame are known, too. All messages are entered in the ledger; a vehicle sends its message about a spin
+once, for all windows that contain the spin. After stage II samples are labelled once, before the first round.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -47,7 +47,7 @@ from flcav.runs.stages.settings import FederationSettings
 from flcav.runs.training.learning import Learning
 from flcav.world.map.lanes import map_layers
 
-SURVEYED = np.eye(4)  # pose of a road sensor: it sends its boxes in the world frame
+SURVEYED = np.eye(4)  # pose of a road sensor, whose position is surveyed: it sends its boxes in the world frame
 
 
 class RoadAverageLabels(RenewedSamples):
@@ -61,25 +61,31 @@ class RoadAverageLabels(RenewedSamples):
         folder: Path | None = None,
         report: Report = ignore_progress,
     ) -> None:
-        """Hold the vehicles' frames, to be labelled with the sensors on the poles; `about` names both.
+        """Prepare the vehicles' frames and the sensors on the poles, both given by `about`, without labels yet.
 
-        poses: of the vehicles' navigation. folder: where the quality of the labels is kept, `read_label_history`; None:
-        nowhere. The threshold of `about` holds for labels that only vehicles contribute to.
+        `poses`: of the vehicles' navigation. `folder`: where the quality of the labels is kept, see
+        `read_label_history`; None: nowhere. The score threshold of `about` applies to labels from vehicles alone.
         """
         split, frames = about.split, about.frames
         config: SecondConfig = about.config
-        self._how, self._config, self._threshold = how, config, about.threshold
+        self._how = how
+        self._config = config
+        self._threshold = about.threshold
         self._poses: PoseSource = poses
-        self._split, self._region = split, about.inputs.region
-        self._frames, self._book, self._stage = frames, about.book, about.stage
-        self._folder, self._report = folder, report
-        self._told = list_window(split, frames, how.window_s)
+        self._split = split
+        self._region = about.inputs.region
+        self._frames = frames
+        self._book = about.book
+        self._stage = about.stage
+        self._folder = folder
+        self._report = report
+        self._sent = list_window(split, frames, how.window_s)  # frames that vehicles send messages about
         seen = [i for pole in about.poles for i in split.poles.get(pole, ())]
-        self._time_s = {self._spin(i): split.data.keys[i].time_s for i in (*seen, *self._told)}
+        self._time_s = {self._spin(i): split.data.keys[i].time_s for i in (*seen, *self._sent)}
         self._around = {spin: self._find_around(spin) for spin in dict.fromkeys(map(self._spin, frames))}
         spins = {spin for around in self._around.values() for spin in around}
         self._views = road_views(split, about.poles, True, spins)
-        self._seen_by = {i: self._list_views(self._spin(i)) for i in frames}  # as each frame's vehicle has them
+        self._seen_by = {i: self._list_views(self._spin(i)) for i in frames}  # as the frame's vehicle receives them
         town = split.data.town() if how.pose_graph or how.map_context else None
         self._posts = None
         if how.pose_graph:
@@ -104,7 +110,7 @@ class RoadAverageLabels(RenewedSamples):
         return len(self._samples)
 
     def list_quality(self) -> tuple[LabelQuality, ...]:
-        """Return the quality of the labels before each round so far; none where it is not kept."""
+        """Return the quality of the labels before the rounds so far; empty where it is not kept."""
         return () if self._folder is None else read_label_history(self._folder).rounds
 
     def _name(self, frame: int) -> str:
@@ -116,8 +122,9 @@ class RoadAverageLabels(RenewedSamples):
     def _find_around(self, spin: Spin) -> tuple[Spin, ...]:
         """Return the spins in the window around a spin, the spin itself first."""
         ends = self._time_s[spin] - self._how.window_s - SLACK_S, self._time_s[spin] + self._how.window_s + SLACK_S
-        near = (each for each, time_s in self._time_s.items() if each[0] == spin[0] and ends[0] <= time_s <= ends[1])
-        return spin, *(each for each in near if each != spin)
+        times = self._time_s.items()
+        near = (other for other, time_s in times if other[0] == spin[0] and ends[0] <= time_s <= ends[1])
+        return spin, *(other for other in near if other != spin)
 
     def _list_views(self, spin: Spin) -> list[RoadView]:
         return [*self._views.get(spin, {}).values()]
@@ -129,46 +136,47 @@ class RoadAverageLabels(RenewedSamples):
             self._seen_by[i] = [RoadView.from_message(message) for message in sent]
 
     def renew(self, round_: int, weights: Weights) -> None:
-        """Label all samples by the road average of what `weights` detect, before a round."""
+        """Relabel all samples by the road average of detections with `weights`, before a round."""
         network = second(self._config)
         from_arrays(network, weights)
-        told: dict[int, Sighting] = {}
-        own: dict[int, Boxes] = {}
-        for done, i in enumerate(self._told, start=1):
-            sighting, own[i] = make_sighting(network, self._split.data, i, self._how, self._poses)
-            told[i] = unpack_sighting(sighting.agent, self._send("up", i, round_, pack_sighting(sighting)))
-            self._report(done, len(self._told), "labels")
+        received: dict[int, Sighting] = {}
+        detected: dict[int, Boxes] = {}
+        for done, i in enumerate(self._sent, start=1):
+            sighting, detected[i] = make_sighting(network, self._split.data, i, self._how, self._poses)
+            received[i] = unpack_sighting(sighting.agent, self._send("up", i, round_, pack_sighting(sighting)))
+            self._report(done, len(self._sent), "labels")
         given = {
             i: Guidance.from_message(self._send("down", i, round_, guidance.message()))
-            for i, guidance in self._average(told)
+            for i, guidance in self._average(received)
         }
         place = dict.fromkeys(self._samples, 0)
         for i in self._frames:
-            name, frame = self._name(i), self._split.data.frame(i)
+            name = self._name(i)
+            frame = self._split.data.frame(i)
             views, lidar = self._seen_by[i], choose_lidar(frame)
-            self._samples[name][place[name]] = distil_sample(frame, own[i], given[i], views, self._config, lidar)
+            self._samples[name][place[name]] = distil_sample(frame, detected[i], given[i], views, self._config, lidar)
             place[name] += 1
         if self._folder is not None:
-            kept = tuple(each for each in read_label_history(self._folder).rounds if each.round < round_)
+            kept = tuple(known for known in read_label_history(self._folder).rounds if known.round < round_)
             quality = measure_labels(round_, self._split, self._frames, self._region, self, self._config)
             LabelHistory((*kept, quality)).save(self._folder, LABELS)
 
-    def _average(self, told: Mapping[int, Sighting]) -> Iterator[tuple[int, Guidance]]:
-        """Yield the number of each frame to be labelled, and the averaged boxes that its vehicle receives."""
+    def _average(self, received: Mapping[int, Sighting]) -> Iterator[tuple[int, Guidance]]:
+        """Yield the numbers of the frames to be labelled, with the averaged boxes that their vehicles receive."""
         spins: dict[Spin, dict[int, Sighting]] = {}
-        for i, sighting in told.items():
+        for i, sighting in received.items():
             spins.setdefault(self._spin(i), {})[i] = sighting
         seen = {
             spin: [Sighting(f"pole {n}", self._time_s[spin], SURVEYED, view.boxes) for n, view in views.items()]
             for spin, views in self._views.items()
         }
-        asked = set(self._frames)
+        wanted = set(self._frames)
         for spin, (_, *others) in self._around.items():
-            around = [one for each in others for one in (*spins.get(each, {}).values(), *seen.get(each, ()))]
+            around = [one for other in others for one in (*spins.get(other, {}).values(), *seen.get(other, ()))]
             middle = [*spins[spin].values(), *seen.get(spin, ())]
             how = (self._config, self._threshold, self._posts, self._context, around)
             found = average_spin(middle, self._list_views(spin), *how)
-            yield from (each for each in zip(spins[spin], found, strict=True) if each[0] in asked)
+            yield from (pair for pair in zip(spins[spin], found, strict=True) if pair[0] in wanted)
 
     def _send(self, direction: Direction, i: int, round_: int, message: bytes) -> bytes:
         about: Any = {"stage": self._stage, "task": OBJECTS.name, "link": "wireless", "client": self._name(i)}
@@ -176,11 +184,12 @@ class RoadAverageLabels(RenewedSamples):
 
 
 def label_by_average(work: Work, settings: FederationSettings, about: Labelling) -> RoadAverageLabels | None:
-    """Return a region's samples, to be labelled by the road average, once vehicles have what road sensors see.
+    """Return a region's samples, to be labelled by the road average, after sending vehicles the road sensors' views.
 
-    None of other labels. After a stage II they have it.
+    None for other labels. After a stage II vehicles have the views.
     """
-    how, first = settings.distillation, about.inputs.edge is None
+    how = settings.distillation
+    first = about.inputs.edge is None
     if how is None:
         return None
     found = RoadAverageLabels(how, settings.navigation, about, work.folder if first else None, work.report)

@@ -1,7 +1,7 @@
-"""Sizes of what vehicles send to have their samples labelled by the road average, by dry runs of the messages.
+"""Sizes of the messages by which vehicles have their samples labelled by the road average, measured by dry runs.
 
-Sensors are placed after the plan, and detections follow from training: so boxes are those of annotated targets, in
-frames of a drive before, near the poles with most traffic.
+Sensors are placed after the plan, and detections follow from training: the boxes are therefore annotated targets, in
+frames of an earlier drive, near the poles with most traffic.
 """
 
 from collections.abc import Sequence
@@ -24,25 +24,26 @@ from flcav.world.map.census import measure_traffic_density
 def measure_messages(
     regions: Sequence[RegionDrive], sensors: Sensors, how: Distillation, config: SecondConfig
 ) -> float:
-    """Return what a vehicle sends to have its samples labelled once by the road average [MB], in the mean.
+    """Return the mean size of a vehicle's messages for one labelling of its samples by the road average [MB].
 
-    A recorded region has in its windows what it has. In a town one more spin is recorded before each frame and after;
-    where a spin lies between two frames it is sent once, and this is more than is sent.
+    In a recorded region the windows contain what was recorded. In a town one more spin is recorded before and after a
+    frame; the size is an upper bound there, since a spin between two frames is sent once.
     """
-    sent, vehicles = 0.0, 0
+    sent = 0.0
+    vehicles = 0
     for region in regions:
         drive = region.drive
         near = select_frames_near(drive, _expect_sensors(region, sensors), sensors.near_m)
-        told = list_window(drive, near, how.window_s) if region.recorded else near
+        reported = list_window(drive, near, how.window_s) if region.recorded else near
         spins = 3 if how.window_s and not region.recorded else 1
-        each = sum(_sighting_bytes(drive, i, how, config) for i in told) / len(drive.vehicles)
-        sent += region.training_frames * spins * each
+        per_vehicle = sum(_sighting_bytes(drive, i, how, config) for i in reported) / len(drive.vehicles)
+        sent += region.training_frames * spins * per_vehicle
         vehicles += region.vehicles
     return sent / vehicles / BYTES_PER_MB
 
 
 def _expect_sensors(region: RegionDrive, sensors: Sensors) -> np.ndarray:
-    """Return the places (S, 2) of a region's sensors, world [m]: on named poles, and those with most traffic."""
+    """Return the expected positions (S, 2) of a region's sensors, world frame [m]: named poles, and most traffic."""
     sites = find_sites(region.drive, region.drive if region.recorded else None)
     named = np.flatnonzero(np.isin(sites.number, sensors.poles))
     traces = read_traces(region.drive.data, region.drive.vehicles)
@@ -52,8 +53,9 @@ def _expect_sensors(region: RegionDrive, sensors: Sensors) -> np.ndarray:
 
 
 def _sighting_bytes(drive: Frames, i: int, how: Distillation, config: SecondConfig) -> int:
-    """Return the size of a vehicle's message on a frame, with its annotated boxes for detections [bytes]."""
+    """Return the size of a vehicle's message about a frame [bytes], with annotated boxes in place of detections."""
     frame, key = drive.data.frame(i), drive.data.keys[i]
     boxes = asked_of(frame, config).targets
-    posts, accuracy = find_told_posts(frame, how), NavigationErrors().stated
+    posts = find_told_posts(frame, how)
+    accuracy = NavigationErrors().stated
     return len(pack_sighting(Sighting(key.agent, key.time_s, frame.world_from_agent, boxes, posts, accuracy)))

@@ -11,7 +11,7 @@ from flcav.runs.recipe import Federation, RunRecipe
 
 
 def count_called(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:
-    """Return what a plan chooses the vehicles of a group on request from; None for a fixed roster."""
+    """Return the range from which a plan chooses the size of a group on request; None for a fixed roster."""
     if how.requests is None:
         return None
     most = how.requests.most or max(map(recipe.vehicles, recipe.with_role("federate")))
@@ -19,18 +19,19 @@ def count_called(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:
 
 
 def check_groups(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where an arm has groups on request, and these do not go with the rest of it."""
+    """Raise `InputError` where an arm has groups on request that conflict with its other settings."""
     if setting.federation.requests is not None:
         check_roster(recipe, setting, strategy)
 
 
 def check_roster(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where a group of any number of vehicles does not go with a strategy, rules or labels."""
-    how, told = setting.federation, "requests: how many vehicles a group has is not known before"
+    """Raise `InputError` where a strategy, rules or labels conflict with groups, whose size is not known before."""
+    how = setting.federation
+    reason = "requests: how many vehicles a group has is not known before"
     if isinstance(strategy, FedBuff | FedMD) or needs_known_number(strategy):
-        raise InputError(f"{told}, and {type(strategy).__name__} needs a known roster")
+        raise InputError(f"{reason}, and {type(strategy).__name__} needs a known roster")
     if how.selection.rule != "all" or how.least_clients is not None or how.secure is not None:
-        raise InputError(f"{told}; leave out 'selection', 'least_clients' and 'secure'")
+        raise InputError(f"{reason}; leave out 'selection', 'least_clients' and 'secure'")
     if how.privacy is not None:
         raise InputError("privacy: requests and offers tell of a vehicle's data, and no noise covers them")
     if plans_joiners(recipe, setting):

@@ -1,8 +1,8 @@
 """Groups of edge FL on request: requests, selection of members, and early stopping (Wang et al., IEEE Network, 2023).
 
-A vehicle checks the network that drives against its own labels (of its tracks, the map or the road's boxes) on frames
-that it holds back from training. Where it errs, it sends a request. Whoever is in range of it offers its data: counts
-of its labels and a sketch of its gradient, by which the lead measures what the data add.
+A vehicle checks the deployed network against its labels (from tracks, the map or the road's boxes) on frames that it
+holds back from training. Where the network errs, it sends a request. Vehicles in range of it offer their data: counts
+of labels and a sketch of the gradient, by which the lead estimates how much the data add.
 """
 
 import contextlib
@@ -32,15 +32,15 @@ FULL = "the group is full"
 class Chosen:
     """The members of a group in a region, by name, and the reasons why others did not join."""
 
-    members: tuple[str, ...]  # those that asked first
-    quality: Mapping[str, float]
-    stayed: Mapping[str, str]
+    members: tuple[str, ...]  # those that sent requests first
+    quality: Mapping[str, float]  # of the offered data in (0, 1], by client
+    stayed: Mapping[str, str]  # reason for not joining, by client
 
 
 def weigh_offers(offers: Mapping[str, Offer]) -> dict[str, float]:
-    """Return the quality in (0, 1] of each offer's data: by labels, objects seen and novelty of the gradient.
+    """Return the quality of offered data in (0, 1], by client: from labels, visible objects and novelty of gradients.
 
-    A task without classes is judged by its gradients alone.
+    For a task without classes it depends on gradients alone.
     """
     classes = sorted({label for offer in offers.values() for label in offer.labels})
     counts = np.array([[offer.labels.get(label, 0) for label in classes] for offer in offers.values()])
@@ -51,18 +51,22 @@ def weigh_offers(offers: Mapping[str, Offer]) -> dict[str, float]:
 
 
 def find_in_range(positions: Mapping[str, Array], of: Sequence[str], range_m: float) -> list[str]:
-    """Return the clients within `range_m` [m] of any client in `of`, these included; positions (3,) [m, world]."""
+    """Return the clients within `range_m` [m] of any client in `of`, including these.
+
+    `positions`: (3,) by client, world frame [m].
+    """
     centres = [positions[name] for name in of if name in positions]
-    near = lambda own: any(np.linalg.norm(own - each) <= range_m for each in centres)  # noqa: E731
-    return [name for name, own in positions.items() if name in of or near(own)]
+    near = lambda position: any(np.linalg.norm(position - centre) <= range_m for centre in centres)  # noqa: E731
+    return [name for name, position in positions.items() if name in of or near(position)]
 
 
 def find_lead(
     positions: Mapping[str, Array], asked: Sequence[str], servers: Mapping[str, Array], range_m: float
 ) -> str:
-    """Return who leads: the nearest edge server in range of one that asked, or else the lowest identifier in range.
+    """Return the lead: the nearest edge server in range of a vehicle that `asked`, or else the lowest name in range.
 
-    positions: (3,) [m] of the vehicles that are there, by client; servers: (3,) [m] of edge servers by name.
+    `positions`: (3,) of the vehicles present, by client, world frame [m]. `servers`: (3,) of the edge servers, by name,
+    world frame [m]. `range_m`: range of V2X radio [m].
     """
     distances = {
         server: min(
@@ -83,10 +87,10 @@ def choose_members(
     stayed: Mapping[str, str],
     most: int | None = None,
 ) -> Chosen:
-    """Return the group: who asked, and of the others those whose data are good enough, the best first.
+    """Choose the members of a group: vehicles that `asked`, then those with good enough data, the best first.
 
-    asked: those that made an offer, who errs most first; quality: of all who made one; stayed: why others made none;
-    most: members by the plan, None: those of `how`.
+    `asked`: vehicles with requests and offers, the largest error first. `quality`: of all offers, by client. `stayed`:
+    reason for not making an offer, by client. `most`: number of members by the plan; None: that of `how`.
     """
     others = sorted((name for name in quality if name not in asked), key=lambda name: (-quality[name], name))
     good = [name for name in others if quality[name] >= how.least_quality * max(quality.values())]
@@ -96,9 +100,9 @@ def choose_members(
 
 
 def has_levelled(losses: Sequence[float], how: Requests) -> bool:
-    """Return whether the loss has levelled off: the last `patience` rounds lowered its least by too small a share.
+    """Return whether the loss has levelled off: the last `patience` rounds lowered its minimum by too small a share.
 
-    losses: before the first round, and after each.
+    `losses`: before the first round, and after every round.
     """
     if len(losses) <= how.patience:
         return False
@@ -111,26 +115,26 @@ class GroupWatch:
     """Early stopping of a group by the loss on its members' held-out frames, round by round."""
 
     how: Requests
-    members: Mapping[str, GroupMember]  # that hold something back, by client
-    losses: list[float] = field(default_factory=list)  # before the first round, and after each
+    members: Mapping[str, GroupMember]  # that hold samples back, by client
+    losses: list[float] = field(default_factory=list)  # before the first round, and after every round
 
     def enlist(self, clients: Mapping[str, Trainable]) -> dict[str, Trainable]:
-        """Return the clients of a group's rounds, whose members answer questions as well."""
-        members = {name: replace(own, client=clients[name]) for name, own in self.members.items()}
-        return {name: members.get(name, own) for name, own in clients.items()}
+        """Return the clients of a group's rounds; members among them also answer questions."""
+        members = {name: replace(member, client=clients[name]) for name, member in self.members.items()}
+        return {name: members.get(name, client) for name, client in clients.items()}
 
     def hear(self, ask: Ask, weights: Weights, *, counted: bool = True) -> dict[str, bytes]:
-        """Return the messages in which the members report a network's loss on their held-back samples."""
+        """Ask the members for a network's loss on their held-back samples; return their messages, by client."""
         replies = ask(SCORE, [*self.members], weights, counted=counted)
         return {name: answer[MESSAGE].tobytes() for name, answer in replies.answers.items() if MESSAGE in answer}
 
     def note(self, messages: Mapping[str, bytes]) -> None:
-        """Record the mean of the reported losses; if none is reported, that of the round before."""
-        told = [*read_losses(messages).values()]
-        self.losses.append(float(np.mean(told)) if told else self.losses[-1])
+        """Record the mean of the reported losses; if none is reported, that of the previous round."""
+        losses = [*read_losses(messages).values()]
+        self.losses.append(float(np.mean(losses)) if losses else self.losses[-1])
 
     def follow(self, book: Ledger, number: int, weights: Weights, ask: Ask) -> None:
-        """Note the loss after a round; the members' messages enter `book`. Raises `BudgetExceeded`."""
+        """Record the loss after a round; the members' messages enter `book`. Raises `BudgetExceeded`."""
         messages = self.hear(ask, weights)
         self.note(messages)
         for name, message in messages.items():
@@ -139,12 +143,12 @@ class GroupWatch:
 
     @property
     def over(self) -> bool:
-        """Return whether the loss has levelled off; that of members who hold nothing back never does."""
+        """Whether the loss has levelled off; it never does without members that hold samples back."""
         return bool(self.members) and has_levelled(self.losses, self.how)
 
 
 def read_losses(messages: Mapping[str, bytes]) -> dict[str, float]:
-    """Return the losses in messages, by client, without unreadable ones."""
+    """Decode the losses in messages, by client; unreadable messages are left out."""
     found: dict[str, float] = {}
     for name, message in messages.items():
         with contextlib.suppress(Unreadable):

@@ -74,17 +74,17 @@ if TYPE_CHECKING:
     from flcav.federation.links.flower import RegionalDeployment
     from flcav.runs.stages.rounds import Deployed
 
-EVERY_SCENE = 10**6  # more than there are
+EVERY_SCENE = 10**6  # more than any dataset has
 AnswerT = TypeVar("AnswerT")
-Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) [m] by client, see `find_client_places`
+Places = Mapping[str, NDArray[np.float64]]  # (scenes, 3) by client, world frame [m], see `find_client_places`
 
 
 @dataclass(frozen=True)
 class Called(Conduct):
-    """Conduct of the rounds of a region's group, which may be empty where no vehicle sent a request."""
+    """Conduct of the rounds of a region's group, which is empty if no vehicle sent a request."""
 
     group: Group
-    samples: Mapping[str, Sequence[Any]]  # that its members train on, by client
+    samples: Mapping[str, Sequence[Any]]  # training samples of its members and roadside units, by client
     watch: GroupWatch
     task: Task
     book: Ledger
@@ -92,17 +92,17 @@ class Called(Conduct):
 
     @property
     def within(self) -> frozenset[str]:
-        """Return the roadside units, which are at the edge server itself."""
+        """The roadside units, which are at the edge server itself."""
         return frozenset(self.group.roadside)
 
     @property
     def vacant(self) -> bool:
-        """Return whether the group has no members and no roadside units."""
+        """Whether the group has no members and no roadside units."""
         return not self.samples
 
     @property
     def over(self) -> bool:
-        """Return whether the group is to dissolve."""
+        """Whether the group is to dissolve."""
         return self.watch.over
 
     def choose(self, samples: Mapping[str, Sequence[Any]]) -> Mapping[str, Sequence[Any]]:
@@ -116,17 +116,17 @@ class Called(Conduct):
     def resume(
         self, folder: Path, clients: Mapping[str, Trainable], deployed: Any, account: Account, done: int
     ) -> None:
-        """Note the losses after the rounds that are over, whose weights are in `folder`."""
+        """Record the losses after the finished rounds, whose weights are in `folder`."""
         with open_questions(clients, deployed if done else None, account) as ask:
             for number in range(1, done + 1):
                 self.watch.note(self.watch.hear(ask, load_file(round_path(folder, number)), counted=False))
 
     def follow(self, number: int, weights: Weights, ask: Ask) -> None:
-        """Note the loss after a round; the members' messages enter the ledger. Raises `BudgetExceeded`."""
+        """Record the loss after a round; the members' messages enter the ledger. Raises `BudgetExceeded`."""
         self.watch.follow(self.book, number, weights, ask)
 
     def foresee(self, records: tuple[RoundTiming, ...], region: str) -> "Called":
-        """Return the group with the terms of its leads, where a vehicle leads it."""
+        """Return the group with the terms of its leads, if a vehicle leads it."""
         vehicles = [*self.group.members]
         if self.group.lead not in vehicles:
             return self
@@ -135,22 +135,22 @@ class Called(Conduct):
     def run(
         self, run: RunRounds, start: Weights, account: Account, on_round: OnRound, state: FederationState, done: int
     ) -> None:
-        """Run the rounds after `done`, under one lead after another where vehicles lead."""
+        """Run the rounds after `done`, under successive leads if vehicles lead."""
         if self.terms:
             federate_led(run, start, account, self.terms, on_round, state=state, done=done)
         else:
             run(start, account, done, on_round)
 
     def report(self, work: Work, settings: EdgeSettings, rounds: int, deployed: "Deployed") -> dict[str, Any]:
-        """Return the group's row of the results after its rounds; `planned`: their number in the plan."""
+        """Return the group's row of the results after its rounds; `rounds`: their planned number."""
         shown = Frames.open(work.inputs[settings.shown]) if settings.shown else None
         with open_questions(self.watch.members, deployed, Account(self.book, EDGE, self.task.name, "wireless")) as ask:
             return {"group": self.dissolve(work.folder, work.inputs[settings.inputs.pretrain], shown, rounds, ask)}
 
     def dissolve(self, folder: Path, before: Path, shown: Frames | None, most_rounds: int, ask: Ask) -> Group:
-        """Return the group after its rounds; members tell what the network in `folder` does on what they held back.
+        """Return the group after its rounds, with the loss of the network in `folder` on its members' held-back frames.
 
-        Of the frames `shown` its score is told beside that of the network in the folder `before`.
+        On the frames `shown`, the network is scored, and so is the one in the folder `before` for comparison.
         """
         if not self.group.members:
             return self.group
@@ -158,8 +158,8 @@ class Called(Conduct):
         reached = read_losses(self.watch.hear(ask, to_arrays(ended), counted=False))
         if shown is not None:
             networks = (load_stage_network(self.task, before), ended)
-            scores = tuple(score_network(self.task, each, shown.data, shown.vehicles) for each in networks)
-        vehicles = {name: replace(each, after=reached.get(name)) for name, each in self.group.vehicles.items()}
+            scores = tuple(score_network(self.task, network, shown.data, shown.vehicles) for network in networks)
+        vehicles = {name: replace(check, after=reached.get(name)) for name, check in self.group.vehicles.items()}
         over = "the loss has levelled off" if self.watch.over else "the plan's rounds are over"
         losses = tuple(self.watch.losses)
         led = tuple(term for term in self.terms if term.first < len(losses) or term.first == 1)
@@ -175,40 +175,45 @@ def call_group(
     plan: Plan,
     deployed: "RegionalDeployment | None",
 ) -> Called | None:
-    """Return the group that a region's vehicles form; requests and offers enter `book`. None: all vehicles federate.
+    """Form the group of a region's vehicles; requests and offers enter `book`. None: all vehicles federate.
 
-    It has as many members as the plan calls. Units on poles join, if the recipe says so, that are in range of one that
-    asked; what they send crosses no radio. Vehicles that are `deployed` answer there, and those whose FL requests wait
-    in their fleet have asked.
+    It has as many members as the plan calls. If the recipe says so, units on poles in range of a vehicle that asked
+    join; their messages do not use the radio. Vehicles that are `deployed` answer there, and those with FL requests
+    waiting in their fleet count as having asked.
 
-    Who asks is there when the vehicle that errs most is first there. Raises `InputError` where pretraining has no loss,
-    and `BudgetExceeded`.
+    The group forms in the first scene in which the vehicle with the largest error is present. Raises `InputError` where
+    pretraining has no loss, and `BudgetExceeded`.
     """
-    how, inputs, samples = settings.federation.requests, settings.inputs, labelled.samples
+    how = settings.federation.requests
+    inputs = settings.inputs
+    samples = labelled.samples
     if how is None:
         return None
     learning = settings.learning.resolve()
-    task, frozen = learning.task, load_stage_network(learning.task, work.inputs[inputs.pretrain])
+    task = learning.task
+    frozen = load_stage_network(task, work.inputs[inputs.pretrain])
     validated = Pretrained.load(work.inputs[inputs.pretrain]).validated
     if not validated:
         raise InputError("requests: vehicles ask by the loss at the end of pretraining, and there is no pretraining")
-    limit, split = how.excess * validated[-1].loss, Frames.open(work.inputs[inputs.frames])
+    limit = how.excess * validated[-1].loss
+    split = Frames.open(work.inputs[inputs.frames])
     places = find_client_places(split, inputs.region, [name for name in sorted(samples) if len(samples[name])])
     members = make_members(learning, frozen, how, limit, samples, places)
     with open_questions(members, deployed, Account(book, EDGE, task.name, "wireless")) as ask:
         uplink, entered = GroupUplink(ask, book, task.name), len(book.entries)
         vehicles = uplink.check([*members])
         taken = take_requests(deployed, work.folder, [*members], task.name)
-        before = {name: own for name, own in taken.read().items() if name in vehicles}
-        vehicles |= {name: replace(vehicles[name], asks=True, told=own.loss) for name, own in before.items()}
-        asked = sorted((name for name, own in vehicles.items() if own.asks), key=lambda name: -vehicles[name].error)
+        before = {name: request for name, request in taken.read().items() if name in vehicles}
+        vehicles |= {name: replace(vehicles[name], asks=True, told=request.loss) for name, request in before.items()}
+        asked = sorted((name for name, check in vehicles.items() if check.asks), key=lambda name: -vehicles[name].error)
         if not asked:
             return Called(Group(limit, vehicles, "", stayed=uplink.silent), {}, GroupWatch(how, {}), task, book)
         scene = int(np.flatnonzero(np.isfinite(places[asked[0]]).all(axis=1))[0])
         positions = {name: places[name][scene] for name in vehicles if np.isfinite(places[name][scene]).all()}
-        for name, own in before.items():
+        for name, request in before.items():
             uplink.enter(name, *(message.encode() for message in taken.messages[name]))
-            positions[name] = np.array([own.x, own.y, positions[name][2] if name in positions else 0.0])
+            height_m = positions[name][2] if name in positions else 0.0  # a request states x and y alone
+            positions[name] = np.array([request.x, request.y, height_m])
         asking = [name for name in vehicles if name in asked and name in positions and name not in before]
         positions |= uplink.hear(REQUEST, asking, read_position, {SCENE: np.array([scene])})
         present = [name for name in vehicles if name in asked and name in positions and name not in uplink.silent]
@@ -248,10 +253,12 @@ def call_group(
 def make_members(
     learning: Learning, network: Any, how: Requests, limit: float, samples: Mapping[str, Sequence[Any]], places: Places
 ) -> dict[str, GroupMember]:
-    """Return the vehicles' parts in a group: each holds some of its samples back, and trains on the others."""
-    weights, seed, members = to_arrays(network), derive_seed(learning.seed, "offer"), dict[str, GroupMember]()
+    """Return the possible members of a group: a vehicle holds some of its samples back, and trains on the others."""
+    weights = to_arrays(network)
+    seed = derive_seed(learning.seed, "offer")
+    members = dict[str, GroupMember]()
     for name, at in places.items():
-        trained, held = (Picked(samples[name], own) for own in hold_back(len(samples[name]), how.held_back))
+        trained, held = (Picked(samples[name], indices) for indices in hold_back(len(samples[name]), how.held_back))
         about = learning.task, network.config, learning.batch, trained, held, weights
         members[name] = GroupMember(*about, limit, seed, at)
     return members
@@ -264,15 +271,16 @@ class GroupUplink:
     ask: Ask
     book: Ledger
     task: str
-    silent: dict[str, str] = field(default_factory=dict)  # by client why nothing is heard of it
+    silent: dict[str, str] = field(default_factory=dict)  # reason for the lack of an answer, by client
 
     def check(self, clients: Sequence[str]) -> dict[str, CheckedNetwork]:
-        """Return the clients' checks of the deployed network; they are recorded, and sent over no link."""
-        replies, found = self.ask(CHECK, clients, counted=False), dict[str, CheckedNetwork]()
+        """Return the clients' checks of the deployed network; they are recorded, but sent over no link."""
+        replies = self.ask(CHECK, clients, counted=False)
+        found = dict[str, CheckedNetwork]()
         for name, answer in replies.answers.items():
-            told: Any = answer
+            arrays: Any = answer
             try:
-                found[name] = CheckedNetwork(int(told[HELD][0]), float(told[LOSS][0]), asks=bool(told[ASKS][0]))
+                found[name] = CheckedNetwork(int(arrays[HELD][0]), float(arrays[LOSS][0]), asks=bool(arrays[ASKS][0]))
             except (KeyError, IndexError, TypeError, ValueError) as error:
                 self.silent[name] = f"{UNREADABLE}: {error}"
         self.silent.update(replies.missing)
@@ -281,8 +289,9 @@ class GroupUplink:
     def hear(
         self, question: str, clients: Sequence[str], read: Callable[[bytes], AnswerT], arrays: Weights = NOTHING
     ) -> dict[str, AnswerT]:
-        """Return the clients' messages as `read` decodes them, and enter them in the ledger."""
-        replies, found = self.ask(question, clients, arrays), dict[str, AnswerT]()
+        """Return the clients' messages, decoded by `read`, after entering them in the ledger."""
+        replies = self.ask(question, clients, arrays)
+        found = dict[str, AnswerT]()
         for name, answer in replies.answers.items():
             message = answer.get(MESSAGE, np.zeros(0, np.uint8)).tobytes()
             self.enter(name, message)
@@ -307,7 +316,7 @@ def find_units(
     asked: Sequence[str],
     range_m: float,
 ) -> list[int]:
-    """Return those of the poles that are in range of one that asked."""
+    """Return those of `poles` within `range_m` [m] of a vehicle that `asked`; `positions`: (3,), world frame [m]."""
     sites = find_sites(split, split if inputs.recorded else None)
     places = {f"pole{n}": at for n, at in zip(sites.number.tolist(), sites.position, strict=True) if n in poles}
     near = find_in_range({**positions, **places}, asked, range_m)
@@ -315,22 +324,24 @@ def find_units(
 
 
 def find_client_places(split: Frames, region: str, clients: Sequence[str]) -> dict[str, NDArray[np.float64]]:
-    """Return each client's first position (scenes, 3) [m, world frame] in each scene of a split; NaN if absent."""
+    """Return the clients' first positions in the scenes of a split (scenes, 3), world frame [m]; NaN if absent."""
     keys = split.data.keys
     scenes = {scene: number for number, scene in enumerate(dict.fromkeys(keys[i].scene for i in split.vehicles))}
     found = {name: np.full((len(scenes), 3), np.nan) for name in clients}
     for i in split.vehicles:
-        name, scene = f"{region}/{keys[i].agent}", scenes[keys[i].scene]
+        name = f"{region}/{keys[i].agent}"
+        scene = scenes[keys[i].scene]
         if name in found and np.isnan(found[name][scene, 0]):
             found[name][scene] = split.data.world_from_agent(i)[:3, 3]
     return found
 
 
 def find_servers(split: Frames, placed: Placed, inputs: RegionInputs) -> dict[str, NDArray[np.float64]]:
-    """Return the positions (3,) [m] of the units on the poles with sensors, or on the one with most traffic."""
+    """Return the positions (3,) of the units on poles with sensors, or else with most traffic, world frame [m]."""
     if not placed.poles:
         return {}
-    sites, poles = find_sites(split, split if inputs.recorded else None), placed.chosen or (placed.densest,)
+    sites = find_sites(split, split if inputs.recorded else None)
+    poles = placed.chosen or (placed.densest,)
     pairs = zip(sites.number.tolist(), sites.position, strict=True)
     return {f"pole{number}": position for number, position in pairs if number in poles}
 

@@ -1,6 +1,6 @@
 """A vehicle as a member of a group: its check of the deployed network, request, offer of data, and reported loss.
 
-It answers questions of the lead from data that stay with it, in this process or on the vehicle of a deployed fleet.
+It answers the lead's questions from data that stay with it, in this process or on the vehicle of a deployed fleet.
 """
 
 from collections import Counter
@@ -29,9 +29,9 @@ from flcav.statistics.streams import stream
 if TYPE_CHECKING:
     from flcav.federation.links.flower import RegionalDeployment
 
-SKETCH = 64  # numbers
+SKETCH = 64  # dimensions of the random projection of a gradient
 CHECK, REQUEST, OFFER, SCORE = "check", "request", "offer", "score"  # questions
-SCENE = "scene"  # array beside a request: number of the scene in which the group forms
+SCENE = "scene"  # array sent with the question for a request: number of the scene in which the group forms
 HELD, LOSS, ASKS = "held", "loss", "asks"  # arrays of a check
 MESSAGE = "message"  # array of any other answer: the bytes of a message on the radio
 
@@ -45,11 +45,11 @@ class Offer:
     """A vehicle's offer to a group."""
 
     samples: int
-    labels: Mapping[str, int]  # their number by class
+    labels: Mapping[str, int]  # number of labels by class
     sketch: Array  # (SKETCH,) random projection of the gradient of its loss
 
     def message(self) -> bytes:
-        """Return the offer as its bytes on the radio."""
+        """Encode the offer as a message on the radio."""
         counts = np.array([*self.labels.values()], np.int64)
         return pack_arrays(
             {
@@ -62,7 +62,7 @@ class Offer:
 
     @classmethod
     def read(cls, message: bytes) -> "Offer":
-        """Return the offer in a message; raises `Unreadable`."""
+        """Decode the offer in a message; raises `Unreadable`."""
         found = _read(message, samples=(1,), sketch=(SKETCH,))
         samples, sketch = int(found["samples"][0]), found["sketch"].astype(np.float64)
         try:
@@ -75,17 +75,17 @@ class Offer:
 
 
 def read_position(message: bytes) -> Array:
-    """Return the position (3,) [m] in a request; raises `Unreadable`."""
+    """Decode the position (3,) in a request, world frame [m]; raises `Unreadable`."""
     return _read(message, position=(3,))["position"].astype(np.float64)
 
 
 def read_loss(message: bytes) -> float:
-    """Return the loss that a member reports; raises `Unreadable`."""
+    """Decode the loss that a member reports; raises `Unreadable`."""
     return float(_read(message, loss=(1,))["loss"][0])
 
 
 def _read(message: bytes, **shapes: tuple[int, ...]) -> dict[str, NDArray[Any]]:
-    """Return the arrays of a message after checking the shapes of those named in `shapes`; raises `Unreadable`."""
+    """Decode the arrays of a message, and check the shapes of those in `shapes`; raises `Unreadable`."""
     try:
         found = unpack_arrays(message)
     except (SafetensorError, ValueError) as error:
@@ -98,18 +98,18 @@ def _read(message: bytes, **shapes: tuple[int, ...]) -> dict[str, NDArray[Any]]:
 
 @dataclass(frozen=True)
 class GroupMember:
-    """A vehicle of a region that may ask for a group, be called, and train in it. It satisfies `Answers`."""
+    """A vehicle of a region that may ask for a group, be called, and train in it; satisfies `Answers`."""
 
     task: Task
     config: Any
     batch: int
-    data: Sequence[Any]  # that it trains on
-    held: Sequence[Any]  # that it holds back
-    network: Weights  # that drives
-    limit: float  # of the loss of that on `held`, above which it asks
-    seed: int  # of what it offers, the same for all
-    places: Array  # (scenes, 3) where it is when it is first in a scene [m]; NaN where it is not
-    client: Trainable | None = None  # that trains, where it is called
+    data: Sequence[Any]  # training samples
+    held: Sequence[Any]  # held-back samples
+    network: Weights  # of the deployed network
+    limit: float  # of its loss on `held`, above which the vehicle sends a request
+    seed: int  # of the offers, the same for all vehicles
+    places: Array  # (scenes, 3) its first positions by scene, world frame [m]; NaN if absent
+    client: Trainable | None = None  # for training, if it is called
 
     def train(self, weights: Weights, **how: Any) -> Update:
         """Train the vehicle's client and return its update."""
@@ -122,7 +122,7 @@ class GroupMember:
         return count_samples(self.client, steps)
 
     def answer(self, question: str, arrays: Weights) -> Weights:
-        """Return the member's answer to a question of this module; for `SCORE`, `arrays` are the weights to score."""
+        """Answer a question of this module; for `SCORE`, `arrays` are the weights to score."""
         use_threads(1)
         if question == CHECK:
             loss = self.driving_loss
@@ -141,7 +141,7 @@ class GroupMember:
 
     @cached_property
     def driving_loss(self) -> float:
-        """Loss of the deployed network on the samples that the vehicle holds back; 0 without any."""
+        """The loss of the deployed network on the vehicle's held-back samples; 0 without any."""
         if not len(self.held):
             return 0.0
         return measure_loss(self.task, self.config, self.network, self.held, self.batch)
@@ -153,9 +153,9 @@ class GroupMember:
 
 
 def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
-    """Split `count` samples: indices to train on and indices held back, evenly spread, at least one of each.
+    """Split `count` samples into indices to train on and indices held back, evenly spread, at least one of both.
 
-    Of a single sample nothing is held back.
+    A single sample is not held back.
     """
     held = min(max(round(share * count), 1), count - 1) if count > 1 else 0
     places = {int((number + 0.5) * count / held) for number in range(held)}
@@ -163,7 +163,7 @@ def hold_back(count: int, share: float) -> tuple[list[int], list[int]]:
 
 
 def measure_loss(task: Task, config: Any, weights: Weights, samples: Sequence[Any], batch: int) -> float:
-    """Return the mean loss of a network on samples; the network stays as it is."""
+    """Return the mean loss of a network on samples, without training it."""
     network = task.build(config)
     from_arrays(network, weights)
     network.eval()
@@ -176,7 +176,7 @@ def measure_loss(task: Task, config: Any, weights: Weights, samples: Sequence[An
 
 
 def count_sample_labels(samples: Sequence[Any]) -> dict[str, int]:
-    """Return the number of labels by class, where the task's samples have classes."""
+    """Count the labels by class; empty where the task's samples have no classes."""
     counts: Counter[str] = Counter()
     for number in range(len(samples)):
         sample = samples[number]
@@ -188,13 +188,14 @@ def count_sample_labels(samples: Sequence[Any]) -> dict[str, int]:
 
 def find_gradient(client: TaskClient, weights: Weights, seed: int) -> Weights:
     """Return the gradient of a client's loss on one batch, at `weights`."""
+    # `train` returns the gradient if it is given a shift, here an empty one; the step itself is negligible.
     return client.train(weights, steps=1, learning_rate=1e-9, seed=seed, shift={}).gradient
 
 
 def sketch_gradient(gradient: Weights, seed: int) -> Array:
-    """Return a random projection (SKETCH,) of a gradient.
+    """Return the random projection (SKETCH,) of a gradient.
 
-    Projections of all clients by one seed keep the angles between their gradients up to some 1 / sqrt(SKETCH).
+    Projections of all clients with the same seed preserve the angles between gradients up to about 1 / sqrt(SKETCH).
     """
     sketch = np.zeros(SKETCH)
     for name, array in gradient.items():
@@ -209,7 +210,8 @@ class Picked(Sequence[Any]):
     """A subset of a vehicle's samples, given by indices."""
 
     def __init__(self, samples: Sequence[Any], places: Sequence[int]) -> None:
-        self._samples, self._places = samples, tuple(places)
+        self._samples = samples
+        self._places = tuple(places)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -226,29 +228,32 @@ class TakenRequests(Saved):
 
     file: ClassVar[str] = "fl-requests.json"
 
-    messages: Mapping[str, tuple[str, ...]]  # by client, as they were sent, the latest last
+    messages: Mapping[str, tuple[str, ...]]  # as they were sent, by client, the latest last
 
     def read(self) -> dict[str, FLRequest]:
-        """Return the latest request of each client."""
-        return {name: parse_request(own[-1].encode()) for name, own in self.messages.items()}
+        """Parse the latest requests, by client."""
+        return {name: parse_request(sent[-1].encode()) for name, sent in self.messages.items()}
 
 
 def take_requests(
     deployed: "RegionalDeployment | None", folder: Path, clients: Sequence[str], task: str
 ) -> TakenRequests:
-    """Return the FL requests of a region's `clients` for a task: those that `folder` has, or that wait in the fleet."""
+    """Return the FL requests of a region's `clients` for a task: those saved in `folder`, or waiting in the fleet.
+
+    They are saved before the first round, so that a resumed step forms the same group.
+    """
     if (folder / TakenRequests.file).exists():
         return TakenRequests.load(folder)
     if deployed is None or not clients:
         return TakenRequests({})
     waiting = deployed.fleet_of(clients[0]).list_requests(clients, task)
-    taken = TakenRequests({name: tuple(content.decode() for content in own) for name, own in waiting.items()})
+    taken = TakenRequests({name: tuple(content.decode() for content in sent) for name, sent in waiting.items()})
     taken.save(folder)
     return taken
 
 
 def answer_requests(deployed: "RegionalDeployment | None", taken: TakenRequests, members: Sequence[str]) -> None:
     """Mark the requests of a group's members as answered."""
-    answered = [each.encode() for name, own in taken.messages.items() if name in members for each in own]
+    answered = [content.encode() for name, sent in taken.messages.items() if name in members for content in sent]
     if deployed is not None and answered:
         deployed.fleet_of(members[0]).answer_requests(answered)

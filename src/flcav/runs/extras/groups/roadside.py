@@ -1,4 +1,4 @@
-"""Samples of roadside units that join a group: their own sweeps, labelled by their own trained detector."""
+"""Samples of roadside units that join a group: their sweeps, labelled by their trained detector."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -22,16 +22,18 @@ def label_roadside(
 ) -> dict[str, list[Sample]]:
     """Return the samples of the units on `poles` in `spins`, by "region/pole": see `flcav.fusion.labels.label_sample`.
 
-    Boxes to find are those of the unit's detector; what it sees of free ground and of other returns is background.
+    The targets are the boxes of the unit's detector; free ground and other returns in its view are background.
     """
-    ground, samples = DatasetGround(split.data), dict[str, list[Sample]]()
+    ground = DatasetGround(split.data)
+    samples = dict[str, list[Sample]]()
     find = road_detector(split.data) if poles else None
     for pole in poles:
         for i in split.poles.get(pole, ()):
             key = split.data.keys[i]
             if find is None or (key.scene, key.index) not in spins:
                 continue
-            frame, below = split.data.frame(i), ground.below(i)
+            frame = split.data.frame(i)
+            below = ground.below(i)
             lidar = choose_lidar(frame)
             view = build_road_view(frame, find(i), lidar, ground.relief, below)
             seen = lower_sweep(frame, lidar, below, config)
@@ -43,12 +45,15 @@ def label_roadside(
 def lower_sweep(frame: Frame, lidar: str, ground_m: float, config: SecondConfig) -> Frame:
     """Return a roadside frame as if its LiDAR were as high above the ground as those of the network's training.
 
-    ground_m: height of the ground below the sensor in the world [m].
+    `ground_m`: height of the ground below the sensor, world frame [m].
     """
-    height, mount = -config.ground_z_m, np.array(frame.agent_from_sensor[lidar])
+    height = -config.ground_z_m
+    mount = np.array(frame.agent_from_sensor[lidar])
     above_m = float(frame.world_from_sensor(lidar)[2, 3]) - ground_m
     points = frame.lidar[lidar].copy()
     points[:, 2] += above_m - height
+    # The mount is lowered, and points are raised by as much in the LiDAR frame, so that they stay where they are in the
+    # world; the agent's origin moves to the ground.
     pose = np.array(frame.world_from_agent)
     pose[2, 3], mount[2, 3] = ground_m, height
     moved = replace(frame.calibration, agent_from_sensor={**frame.agent_from_sensor, lidar: mount})

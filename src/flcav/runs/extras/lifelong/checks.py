@@ -9,12 +9,12 @@ from flcav.runs.recipe import MAIN, RunRecipe
 
 
 def check_lifelong(recipe: RunRecipe) -> None:
-    """Raise ValueError where a recipe's conditions do not federate, or its groups cannot ask."""
-    own = recipe.lifelong
-    if own is None:
+    """Raise `ValueError` where a recipe's conditions do not federate, or its groups cannot send requests."""
+    lifelong = recipe.lifelong
+    if lifelong is None:
         return
     federating = recipe.with_role("federate")
-    if odd := [each for each in own.conditions if each not in federating]:
+    if odd := [region for region in lifelong.conditions if region not in federating]:
         raise ValueError(f"lifelong.conditions: '{odd[0]}' is none of {', '.join(federating)}")
     if not all(task.pretrains for task in recipe.tasks.values()):
         raise ValueError("lifelong: vehicles ask by the loss at the end of pretraining, and a plan has none")
@@ -25,13 +25,13 @@ def check_lifelong(recipe: RunRecipe) -> None:
 
 
 def find_requests(recipe: RunRecipe) -> Requests:
-    """Return the groups on request of lifelong learning: those of the recipe or the defaults, with what differs."""
+    """Return the settings of lifelong learning's groups: the recipe's or the defaults, overridden by its fields."""
     given = {} if recipe.lifelong is None else dict(recipe.lifelong.requests)
     whole = (recipe.federation.requests or Requests()).model_dump() | given
     return parse_config(Requests, whole, "lifelong.requests")
 
 
 def check_conditions(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where the run's own federation cannot be that of groups, which learn in each condition."""
+    """Raise `InputError` where the federation of the run itself does not suit groups, which learn in the conditions."""
     if recipe.lifelong is not None and setting.name == MAIN:
         check_roster(recipe, setting, strategy)

@@ -10,49 +10,49 @@ from flcav.runs.recipe import EDGE
 from flcav.runs.stages.regions import label_samples
 from flcav.runs.stages.settings import FederationSettings, RegionInputs, StepSettings
 
-NO_LIMIT = LinkMegabytes(1e9, 1e9)  # of messages that were sent, and counted, when their condition was there
+NO_LIMIT = LinkMegabytes(1e9, 1e9)  # budget for messages that were already counted in their condition [MB]
 
 
 class Memory(StepSettings):
-    """What each vehicle of a region remembers: frames of earlier conditions, with the labels that they had then."""
+    """The replay memory of a region's vehicles: frames of earlier conditions, with the labels that they had then."""
 
-    conditions: tuple[RegionInputs, ...]  # that its labels came from, the first condition first
-    frames: int  # of all of them together, of each vehicle
+    conditions: tuple[RegionInputs, ...]  # inputs of the labels, by earlier condition, the first one first
+    frames: int  # per vehicle, of all conditions together
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """Return the names of the steps whose results it takes."""
+        """The names of the steps whose results it takes."""
         return tuple(name for inputs in self.conditions for name in inputs.needs)
 
 
 def remember(
     work: Work, settings: FederationSettings, memory: Memory, region: str, samples: Mapping[str, Sequence[Any]]
 ) -> dict[str, Sequence[Any]]:
-    """Return each client's samples in `region`, joined by what its vehicle remembers; `samples` by "region/vehicle"."""
-    parts = {name: [own] for name, own in samples.items()}
+    """Join the clients' `samples` in `region`, by "region/vehicle", with the memory of their vehicles."""
+    parts = {name: [present] for name, present in samples.items()}
     shares = divide_memory(memory.frames, len(memory.conditions))
     for inputs, frames in zip(memory.conditions, shares, strict=True):
         known = label_samples(work, settings, inputs, Ledger(NO_LIMIT), EDGE).samples
-        for name, own in parts.items():
+        for name, sequences in parts.items():
             held = known.get(f"{inputs.region}/{name.removeprefix(f'{region}/')}", ())
-            own.append(Picked(held, spread_evenly(len(held), frames)))
-    return {name: Joined(own) for name, own in parts.items()}
+            sequences.append(Picked(held, spread_evenly(len(held), frames)))
+    return {name: Joined(sequences) for name, sequences in parts.items()}
 
 
 def divide_memory(frames: int, conditions: int) -> list[int]:
-    """Return how many of `frames` are of each condition: as equal as they go, the latest have more."""
+    """Divide `frames` among conditions as equally as possible; later ones get the remainder."""
     return [frames * (number + 1) // conditions - frames * number // conditions for number in range(conditions)]
 
 
 def spread_evenly(count: int, kept: int) -> list[int]:
-    """Return the places of `kept` of `count` samples, evenly spread; all places where there are no more."""
+    """Return the indices of `kept` of `count` samples, evenly spread; all indices if there are no more."""
     if kept >= count:
         return [*range(count)]
     return [int((number + 0.5) * count / kept) for number in range(kept)]
 
 
 class Joined(Sequence[Any]):
-    """The samples of several sequences, one after another, each read when it is asked for."""
+    """The concatenation of several sequences of samples, which are read on access."""
 
     def __init__(self, parts: Sequence[Sequence[Any]]) -> None:
         self._places = [(part, place) for part in parts for place in range(len(part))]

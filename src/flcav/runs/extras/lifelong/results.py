@@ -1,4 +1,4 @@
-"""Results of lifelong learning, of the finished steps of a run: scores, transfer, bytes, and seconds until mended."""
+"""Results of lifelong learning from the finished steps of a run: scores, transfer, bytes, and times until mended."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -23,28 +23,30 @@ from flcav.runs.stages.graph import Graph
 
 
 def collect_lifelong(graph: Graph, work: Path) -> dict[str, tuple[LifelongArm, ...]]:
-    """Return each task's arms of lifelong learning: with replay, without, and nothing; no field where the run has none.
+    """Collect the arms of lifelong learning by task: with replay, without, and nothing; no field if the run has none.
 
-    Writes the ledger of each arm that learns to `ledgers` beside `work`.
+    Writes the ledgers of the arms that learn to the folder `ledgers` next to `work`.
     """
-    own = graph.recipe.lifelong
-    if own is None:
+    lifelong = graph.recipe.lifelong
+    if lifelong is None:
         return {}
-    arms = [_collect_learning(graph, work, own, task, arm) for task in graph.recipe.tasks for arm in LEARNING]
+    arms = [_collect_learning(graph, work, lifelong, task, arm) for task in graph.recipe.tasks for arm in LEARNING]
     for arm in LEARNING:
-        steps = [folder / name for folder, name in _list_ledgers(graph, work, own, arm)]
+        steps = [folder / name for folder, name in _list_ledgers(graph, work, lifelong, arm)]
         book = Ledger(NO_LIMIT, (entry for path in steps for entry in Ledger.load(path).entries))
         book.save(work.parent / "ledgers" / f"{LIFELONG}-{arm.replace(' ', '-')}.parquet")
-    return {"lifelong": (*arms, *(_collect_nothing(graph, work, own, task) for task in graph.recipe.tasks))}
+    return {"lifelong": (*arms, *(_collect_nothing(graph, work, lifelong, task) for task in graph.recipe.tasks))}
 
 
 def find_mended(
     scores: Sequence[float], wanted: float, recorded_s: float, rounds_s: Sequence[float] | None, replaced: bool
 ) -> tuple[float | None, float | None]:
-    """Return the seconds from a condition's beginning until a copy has the score `wanted`, and until one drives.
+    """Return the times [s] from a condition's beginning until a copy reaches the score `wanted`, and until it drives.
 
-    scores: before the first round, and after each. The first is 0 where the network that drives has it already; a copy
-    drives after the last round, where it is `replaced`. None where there is no such copy, or no clock.
+    `scores`: before the first round, and after every round. `recorded_s`: time of recording before the rounds [s];
+    `rounds_s`: durations of the rounds [s]. The first time is 0 where the deployed network has the score already; a
+    copy drives after the last round, if it has `replaced` the deployed one. None where there is no such copy, or no
+    clock.
     """
     if scores[0] >= wanted:
         stays = not replaced or scores[-1] >= wanted
@@ -57,38 +59,41 @@ def find_mended(
     return learned, float(ends[-1]) if replaced and reached and scores[-1] >= wanted else None
 
 
-def _list_ledgers(graph: Graph, work: Path, own: Lifelong, arm: str) -> list[tuple[Path, str]]:
+def _list_ledgers(graph: Graph, work: Path, lifelong: Lifelong, arm: str) -> list[tuple[Path, str]]:
     return [
         (work / name(condition, task, arm), file)
         for task in graph.recipe.tasks
-        for condition in own.conditions
+        for condition in lifelong.conditions
         for name, file in ((name_learning, LEDGER), (name_driving, DELIVERED))
     ]
 
 
-def _collect_learning(graph: Graph, work: Path, own: Lifelong, task: str, arm: str) -> LifelongArm:
-    names, passed = graph.names, list[Passed]()
+def _collect_learning(graph: Graph, work: Path, lifelong: Lifelong, task: str, arm: str) -> LifelongArm:
+    names = graph.names
+    passed = list[Passed]()
     drove = names.pretrain(MAIN, task)
-    tested = [[_test(graph, work, drove, region) for region in own.conditions]]
-    for number, condition in enumerate(own.conditions):
+    tested = [[_test(graph, work, drove, region) for region in lifelong.conditions]]
+    for number, condition in enumerate(lifelong.conditions):
         learned, drives = name_learning(condition, task, arm), name_driving(condition, task, arm)
-        tested.append([_test(graph, work, drives, region) for region in own.conditions])
+        tested.append([_test(graph, work, drives, region) for region in lifelong.conditions])
         result, driving = StageResult.load(work / learned), Driving.load(work / drives)
         books = [Ledger.load(path) for path in (work / learned / LEDGER, work / drives / DELIVERED)]
-        seen = own.conditions[: number + 1]
+        seen = lifelong.conditions[: number + 1]
         scores = {
             region: tuple(
-                each.score
+                scored.score
                 for trained in (drove, learned)
-                for each in Watched.load(work / names.rounds(trained, region)).rounds
+                for scored in Watched.load(work / names.rounds(trained, region)).rounds
             )
             for region in seen
         }
         seconds = [record.seconds for record in result.records or ()]
         clocked = graph.settings[MAIN].federation.network is not None
-        rounds_s = tuple(each for each in seconds if each is not None) if clocked else None
+        rounds_s = tuple(round_s for round_s in seconds if round_s is not None) if clocked else None
         reachable = _reachable(graph, work, condition, task)
-        mended = find_mended(scores[condition], reachable - own.margin, driving.recorded_s, rounds_s, driving.replaced)
+        mended = find_mended(
+            scores[condition], reachable - lifelong.margin, driving.recorded_s, rounds_s, driving.replaced
+        )
         group = result.group
         passed.append(
             Passed(
@@ -108,26 +113,27 @@ def _collect_learning(graph: Graph, work: Path, own: Lifelong, task: str, arm: s
             )
         )
         drove = drives
-    means = tuple(tuple(each.estimate.mean for each in row) for row in tested)
+    means = tuple(tuple(test.estimate.mean for test in row) for row in tested)
     return LifelongArm.of(arm, task, tested[0][0].measure, means, tuple(passed))
 
 
-def _collect_nothing(graph: Graph, work: Path, own: Lifelong, task: str) -> LifelongArm:
+def _collect_nothing(graph: Graph, work: Path, lifelong: Lifelong, task: str) -> LifelongArm:
     """Return the arm in which the pretrained network drives throughout."""
-    names, passed = graph.names, list[Passed]()
+    names = graph.names
+    passed = list[Passed]()
     pretrained = names.pretrain(MAIN, task)
-    tested = [_test(graph, work, pretrained, region) for region in own.conditions]
-    for number, condition in enumerate(own.conditions):
+    tested = [_test(graph, work, pretrained, region) for region in lifelong.conditions]
+    for number, condition in enumerate(lifelong.conditions):
         scores = {
             region: (Watched.load(work / names.rounds(pretrained, region)).rounds[-1].score,)
-            for region in own.conditions[: number + 1]
+            for region in lifelong.conditions[: number + 1]
         }
         reachable = _reachable(graph, work, condition, task)
-        mended = find_mended(scores[condition], reachable - own.margin, 0.0, None, replaced=False)
+        mended = find_mended(scores[condition], reachable - lifelong.margin, 0.0, None, replaced=False)
         recorded_s = count_recorded_s(Frames.open(work / names.recording(condition, EDGE, task)))
         passed.append(Passed(condition, (), 0, 0, False, scores, reachable, recorded_s, *mended, 0, 0))
-    row = tuple(each.estimate.mean for each in tested)
-    return LifelongArm.of(NOTHING, task, tested[0].measure, (row,) * (len(own.conditions) + 1), tuple(passed))
+    row = tuple(test.estimate.mean for test in tested)
+    return LifelongArm.of(NOTHING, task, tested[0].measure, (row,) * (len(lifelong.conditions) + 1), tuple(passed))
 
 
 def _test(graph: Graph, work: Path, trained: str, region: str) -> Tested:
@@ -135,9 +141,9 @@ def _test(graph: Graph, work: Path, trained: str, region: str) -> Tested:
 
 
 def _reachable(graph: Graph, work: Path, condition: str, task: str) -> float:
-    """Return the validation score of the network that stage II trained for this condition from the pretrained one.
+    """Return the validation score that this condition can reach: of stage II from the pretrained network.
 
-    It is that of the pretrained network where this has the better one.
+    Where the pretrained network has the better score, it is that one.
     """
     steps = [graph.names.stage(MAIN, stage, condition, task) for stage in (PRETRAIN, EDGE)]
     return max(Watched.load(work / graph.names.rounds(step, condition)).rounds[-1].score for step in steps)
@@ -151,12 +157,12 @@ class LifelongSection(PageSection):
     chart: ClassVar[str] = "flcav.report.charts.lifelong:draw_lifelong"
 
     arms: tuple[LifelongArm, ...]
-    conditions: tuple[tuple[LifelongArm, Passed], ...]  # in which vehicles asked
+    conditions: tuple[tuple[LifelongArm, Passed], ...]  # in which vehicles sent requests
 
 
 def describe_lifelong(run: Run) -> LifelongSection | None:
     """Return the section of a run; None where it has no lifelong learning."""
     if not run.lifelong:
         return None
-    passed = tuple((arm, each) for arm in run.lifelong for each in arm.passed if each.asked)
+    passed = tuple((arm, condition) for arm in run.lifelong for condition in arm.passed if condition.asked)
     return LifelongSection(run.lifelong, passed)

@@ -1,9 +1,9 @@
-"""Non-IID partitions of samples among vehicles: by class, by place, by amount, and by a Dirichlet draw of each class.
+"""Non-IID partitions of samples among vehicles: by class, by place, by amount, and by a Dirichlet draw per class.
 
 By class: shards of the samples in the order of their classes (McMahan et al., AISTATS 2017). By amount: shares of
 all samples drawn from a Dirichlet distribution, equal in their classes but for chance (Li et al., "Federated learning
-on non-IID data silos", ICDE 2022). Dirichlet: such shares are drawn for each class (Hsu et al., "Measuring the effects
-of non-identical data distribution for federated visual classification", 2019).
+on non-IID data silos", ICDE 2022). Dirichlet: such shares are drawn per class (Hsu et al., "Measuring the effects of
+non-identical data distribution for federated visual classification", 2019).
 """
 
 from collections.abc import Sequence
@@ -15,19 +15,19 @@ from flcav.arrays import Array, Ints
 
 
 def deal_by_class(labels: NDArray, vehicles: int, shards: int, rng: np.random.Generator) -> Ints:
-    """Return the vehicle (N,) of each sample: each is dealt `shards` of the equal parts of samples sorted by label.
+    """Return the vehicles of the samples (N,): a vehicle gets `shards` of the equal parts of samples sorted by label.
 
-    labels: (N,) class of each sample, of any type that can be sorted.
+    `labels`: (N,) classes of the samples, of any type that can be sorted. Samples of a class are in random order.
     """
     order = np.lexsort((rng.permutation(len(labels)), labels))
-    owners = rng.permutation(vehicles * shards) % vehicles
+    owners = rng.permutation(vehicles * shards) % vehicles  # (vehicles * shards,): a vehicle owns exactly `shards`
     return _assign(np.array_split(order, vehicles * shards), owners.tolist(), len(labels))
 
 
 def deal_by_place(positions: Array, vehicles: int) -> Ints:
-    """Return the vehicle (N,) of each sample: each has one area, with as equal a number of samples as can be.
+    """Return the vehicles of the samples (N,): a vehicle gets one area, with as equal a number of samples as possible.
 
-    positions: (N, 2) [m]. Areas are halved across their longer side until there is one for each vehicle.
+    `positions`: (N, 2) world frame [m]. Areas are halved across their longer side until there is one per vehicle.
     """
 
     def halve(places: Ints, count: int) -> list[Ints]:
@@ -43,26 +43,26 @@ def deal_by_place(positions: Array, vehicles: int) -> Ints:
 
 
 def deal_by_amount(count: int, vehicles: int, alpha: float, rng: np.random.Generator) -> Ints:
-    """Return the vehicle (N,) of each of `count` samples: shares of the vehicles are drawn from Dir(alpha)."""
+    """Return the vehicles of `count` samples (N,): the vehicles' shares are drawn from Dir(alpha)."""
     return _assign(_cut(rng.permutation(count), vehicles, alpha, rng), range(vehicles), count)
 
 
 def deal_by_dirichlet(labels: NDArray, vehicles: int, alpha: float, rng: np.random.Generator) -> Ints:
-    """Return the vehicle (N,) of each sample: of each class the vehicles' shares are drawn from Dir(alpha).
+    """Return the vehicles of the samples (N,): the vehicles' shares of a class are drawn from Dir(alpha), per class.
 
-    labels: (N,) class of each sample.
+    `labels`: (N,) classes of the samples.
     """
     owner = np.zeros(len(labels), np.int64)
     for label in np.unique(labels):
-        own = np.flatnonzero(labels == label)
-        owner[own] = deal_by_amount(len(own), vehicles, alpha, rng)
+        rows = np.flatnonzero(labels == label)
+        owner[rows] = deal_by_amount(len(rows), vehicles, alpha, rng)
     return owner
 
 
 def give_each_one(owner: Ints, vehicles: int) -> Ints:
-    """Return the vehicle (N,) of each sample, where a vehicle without any has the last one of whoever has most.
+    """Return the vehicles of the samples (N,), after giving a vehicle without any the last sample of the one with most.
 
-    Of fewer samples than vehicles the last vehicles have none.
+    If there are fewer samples than vehicles, the last vehicles have none.
     """
     owner = owner.copy()
     for vehicle in range(min(vehicles, len(owner))):
@@ -79,6 +79,6 @@ def _cut(order: Ints, vehicles: int, alpha: float, rng: np.random.Generator) -> 
 
 def _assign(parts: Sequence[Ints], owners: Sequence[int], count: int) -> Ints:
     owner = np.zeros(count, np.int64)
-    for part, own in zip(parts, owners, strict=True):
-        owner[part] = own
+    for part, assigned in zip(parts, owners, strict=True):
+        owner[part] = assigned
     return owner

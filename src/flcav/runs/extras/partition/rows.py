@@ -1,4 +1,4 @@
-"""Records of a partition: what each vehicle of a region holds, and how far its labels are from the region's."""
+"""Records of a partition: the samples of a region's vehicles, and the distances of their labels to the region's."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -13,12 +13,12 @@ class VehicleHolding(Record):
     """The training data that a vehicle was dealt."""
 
     samples: int
-    labels: Mapping[str, int]  # their number by class of the region; empty where the task has no classes
-    distance: float | None  # total variation distance of its labels to the region's; None: the task has no classes
+    labels: Mapping[str, int]  # number of labels by class of the region; empty where the task has no classes
+    distance: float | None  # total variation distance of its labels to the region's, in [0, 1]; None: no classes
 
     @property
     def listed(self) -> str:
-        """Return the labels that it has, in words."""
+        """The numbers of its labels as text."""
         return ", ".join(f"{count} {label}" for label, count in self.labels.items() if count)
 
 
@@ -30,22 +30,23 @@ class Partitioned(Record):
     vehicles: Mapping[str, VehicleHolding]  # by client
 
     def describe(self) -> str:
-        """Return the partition in words."""
-        told = [
-            f"{name.rpartition('/')[2]} {plural(own.samples, 'sample')}" + (f" ({own.listed})" if own.labels else "")
-            for name, own in self.vehicles.items()
+        """Describe the partition in words."""
+        holdings = [
+            f"{name.rpartition('/')[2]} {plural(vehicle.samples, 'sample')}"
+            + (f" ({vehicle.listed})" if vehicle.labels else "")
+            for name, vehicle in self.vehicles.items()
         ]
-        distances = [own.distance for own in self.vehicles.values() if own.distance is not None]
+        distances = [vehicle.distance for vehicle in self.vehicles.values() if vehicle.distance is not None]
         far = (
             f"; distance of their labels to the region's {min(distances):.2f} to {max(distances):.2f}"
             if distances
             else ""
         )
-        return f"dealt by {self.by}: {', '.join(told)}{far}"
+        return f"dealt by {self.by}: {', '.join(holdings)}{far}"
 
 
 @dataclass(frozen=True)
 class PartitionRow:
-    """What a partition adds to the result of a stage."""
+    """The field that a partition adds to the result of a stage."""
 
     partition: Annotated[Partitioned | None, LEFT_OUT] = None  # of stage II; None: vehicles have what they recorded

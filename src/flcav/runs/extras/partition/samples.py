@@ -37,20 +37,23 @@ Samples = Mapping[str, Sequence[Any]]  # by "region/vehicle"
 
 
 def check_partition(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> None:
-    """Raise `InputError` where an arm's samples are to be dealt, and this does not go with the rest of it."""
-    how, told = setting.federation.partition, "federation.partition"
+    """Raise `InputError` where an arm's samples are to be partitioned, and this conflicts with its other settings."""
+    how = setting.federation.partition
+    field = "federation.partition"
     if how is None or setting.central:
         return
     if averaged := [task for task, kind in setting.labels.items() if LABEL_SOURCES[kind].averaged]:
-        raise InputError(f"{told}: the labels '{setting.labels[averaged[0]]}' are made anew by who recorded the frames")
+        raise InputError(
+            f"{field}: the labels '{setting.labels[averaged[0]]}' are made anew by who recorded the frames"
+        )
     if setting.federation.requests is not None or recipe.lifelong is not None:
         raise InputError(
-            f"{told}: vehicles of a group learn from what they recorded; leave out 'requests' and 'lifelong'"
+            f"{field}: vehicles of a group learn from what they recorded; leave out 'requests' and 'lifelong'"
         )
     for task in recipe.tasks if how.by in (BY_CLASS, BY_DIRICHLET) else ():
         if not getattr(find_configuration(task_named(task), recipe.tasks[task].network), "classes", ()):
             raise InputError(
-                f"{told}: the task '{task}' has no classes to deal by; take '{BY_PLACE}' or '{BY_AMOUNT}' instead of "
+                f"{field}: the task '{task}' has no classes to deal by; take '{BY_PLACE}' or '{BY_AMOUNT}' instead of "
                 f"'{how.by}'"
             )
 
@@ -60,15 +63,17 @@ def deal_region(
 ) -> tuple[Samples, dict[str, Partitioned]]:
     """Return a region's samples as they are dealt to its vehicles, and the row of the stage's result.
 
-    The draw is that of the recording's seed: stages, arms and retrainings deal alike. Raises `InputError` where
-    samples without classes are to be dealt by class.
+    The draw depends on the recording's seed alone: it is the same in all stages, arms and retrainings. Raises
+    `InputError` where samples without classes are to be dealt by class.
     """
     how = settings.federation.partition
     if how is None:
         return samples, {}
-    learning, split = settings.learning.resolve(), Frames.open(work.inputs[inputs.frames])
+    learning = settings.learning.resolve()
+    split = Frames.open(work.inputs[inputs.frames])
     rng = stream(0, "partition", str(split.data.manifest.recipe.get("seed")), inputs.region)
-    counts, positions = count_labels(samples, getattr(learning.config, "classes", ())), None
+    counts = count_labels(samples, getattr(learning.config, "classes", ()))
+    positions = None
     if how.by == BY_PLACE:
         about = (learning.task, learning.config, split, select_group(work, split, inputs), inputs.region)
         positions = np.array([*locate_samples(*about, samples)]).reshape(-1, 2)
@@ -77,21 +82,21 @@ def deal_region(
 
 
 def count_labels(samples: Samples, classes: Sequence[str]) -> list[dict[str, int]]:
-    """Return the number of labels by class of each sample, one vehicle after another; labels may number `classes`."""
+    """Return the numbers of labels by class of all samples, vehicle by vehicle; labels may be indices of `classes`."""
     return [
         {classes[int(label)] if label.isdecimal() else label: count for label, count in found.items() if label}
-        for own in samples.values()
-        for found in (count_sample_labels([own[place]]) for place in range(len(own)))
+        for held in samples.values()
+        for found in (count_sample_labels([held[place]]) for place in range(len(held)))
     ]
 
 
 def name_classes(counts: Sequence[Mapping[str, int]]) -> list[str]:
-    """Return the class that each sample is dealt by: of its labels the one that is rarest in the region."""
+    """Return the classes by which samples are dealt: among the labels of a sample the rarest one in the region."""
     total: dict[str, int] = {}
-    for each in counts:
-        for label, count in each.items():
+    for by_class in counts:
+        for label, count in by_class.items():
             total[label] = total.get(label, 0) + count
-    return [min(each, key=lambda label: (total[label], label), default=NO_LABEL) for each in counts]
+    return [min(by_class, key=lambda label: (total[label], label), default=NO_LABEL) for by_class in counts]
 
 
 def deal_samples(
@@ -101,10 +106,11 @@ def deal_samples(
     positions: Array | None,
     rng: np.random.Generator,
 ) -> tuple[dict[str, Sequence[Any]], Partitioned]:
-    """Return the samples of each vehicle as they are dealt, and their record.
+    """Return the samples by vehicle after dealing, and the record of the partition.
 
-    counts: labels by class, of each sample, one vehicle after another. positions: (N, 2) [m] of these, where they are
-    dealt by place. Raises `InputError` where no sample has a label, and they are dealt by class.
+    `counts`: numbers of labels by class, by sample, one vehicle after another. `positions`: (N, 2) of these, world
+    frame [m], where they are dealt by place. Raises `InputError` where no sample has a label, and they are dealt by
+    class.
     """
     number = len(samples)
     if how.by in (BY_CLASS, BY_DIRICHLET):
@@ -125,33 +131,33 @@ def deal_samples(
         owner = deal_by_amount(len(counts), number, how.alpha or ALPHA, rng)
     owner = give_each_one(owner, number)
     places = {name: np.flatnonzero(owner == vehicle).tolist() for vehicle, name in enumerate(samples)}
-    classes = sorted({label for each in counts for label in each})
-    table = np.array([[sum(counts[i].get(each, 0) for i in own) for each in classes] for own in places.values()])
+    classes = sorted({label for by_class in counts for label in by_class})
+    table = np.array([[sum(counts[i].get(label, 0) for i in dealt) for label in classes] for dealt in places.values()])
     distances = label_distribution_distance(table).tolist() if table.sum() else [None] * number
     held = {
-        name: VehicleHolding(len(own), dict(zip(classes, map(int, row), strict=True)), distance)
-        for (name, own), row, distance in zip(places.items(), table, distances, strict=True)
+        name: VehicleHolding(len(dealt), dict(zip(classes, map(int, row), strict=True)), distance)
+        for (name, dealt), row, distance in zip(places.items(), table, distances, strict=True)
     }
-    return {name: _take([*samples.values()], own) for name, own in places.items()}, Partitioned(how.by, held)
+    return {name: _take([*samples.values()], dealt) for name, dealt in places.items()}, Partitioned(how.by, held)
 
 
 def _take(parts: Sequence[Sequence[Any]], places: Sequence[int]) -> Joined:
-    """Return the samples at `places` of all parts, one after another; of those in memory it holds no others."""
+    """Return the samples at `places` in the concatenation of all parts; lists are copied, so that the rest is freed."""
     ends = np.cumsum([len(part) for part in parts])
     taken = []
     for part, end in zip(parts, ends.tolist(), strict=True):
-        own = [place - (end - len(part)) for place in places if end - len(part) <= place < end]
-        taken.append([part[place] for place in own] if isinstance(part, list) else Picked(part, own))
+        inside = [place - (end - len(part)) for place in places if end - len(part) <= place < end]
+        taken.append([part[place] for place in inside] if isinstance(part, list) else Picked(part, inside))
     return Joined(taken)
 
 
 def locate_samples(
     task: Task, config: Any, split: Frames, frames: Sequence[int], region: str, samples: Samples
 ) -> Iterator[Array]:
-    """Yield the position (2,) [m] of each sample of `frames` of a split, one vehicle after another.
+    """Yield the positions (2,) of the samples of a split's `frames`, world frame [m], one vehicle after another.
 
-    Frames may have several samples, or none: their number is that of each frame alone. Raises `InputError` where these
-    are not as many as the vehicle has.
+    A frame may have several samples, or none: they are counted frame by frame. Raises `InputError` where their sum is
+    not the vehicle's number of samples.
     """
 
     def count(i: int) -> int:
@@ -161,9 +167,9 @@ def locate_samples(
             return 0
 
     for name, held in samples.items():
-        own = [i for i in frames if f"{region}/{split.data.keys[i].agent}" == name]
-        numbers = [count(i) for i in own]
+        recorded = [i for i in frames if f"{region}/{split.data.keys[i].agent}" == name]
+        numbers = [count(i) for i in recorded]
         if sum(numbers) != len(held):
             raise InputError(f"federation.partition: frames of {name} do not tell where its samples are from")
-        for i, number in zip(own, numbers, strict=True):
+        for i, number in zip(recorded, numbers, strict=True):
             yield from [split.data.frame(i).world_from_agent[:2, 3]] * number

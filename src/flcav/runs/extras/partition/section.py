@@ -10,7 +10,7 @@ from flcav.runs.results.run import Run
 
 @dataclass(frozen=True)
 class PartitionSection(PageSection):
-    """The values of the section."""
+    """Values of the report's section on partitions."""
 
     template: ClassVar[str] = "partition/section.html.j2"
     chart: ClassVar[str] = "flcav.report.charts.partition:draw_partitions"
@@ -19,7 +19,7 @@ class PartitionSection(PageSection):
 
 
 def list_partitions(run: Run) -> tuple[tuple[str, str, str, Partitioned], ...]:
-    """Return arm, region and task of each stage II whose samples were dealt, with the partition."""
+    """Return arm, region, task and partition of all stages II whose samples were dealt."""
     return tuple(
         (name, stage.region or "", stage.task, stage.partition)
         for name, arm in run.arms.items()
@@ -29,6 +29,6 @@ def list_partitions(run: Run) -> tuple[tuple[str, str, str, Partitioned], ...]:
 
 
 def describe_partitions(run: Run) -> PartitionSection | None:
-    """Return the section of a run; None where all vehicles have what they recorded."""
+    """Return the section of a run; None where all vehicles keep what they recorded."""
     dealt = list_partitions(run)
     return PartitionSection(dealt) if dealt else None
