@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import typer
 
-from flcav.cli.options import ENGINE, OWN, EngineName, join_choices
+from flcav.cli.options import BEAMS, ENGINE, LIDAR_HEIGHT, OWN, EngineName, join_choices
 from flcav.cli.terminal import echo, one_line, when_interrupted
 from flcav.dataset.formats.formats import EXPORTS, IMPORTS, export_format
 from flcav.interface.wording import plural
@@ -87,23 +87,26 @@ def import_(
     estimate_poses: bool = typer.Option(
         False, "--estimate-poses", help="Vehicles' poses by LiDAR odometry, for drives that come without."
     ),
+    lidar_height: float | None = LIDAR_HEIGHT,
+    beams: int | None = BEAMS,
 ) -> None:
     """Make a dataset of recordings in another format: docs/formats.md says what of it is kept.
 
     Files that need no conversion are linked to, so they have to stay where they are.
     """
     from flcav.dataset.formats.conversion import import_dataset
+    from flcav.dataset.formats.kitti.rig import StatedLidar
     from flcav.dataset.layout import read_manifest
     from flcav.dataset.scene_checks import find_copies
     from flcav.dataset.validation import find_leaks
     from flcav.interface import progress
 
     with progress.show_progress(f"import {out}") as report:
-        how: Any = {}
+        how: Any = {"lidar": StatedLidar(lidar_height, beams)}
         if estimate_poses:
             from flcav.fusion.registration import DrivenSource
 
-            how = {"posed": DrivenSource}
+            how["posed"] = DrivenSource
         notes = import_dataset(format, folder, out, split=split, progress=report, **how)
     manifest = read_manifest(out)
     counts = manifest.counts

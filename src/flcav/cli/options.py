@@ -32,6 +32,12 @@ AROUND = typer.Option(
     "--around",
     help="objects: detect in 360 degrees, in four passes over the rotated sweep, and not ahead alone.",
 )
+LIDAR_HEIGHT = typer.Option(
+    None,
+    "--lidar-height",
+    help="A folder in KITTI's layout: metres of its LiDAR above the ground; by default as its sweeps show.",
+)
+BEAMS = typer.Option(None, "--beams", help="A folder in KITTI's layout: beams of its LiDAR, likewise.")
 JOBS = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each.")
 
 

@@ -6,7 +6,18 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import AGENTS, ANY_TASK, AROUND, THREADS, Device, check_finite, check_png, refuse_unused
+from flcav.cli.options import (
+    AGENTS,
+    ANY_TASK,
+    AROUND,
+    BEAMS,
+    LIDAR_HEIGHT,
+    THREADS,
+    Device,
+    check_finite,
+    check_png,
+    refuse_unused,
+)
 from flcav.cli.terminal import Answer, answer_json, echo, only_writer_of, when_interrupted
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
@@ -98,6 +109,8 @@ def evaluate(
         help="objects: ask only for those so many metres ahead and to either side, as 48,24; by default the network's "
         "range. Networks of different ranges are compared so.",
     ),
+    lidar_height: float | None = LIDAR_HEIGHT,
+    beams: int | None = BEAMS,
     threads: int = THREADS,
 ) -> Answer:
     """Evaluate a network on recorded frames.
@@ -106,6 +119,7 @@ def evaluate(
     KITTI are counted as its benchmark does: easy, moderate, hard.
     """
     use_threads(threads)
+    from flcav.dataset.formats.kitti.rig import StatedLidar
     from flcav.interface import progress
     from flcav.perception import networks
     from flcav.perception.tasks import task_named
@@ -120,6 +134,7 @@ def evaluate(
             within=within,
             around=around,
             tracks=tracks,
+            lidar=StatedLidar(lidar_height, beams),
             device=device,
             threads=threads,
             progress=report,

@@ -21,10 +21,10 @@ from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
-from flcav.dataset.formats.kitti.read import BEAMS, HEIGHT_M, RANGE_M
+from flcav.dataset.formats.kitti.rig import RANGE_M, KittiRig
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.layout import MANIFEST
-from flcav.geometry import Boxes, pose, transform_points
+from flcav.geometry import Boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.machine.compiled import compiled
@@ -191,7 +191,6 @@ COMPARED: tuple[tuple[Mapping[str, float], BenchmarkKind], ...] = (
     (LOOSE, "bev"),
     (LOOSE, "3d"),
 )
-MOUNT = pose(0.0, 0.0, HEIGHT_M)  # of KITTI's LiDAR
 NEUTRAL = {"Van": "Car", "Truck": "Car", "Tram": "Car", "Misc": "Car", "Person_sitting": "Pedestrian"}  # -> class
 VALIDATION = "val"  # list of the frames to evaluate, where it exists
 
@@ -271,25 +270,35 @@ def is_kitti(path: Path) -> bool:
     return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / MANIFEST).exists())
 
 
-def compare_kitti_rig(path: Path, config: SecondConfig, trained: KnownLidar) -> str:
-    """Return how the LiDAR of the KITTI folder `path` differs from the one that the network was trained with, in words.
+def compare_kitti_rig(path: Path, rig: KittiRig, config: SecondConfig, trained: KnownLidar) -> str:
+    """Return how the LiDAR of the KITTI folder `path` differs from KITTI's and from that of the network's training.
 
-    The words are those of `describe_rig`. Neither beams nor range are known of an export of flcav.
+    The words are those of `find_rig` and `describe_rig`. Neither beams nor range are known of an export of flcav.
     """
-    here = KnownLidar() if (path / FRAMES).is_file() else KnownLidar((BEAMS, BEAMS), RANGE_M)
-    return describe_rig([MOUNT], here, config, trained)
+    here = KnownLidar() if (path / FRAMES).is_file() else KnownLidar((rig.beams, rig.beams), RANGE_M)
+    return "; ".join(filter(None, (*rig.notes, describe_rig([rig.agent_from_lidar], here, config, trained))))
 
 
-def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progress) -> BenchmarkEvaluation:
-    """Return the AP|R40 of each class on the frames of `ImageSets/val.txt`, or of all, of the KITTI folder `path`.
+def open_evaluated(path: Path) -> tuple[KittiFolder, str | None]:
+    """Return the evaluated frames of the KITTI folder `path`, and the list that names them; None: all that have labels.
+
+    Raises `InputError` where a file is missing.
+    """
+    split = VALIDATION if (path / "ImageSets" / f"{VALIDATION}.txt").is_file() else None
+    return KittiFolder.open(path, split, pictures=False), split
+
+
+def evaluate_kitti(
+    network: Second, path: Path, rig: KittiRig, progress: Report = ignore_progress
+) -> BenchmarkEvaluation:
+    """Return the AP|R40 of each class on the frames of `open_evaluated`, whose LiDAR is that of `rig`.
 
     Raises `InputError` where a file is missing, truncated or malformed.
     """
-    split = VALIDATION if (path / "ImageSets" / f"{VALIDATION}.txt").is_file() else None
-    folder = KittiFolder.open(path, split, pictures=False)
+    folder, split = open_evaluated(path)
     if not len(folder):
         raise InputError(f"{path}: no frames to evaluate")
-    found = list(_detect(network, folder, progress))
+    found = list(_detect(network, folder, rig, progress))
     classes = [name for name in network.config.classes if name in LIMITS]
     inside = [in_image(one.boxes, one.frame) for one in found]
     truths = [truth_of(one.frame) for one in found]
@@ -306,8 +315,8 @@ def evaluate_kitti(network: Second, path: Path, progress: Report = ignore_progre
     )
 
 
-def _detect(network: Second, folder: KittiFolder, progress: Report) -> Iterator[_Found]:
-    move = level_mount(MOUNT, network.config)
+def _detect(network: Second, folder: KittiFolder, rig: KittiRig, progress: Report) -> Iterator[_Found]:
+    move = level_mount(rig.agent_from_lidar, network.config)
     for number in range(len(folder)):
         frame = folder.frame(number)
         (boxes,) = detect_moved(network, [frame.points], [move], score_threshold=LOWEST_SCORE)

@@ -13,6 +13,7 @@ from typing import Any, cast
 from torch import nn
 
 from flcav.config import DamagedFile, InputError, Json
+from flcav.dataset.formats.kitti.rig import UNSTATED, StatedLidar, find_rig
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.interface.notebook import resumable
@@ -21,7 +22,7 @@ from flcav.machine.threads import use_threads
 from flcav.perception.agents import FrameSelection, choose_frames
 from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
-from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti
+from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti, open_evaluated
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
 from flcav.perception.objects.task import ObjectsTask
@@ -134,6 +135,7 @@ def evaluate(
     within: str | None = None,
     around: bool = False,
     tracks: bool = False,
+    lidar: StatedLidar = UNSTATED,
     device: str = "auto",
     threads: int = 1,
     progress: Report = print_progress,
@@ -150,6 +152,7 @@ def evaluate(
         within: "AHEAD,SIDE" [m], to which the range is limited; of the task `objects`.
         around: whether to detect in 360°, in four passes over the rotated sweep; of the task `objects`.
         tracks: whether to add the tracking metrics MOTA and AMOTA; of the task `objects`.
+        lidar: height and beams of the LiDAR of a folder in KITTI's layout; by default as its sweeps show.
         device: "auto", "cpu" or "cuda".
         threads: number of CPU threads.
         progress: callback for the frames done so far and in total.
@@ -170,7 +173,9 @@ def evaluate(
         given = {"agents": agents, "range": within, "around": around, "tracks": tracks}
         if odd := [name for name, value in given.items() if value]:
             raise InputError(f"{data}: KITTI's benchmark has no use for --{odd[0]}; import the folder for that")
-        return _evaluate_benchmark(learned, Path(data), network, device, progress)
+        return _evaluate_benchmark(learned, Path(data), network, device, lidar, progress)
+    if lidar != UNSTATED:
+        raise InputError(f"{data}: has no use for --lidar-height and --beams, of a folder in KITTI's layout")
     dataset = open_data(data)
     tested = _turned(learned, resolve_network(learned, network, device), around)
     chosen = choose_frames(learned, tested.config, dataset, agents, trained=find_trained_lidar(learned, network))
@@ -184,11 +189,14 @@ def evaluate(
     return Evaluation(learned.name, evaluated.score, chosen, evaluated.as_json(), tuple(evaluated.lines()))
 
 
-def _evaluate_benchmark(task: ObjectsTask, folder: Path, network: Weights, device: str, progress: Report) -> Evaluation:
+def _evaluate_benchmark(
+    task: ObjectsTask, folder: Path, network: Weights, device: str, lidar: StatedLidar, progress: Report
+) -> Evaluation:
     tested = resolve_network(task, network, device)
-    evaluated = evaluate_kitti(tested, folder, progress)
-    rig = compare_kitti_rig(folder, tested.config, find_trained_lidar(task, network))
-    chosen = FrameSelection(tuple(range(evaluated.frames)), ("ego",), {"vehicle": evaluated.frames}, {}, rig)
+    rig = find_rig(open_evaluated(folder)[0].sweeps, lidar)
+    evaluated = evaluate_kitti(tested, folder, rig, progress)
+    unlike = compare_kitti_rig(folder, rig, tested.config, find_trained_lidar(task, network))
+    chosen = FrameSelection(tuple(range(evaluated.frames)), ("ego",), {"vehicle": evaluated.frames}, {}, unlike)
     return Evaluation(task.name, evaluated.score, chosen, evaluated.as_json(), tuple(evaluated.lines()))
 
 

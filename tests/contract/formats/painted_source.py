@@ -21,6 +21,8 @@ from flcav.world.weather import Weather
 WIDTH, HEIGHT, FOCAL = 320, 160, 200.0
 INTRINSICS = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1.0]])
 OPTICAL = np.array([[0.0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1]])  # body_from_optical
+# Notes of an import as KITTI, since no ground is painted:
+BARE = ("no ground near the LiDAR in most of 4 sweeps, so it is taken to be 1.73 m above it",)
 MOUNTS = {
     "lidar": pose(0.1, -0.05, 1.8, 0.02),
     "front": pose(0.6, 0.1, 1.5) @ OPTICAL,

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from painted_source import BARE
 
 from flcav.config import InputError
 from flcav.dataset.formats.conversion import import_dataset
@@ -90,7 +91,7 @@ def mercator(log: np.ndarray) -> np.ndarray:
 def test_poses_tracks_and_velocities(tmp_path: Path) -> None:
     drive(tmp_path / "in")
     notes = import_dataset("kitti-tracking", tmp_path / "in", tmp_path / "out")
-    assert notes == ("no image_02 of 1 of 1 sequence, so LiDAR alone there: 0007",)
+    assert notes == (*BARE, "no image_02 of 1 of 1 sequence, so LiDAR alone there: 0007")
     data = Dataset.open(tmp_path / "out")
     frames = [data.frame(i) for i in range(len(data))]
     assert [frame.time_s for frame in frames] == pytest.approx([0.0, 0.1, 0.2, 0.3])
@@ -119,7 +120,7 @@ def test_without_a_log_frames_stand_alone_and_a_sweep_may_be_missing(tmp_path: P
     labels = part / "label_02" / "0007.txt"
     labels.write_text("".join(line for line in labels.read_text().splitlines(True) if not line.startswith("2 ")))
     notes = import_dataset("kitti-tracking", tmp_path / "in", tmp_path / "out")
-    assert notes[1] == "no oxts of 1 of 1 sequence, so no poses there, which --estimate-poses estimates: 0007"
+    assert notes[2] == "no oxts of 1 of 1 sequence, so no poses there, which --estimate-poses estimates: 0007"
     data = Dataset.open(tmp_path / "out")
     assert [data.frame(i).time_s for i in range(len(data))] == pytest.approx([0.0, 0.1, 0.3])
     assert all(np.isnan(data.frame(i).annotations.velocity).all() for i in range(len(data)))

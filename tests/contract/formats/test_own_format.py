@@ -58,7 +58,7 @@ def test_the_format_that_is_shown_holds_what_the_dataset_holds(data: Dataset, ca
             "export poetry data",
             "export format 'poetry': choose one of kitti, yolo, .*, or name your own as module:NAME",
         ),
-        ("import poetry data", "import format 'poetry': choose one of kitti, nuscenes, .*, or name your own as"),
+        ("import poetry data", "import format 'poetry': choose one of kitti, kitti-tracking, .*, or name your own as"),
         ("export no_clouds:EXPORT data", "no module 'no_clouds' in .* or among what is installed"),
         ("export clouds:RAIN data", r"clouds\.py has no 'RAIN'"),
         ("export clouds:write data", "is no export format, it has no write, options"),

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from flcav.config import InputError, Json
 from flcav.dataset.formats.formats import IMPORTS, export_format, import_format
+from flcav.dataset.formats.kitti.rig import UNSTATED, StatedLidar
 from flcav.dataset.formats.reading import LogSource
 from flcav.dataset.formats.writing import Exported, ExportOptions
 from flcav.dataset.frame_checks import check_triggers
@@ -30,6 +31,7 @@ def import_dataset(
     *,
     split: str | None = None,
     posed: Callable[[LogSource], Source] = lambda source: source,
+    lidar: StatedLidar = UNSTATED,
     progress: Report = ignore_progress,
 ) -> tuple[str, ...]:
     """Record the dataset of the format `name` in `folder` as one of flcav's in `out`.
@@ -45,9 +47,12 @@ def import_dataset(
         out: new or empty folder for the dataset.
         split: split whose scenes are taken; None: all.
         posed: function that gives the frames other poses, such as `flcav.fusion.registration.DrivenSource`.
+        lidar: height and beams of the LiDAR, for formats that do not say them; by default as the sweeps show.
         progress: callback for the frames recorded so far and in total.
     """
     chosen = import_format(name)
+    if lidar != UNSTATED and not chosen.takes_lidar:
+        raise InputError(f"format '{name}': has no use for --lidar-height and --beams: its files say them")
     if not folder.is_dir():
         raise InputError(f"{folder}: {'is a file, and a folder is wanted' if folder.exists() else 'no such folder'}")
     if chosen.signs and not _shows(folder, chosen.signs):
@@ -57,7 +62,7 @@ def import_dataset(
     with only_writer(out):
         begun = (out / WORK).exists()  # by an earlier call
         try:
-            source = chosen.read(folder, split)
+            source = chosen.read(folder, split, lidar) if chosen.takes_lidar else chosen.read(folder, split)
             checked = _Checked(posed(source))
             record(checked, out, progress=progress)
         except (ValueError, OSError) as error:

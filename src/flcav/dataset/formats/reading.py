@@ -84,8 +84,9 @@ class LogSource(ABC):
 class ImportFormat(NamedTuple):
     """A format to read: how a folder of it is opened, and the files by which it is recognised."""
 
-    read: Callable[[Path, str | None], LogSource]  # folder, split (None: all)
+    read: Callable[..., LogSource]  # folder, split (None: all); `StatedLidar` where it takes one
     signs: tuple[str, ...] = ()  # patterns of paths, at least one of which matches in a folder of this format
+    takes_lidar: bool = False  # whether its files do not say how the LiDAR is mounted
 
 
 @dataclass(frozen=True)

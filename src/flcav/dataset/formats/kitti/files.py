@@ -238,6 +238,11 @@ class KittiFolder:
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def sweeps(self) -> list[Path]:
+        """Return the files of the frames' point clouds."""
+        return [find_part(self.folder, "velodyne", name) for name in self.names]
+
     def count_bare(self) -> int:
         """Return the number of frames without an image."""
         return sum(not (self.folder / PICTURES / f"{name}.{SUFFIXES[PICTURES]}").is_file() for name in self.names)

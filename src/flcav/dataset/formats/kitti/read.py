@@ -3,9 +3,8 @@
 Its frames belong to no sequence: each is a scene, at time 0 and at the world's origin. Only an export of flcav has
 more, in `frames.csv`. A drive is a folder that itself holds `velodyne` and `calib`, or one `calib.txt`: its sweeps
 follow one another in a single scene, its poses are unknown, and its labels have levels of truncation, as those of
-KITTI's tracking benchmark. The LiDAR is mounted as KITTI's, HEIGHT_M above the ground and, except in an export, has the
-BEAMS and RANGE_M of an HDL-64E (Geiger et al., IJRR 32(11), 2013, section 2 and fig. 3). A label's rectangle covers the
-whole object as far as it lies in the image.
+KITTI's tracking benchmark. The LiDAR is KITTI's unless the sweeps show another (see `rig`); beams and range of an
+export are unknown. A label's rectangle covers the whole object as far as it lies in the image.
 """
 
 import csv
@@ -31,6 +30,7 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
     read_split,
 )
+from flcav.dataset.formats.kitti.rig import RANGE_M, UNSTATED, KittiRig, StatedLidar, find_rig
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
@@ -44,7 +44,7 @@ from flcav.dataset.formats.reading import (
     name_some,
     unseen_views,
 )
-from flcav.geometry import Boxes, inverse, pose
+from flcav.geometry import Boxes, inverse
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
 
@@ -56,7 +56,6 @@ CATEGORIES = {  # KITTI's other classes (Person_sitting, Tram, Misc) keep their 
     "Cyclist": "bicycle",
 }
 OCCLUSION = np.array([0.0, 0.3, 0.75, np.nan])  # shares for the levels 0 fully visible, 1, 2, 3 unknown
-HEIGHT_M, BEAMS, RANGE_M = 1.73, 64, 120.0
 LIDAR, CAMERA = "velodyne", PICTURES
 DRIVE_HZ = 10.0  # rate of the sweeps of a drive
 LISTS = ("train", "val", "test")
@@ -80,7 +79,7 @@ class KittiSource(LogSource):
 
     FORMAT = "kitti"
 
-    def __init__(self, folder: Path, split: str | None = None) -> None:
+    def __init__(self, folder: Path, split: str | None = None, stated: StatedLidar = UNSTATED) -> None:
         """Open the frames; raises `InputError` where there is none, none of `split`, or a file of one is missing."""
         self.folder, self.split = folder, split
         shots = _find_shots(folder)
@@ -94,22 +93,23 @@ class KittiSource(LogSource):
         self._calibration: dict[str, Calibration] = {}
         every = [shot for shot in shots if shot.scene in chosen]
         _check_complete(every)
-        names = AgentNames()
+        names, rig = AgentNames(), find_rig([_path(shot, "velodyne") for shot in every], stated)
+        self._rig = rig
         for shot in every:
             calibration = _path(shot, "calib")
-            mounted = mount_sensors(read_calibration(calibration))
+            mounted = mount_sensors(read_calibration(calibration), rig)
             self._shots[shot.scene].append(shot)
             text = "" if shot.exported else read_file(calibration).decode()
             agent = self._agent[shot] = names.of(shot.vehicle, text)
             self._calibration.setdefault(agent, mounted)
         if not any(shot.exported for shot in every):
-            self.beams, self.range_m = BEAMS, RANGE_M
+            self.beams, self.range_m = rig.beams, RANGE_M
         lost = {
             kind: [shot.number for shot in every if not _path(shot, kind).is_file()] for kind in ("label_2", CAMERA)
         }
         self.labelled = not lost["label_2"]
         effects = {"label_2": "so no boxes there", CAMERA: "so LiDAR alone there"}
-        self.notes = tuple(
+        self.notes = rig.notes + tuple(
             f"no {kind} of {len(numbers)} of {plural(len(every), 'frame')}, {effects[kind]}: {name_some(numbers)}"
             for kind, numbers in lost.items()
             if numbers
@@ -123,15 +123,15 @@ class KittiSource(LogSource):
         """Yield the frames of a scene; raises `InputError` where a file is missing, truncated or malformed."""
         for shot in sorted(self._shots[scene], key=lambda shot: (shot.spin, shot.vehicle)):
             agent = self._agent[shot]
-            yield _read_frame(shot, agent, self._calibration[agent])
+            yield _read_frame(shot, agent, self._calibration[agent], self._rig)
 
 
-IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne/*.bin"))
+IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne/*.bin"), takes_lidar=True)
 
 
-def mount_sensors(calibrated: KittiCalibration) -> Calibration:
-    """Return the mounts of LiDAR and camera on a vehicle whose LiDAR is HEIGHT_M above the ground."""
-    agent_from_lidar = pose(0.0, 0.0, HEIGHT_M)
+def mount_sensors(calibrated: KittiCalibration, rig: KittiRig) -> Calibration:
+    """Return the mounts of LiDAR and camera on a vehicle with the LiDAR of `rig`."""
+    agent_from_lidar = rig.agent_from_lidar
     projection = calibrated.image_from_camera
     shifted = np.eye(4)  # the projection's fourth column, K t, as a translation t of the camera
     shifted[:3, 3] = np.linalg.solve(projection[:, :3], projection[:, 3])
@@ -142,7 +142,7 @@ def mount_sensors(calibrated: KittiCalibration) -> Calibration:
     )
 
 
-def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> LinkedFrame:
+def _read_frame(shot: KittiShot, agent: str, calibration: Calibration, rig: KittiRig) -> LinkedFrame:
     pictures = {CAMERA: path} if (path := _path(shot, CAMERA)).is_file() else {}
     files = {LIDAR: _path(shot, "velodyne"), **pictures}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))
@@ -151,7 +151,7 @@ def _read_frame(shot: KittiShot, agent: str, calibration: Calibration) -> Linked
     objects = read_objects(label, calibrated, levels=is_drive(shot.folder)) if label.is_file() else Objects.none()
     check_objects(objects, *size, label)
     agent_from_lidar, mount = calibration.agent_from_sensor[LIDAR], calibration.agent_from_sensor[CAMERA]
-    then = mount_sensors(calibrated).agent_from_sensor[CAMERA] @ inverse(mount)
+    then = mount_sensors(calibrated, rig).agent_from_sensor[CAMERA] @ inverse(mount)
     labels = [CATEGORIES.get(name, name) for name in objects.boxes.label.tolist()]
     boxes = objects.boxes.transform(agent_from_lidar)
     return LinkedFrame(

@@ -28,15 +28,14 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
 )
 from flcav.dataset.formats.kitti.read import (
-    BEAMS,
     CAMERA,
     CATEGORIES,
     DRIVE_HZ,
     LIDAR,
     OCCLUSION,
-    RANGE_M,
     mount_sensors,
 )
+from flcav.dataset.formats.kitti.rig import RANGE_M, UNSTATED, KittiRig, StatedLidar, find_rig
 from flcav.dataset.formats.reading import (
     ImportFormat,
     LogSource,
@@ -65,9 +64,9 @@ class KittiTrackingSource(LogSource):
     """The sequences of KITTI's tracking benchmark in `training` and `testing`."""
 
     FORMAT = "kitti-tracking"
-    beams, range_m = BEAMS, RANGE_M
+    range_m = RANGE_M
 
-    def __init__(self, folder: Path, split: str | None = None) -> None:
+    def __init__(self, folder: Path, split: str | None = None, stated: StatedLidar = UNSTATED) -> None:
         """Open the sequences; raises `InputError` where there is none, none of `split`, or one has no calibration."""
         self.folder, self.split = folder, split
         found = [path for part in FOLDERS for path in sorted((folder / part / "velodyne").glob("*/")) if path.is_dir()]
@@ -80,10 +79,14 @@ class KittiTrackingSource(LogSource):
         self._sequences = {scene: _Sequence(names[scene]) for scene in self.split_of}
         for sequence in self._sequences.values():
             sequence.check()
+        rig = find_rig([sweep for each in self._sequences.values() for sweep in each.sweeps.values()], stated)
+        for sequence in self._sequences.values():
+            sequence.rig = rig
+        self.beams = rig.beams
         lost = {kind: [s.name for s in self._sequences.values() if not s.path(kind).exists()] for kind in EFFECTS}
         self.labelled = not lost["label_02"]
         count = plural(len(self._sequences), "sequence")
-        self.notes = tuple(
+        self.notes = rig.notes + tuple(
             f"no {kind} of {len(names)} of {count}, {EFFECTS[kind]}: {name_some(names)}"
             for kind, names in lost.items()
             if names
@@ -98,7 +101,7 @@ class KittiTrackingSource(LogSource):
         yield from self._sequences[scene].frames(scene)
 
 
-IMPORT = ImportFormat(KittiTrackingSource, ("training/velodyne/*/*.bin", "testing/velodyne/*/*.bin"))
+IMPORT = ImportFormat(KittiTrackingSource, ("training/velodyne/*/*.bin", "testing/velodyne/*/*.bin"), takes_lidar=True)
 
 EFFECTS = {
     "label_02": "so no boxes there",
@@ -117,6 +120,8 @@ class _Labels:
 
 class _Sequence:
     """A sequence of the benchmark: its files, by the folder of its sweeps."""
+
+    rig: KittiRig
 
     def __init__(self, velodyne: Path) -> None:
         self._part, self.name = velodyne.parents[1], velodyne.name
@@ -180,7 +185,7 @@ class _Sequence:
     @cached_property
     def mounts(self) -> Calibration:
         """The mounts of LiDAR and camera on the vehicle."""
-        return mount_sensors(self.calibration)
+        return mount_sensors(self.calibration, self.rig)
 
     def frames(self, scene: str) -> Iterator[LinkedFrame]:
         """Yield the frames, with the velocities of tracks where poses are known."""
