@@ -1,4 +1,4 @@
-"""`flcav drive`: closed-loop drives through scenarios, by what perception finds."""
+"""`flcav drive`: closed-loop drives through scenarios, on perception or ground truth."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
