@@ -83,7 +83,7 @@ def compare_plans(recipe: RunRecipe, runs: Mapping[float, Sequence[Run]]) -> All
     budgets = [AtBudgets(factor, seeds, summarise(seeds)) for factor, seeds in rows.items()]
     settings, history = recipe.model_dump(mode="json", exclude={"seed"}), _history_ranges()
     found = allocation_findings(budgets, history)
-    with_findings = tuple(replace(results, findings=seeds) for results, seeds in zip(budgets, found, strict=True))
+    with_findings = tuple(replace(results, findings=findings) for results, findings in zip(budgets, found, strict=True))
     return AllocationResult(history, with_findings, recipe=settings, provenance=provenance())
 
 

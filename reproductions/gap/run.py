@@ -320,9 +320,9 @@ def _arms(results: GapResult) -> str:
     rows = []
     for name in ARMS:
         arms = [seed[name] for seed in results.seeds.values()]
-        labels = (_mean([getattr(mean, field) for mean in arms]) for field in ("precision", "recall"))
+        labels = (_mean([getattr(arm, field) for arm in arms]) for field in ("precision", "recall"))
         numbers = (results.ap50, results.closed50, results.ap70, results.closed70)
-        rows.append([name, *(mean[name].describe() for mean in numbers), *labels])
+        rows.append([name, *(means[name].describe() for means in numbers), *labels])
     share = "share of the gain of truth"
     titles = ("arm", "AP50", share, "AP70", share, "labels' precision", "labels' recall")
     return format_table(titles, rows)
