@@ -83,7 +83,7 @@ def demo(
 
 
 def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: Mapping[str, Any]) -> Answer:
-    """Run a recipe with one or several seeds, and write its report; `how` are arguments of `flcav.run`."""
+    """Run a recipe; `how`: arguments of `flcav.run`."""
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.report.pages.run_page import write_report
@@ -96,17 +96,17 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: M
 
     check_writable(out)
     found = find_recipe(path)
-    loaded = load_run_recipe(found)
+    asked = load_run_recipe(found)
     if seed is not None:
-        loaded = loaded.model_copy(update={"seed": seed})
+        asked = asked.model_copy(update={"seed": seed})
     how = {**how, "beside": found.parent}
     with live_steps(title) as notify:
         if seeds == 1:
-            results = {out: run_one(loaded, out, notify=notify, **how)}
+            results = {out: run_one(asked, out, notify=notify, **how)}
             summary = None
         else:
-            runs, summary = run_seeds(loaded, out, seeds=seeds, notify=notify, **how)
-            results = {out / f"seed{result.recipe.seed}": result for result in runs}
+            runs, summary = run_seeds(asked, out, seeds=seeds, notify=notify, **how)
+            results = {out / f"seed{each.recipe.seed}": each for each in runs}
             write_bytes(out / "seeds.png", draw_seeds(runs))
     reports = [write_report(result, folder) for folder, result in results.items()]
     yield (summary or next(iter(results.values()))).as_json()

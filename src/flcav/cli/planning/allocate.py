@@ -181,8 +181,8 @@ def _describe(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") 
     measure = MEASURES[problem.objective]
     for task in plan.tasks:
         if task.called is not None:
-            called = plural(task.called, "vehicle")
-            yield (f"{task.name}: {called} at most of each edge server in its edge rounds")
+            told = plural(task.called, "vehicle")
+            yield (f"{task.name}: {told} at most of each edge server in its edge rounds")
     curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
     yield (f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
     yield (f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")

@@ -77,7 +77,7 @@ def draw_map(axes: Axes, town: Town) -> None:
 
 
 def symbols(town: Town) -> list[tuple[str, dict[str, Any], Array]]:
-    """Return label, marker and positions (N, 2) [m] of the kinds of signs and lights in a town."""
+    """Return label, marker and positions (N, 2) of each kind of sign and light in a town."""
     kinds = np.array(town.signs.kind)
     at = town.signs.position[:, :2]
     speed = np.char.startswith(kinds, "speed") if len(kinds) else np.zeros(0, np.bool_)
