@@ -69,9 +69,9 @@ class ClosedLoop(Record):
             for name, arm in self.arms.items()
         ]
 
-    def share_stood(self, own: ArmResult) -> float:
+    def share_stood(self, arm: ArmResult) -> float:
         """Return the share of the time at standstill in an arm."""
-        return sum(own.stood_s.values()) / (self.drives * self.lasts_s)
+        return sum(arm.stood_s.values()) / (self.drives * self.lasts_s)
 
 
 def per_hundred(share: Estimate) -> str:

@@ -340,9 +340,9 @@ def _correct(scenes: Mapping[str, SightedScene], errors: Errors, posts: np.ndarr
     return measure_residual(true, stated), measure_residual(true, corrected)
 
 
-def measure_residual(true: Sequence[Sighting], told: Sequence[Sighting]) -> Residual:
-    """Return the mean absolute errors of the poses and times of vehicles in `told`, against `true`."""
-    pairs = [(a, b) for a, b in zip(true, told, strict=True) if a.navigation is not None]
+def measure_residual(true: Sequence[Sighting], stated: Sequence[Sighting]) -> Residual:
+    """Return the mean absolute errors of the poses and times of vehicles as `stated`, against `true`."""
+    pairs = [(a, b) for a, b in zip(true, stated, strict=True) if a.navigation is not None]
     off_m = [np.linalg.norm((b.world_from_agent - a.world_from_agent)[:2, 3]) for a, b in pairs]
     turned = [abs(yaw_of(inverse(a.world_from_agent) @ b.world_from_agent)) for a, b in pairs]
     late_s = [abs(b.time_s - a.time_s) for a, b in pairs]

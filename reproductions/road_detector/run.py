@@ -112,16 +112,16 @@ def count_labels(split: Frames, frames: Sequence[int], pole: int, config: Second
     return len(frames), beyond, missed, coarse, exact, other, false
 
 
-def grade_labels(ideal: Boxes, told: Boxes) -> tuple[int, int, int]:
-    """Return how many of the `ideal` labels are missed, coarse and exact in `told`; boxes are in one frame."""
-    found = int((assign_targets(_sure(told), ideal, FOUND, "bev") >= 0).sum())
-    exact = int((assign_targets(_sure(told), ideal, EXACT) >= 0).sum())
+def grade_labels(ideal: Boxes, labels: Boxes) -> tuple[int, int, int]:
+    """Return how many of the `ideal` labels are missed, coarse and exact in `labels`; boxes are in one frame."""
+    found = int((assign_targets(_sure(labels), ideal, FOUND, "bev") >= 0).sum())
+    exact = int((assign_targets(_sure(labels), ideal, EXACT) >= 0).sum())
     return len(ideal) - found, found - exact, exact
 
 
-def _find_others(told: Boxes, known: Boxes) -> Boxes:
-    """Return the boxes of `told` that match none of the `known` ones."""
-    return told[assign_targets(_sure(told), known, FOUND, "bev") < 0]
+def _find_others(boxes: Boxes, known: Boxes) -> Boxes:
+    """Return the `boxes` that match none of the `known` ones."""
+    return boxes[assign_targets(_sure(boxes), known, FOUND, "bev") < 0]
 
 
 def _list_objects(split: Frames, i: int, config: SecondConfig) -> Boxes:

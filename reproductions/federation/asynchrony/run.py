@@ -248,42 +248,42 @@ def give_pictures(drives: Drives, fleet: Fleet, setting: str) -> dict[str, Train
 
 
 def follow(
-    rival: Rival, own: Scheduled, waits: Scheduled, clients: Mapping[str, Trainable], drives: Drives, seed: int
+    rival: Rival, schedule: Scheduled, waits: Scheduled, clients: Mapping[str, Trainable], drives: Drives, seed: int
 ) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
     """Run a federation by its schedule; return it, and the correct pictures (N,) at equal megabytes and seconds."""
-    start, rounds = draw_head(seed), len(own.end_s)
+    start, rounds = draw_head(seed), len(schedule.end_s)
     reached: list[Weights] = [start]
     book = Ledger(LinkMegabytes(1e6, 0.0))
     federate(
         clients,
         start,
         Schedule(rounds, STEPS, LEARNING_RATE, LEARNING_RATE, seed),
-        Account(book, "edge", WEATHER.name, "wireless", own.outages),
+        Account(book, "edge", WEATHER.name, "wireless", schedule.outages),
         strategy=rival.strategy,
-        buffers=own.buffers,
+        buffers=schedule.buffers,
         on_round=lambda round_, weights, loss: reached.append(weights),
     )
     right = [find_right(weights, drives.test) for weights in reached]
     sent = np.cumsum([sum(e.bytes for e in book if (e.direction, e.round) == ("up", n + 1)) for n in range(rounds)])
     ends = {
-        MEGABYTES: own.last_within(np.inf, sum(waits.up_bytes)),
-        SECONDS: own.last_within(waits.end_s[-1], np.inf),
+        MEGABYTES: schedule.last_within(np.inf, sum(waits.up_bytes)),
+        SECONDS: schedule.last_within(waits.end_s[-1], np.inf),
     }
     stale = [0] * (len(clients) * ends[SECONDS])
-    if own.buffers is not None:
-        counted = enumerate(own.buffers.rounds[: ends[SECONDS]])
+    if schedule.buffers is not None:
+        counted = enumerate(schedule.buffers.rounds[: ends[SECONDS]])
         stale = [number - version for number, buffer in counted for version in buffer.versions.values()]
-    elif own.outages:
-        stale = stale[: len(stale) - sum(number <= ends[SECONDS] for number, _ in own.outages)]
+    elif schedule.outages:
+        stale = stale[: len(stale) - sum(number <= ends[SECONDS] for number, _ in schedule.outages)]
     trajectory = Trajectory(
-        seconds=(0.0, *(round(end_s, 3) for end_s in own.end_s)),
+        seconds=(0.0, *(round(end_s, 3) for end_s in schedule.end_s)),
         up_mb=(0.0, *np.round(sent / BYTES_PER_MB, 4).tolist()),
         accuracy=tuple(round(float(correct.mean()), 5) for correct in right),
         updates=len(stale),
         staleness=float(np.mean(stale)) if stale else 0.0,
         at={measure: float(right[end].mean()) for measure, end in ends.items()},
         took={
-            MEGABYTES: own.end_s[ends[MEGABYTES] - 1] if ends[MEGABYTES] else 0.0,
+            MEGABYTES: schedule.end_s[ends[MEGABYTES] - 1] if ends[MEGABYTES] else 0.0,
             SECONDS: float(sent[ends[SECONDS] - 1]) / BYTES_PER_MB if ends[SECONDS] else 0.0,
         },
     )

@@ -209,10 +209,12 @@ def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> Attacked:
     return Attacked(measure(seen_one, seen), by_sum, right)
 
 
-def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector) -> float:
+def share_recognised(
+    start: Weights, sent: Mapping[str, Weights], pictures: Mapping[str, Pictures], known: Vector
+) -> float:
     """Return the share of vehicles for which the inversion of the sent weights recognises one of their pictures."""
     named = {name: known[name_nearest(invert(start, weights), known)] for name, weights in sent.items()}
-    return float(np.mean([(own[name].features == found).all(axis=1).any() for name, found in named.items()]))
+    return float(np.mean([(pictures[name].features == found).all(axis=1).any() for name, found in named.items()]))
 
 
 def make_level(
