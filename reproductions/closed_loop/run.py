@@ -1,8 +1,8 @@
-"""Closed loop: the networks of the package drive, against ground truth and against what they were before.
+"""Closed-loop driving on the networks of the package, compared with ground truth and with an earlier driver.
 
-Every arm drives the same scenarios and seeds. Before, the driver had no way around vehicles that stand and believed
-every track of two detections; now it looks for one (`driving.passing`) and a track is believed when it was found in
-three of five sweeps (`driving.following.Confirmed`). Both were tuned on seeds below 100.
+All arms drive the same scenarios and seeds. The earlier driver did not pass standing vehicles, and used every track of
+two detections; now it passes them (`driving.passing`), and a track is confirmed by detections in three of five sweeps
+(`driving.following.Confirmed`). Both were tuned on seeds below 100.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,7 +25,7 @@ from flcav.storage.records import Record
 
 SCENARIOS, SEEDS, LASTS_S = 32, 1, 12.0
 FIRST_SEED = 900
-TOGETHER = 8  # drives of an arm, before those of the next
+TOGETHER = 8  # number of drives of an arm before those of the next arm
 PASSING = DriverSettings(passes=True)
 TRUTH, NOW, BEFORE = "ground truth", "networks", "networks, before"
 ARMS: Mapping[str, tuple[Sensed, DriverSettings]] = {
@@ -39,19 +39,19 @@ MEASURES = ("progress", "score", "faults", "red_lights", "hard_brakes")
 
 @dataclass(frozen=True)
 class ArmResult:
-    """Measures of one arm over all drives; intervals over scenarios, of collisions Wilson's."""
+    """Measures of one arm over all drives, with intervals over scenarios; that of collisions is Wilson's."""
 
     progress: Estimate
     score: Estimate
     crashed: Estimate  # share of the drives with a collision at fault
     red_lights: int
-    hard_brakes: Estimate  # a drive
-    stood_s: Mapping[str, float]  # over all drives, by what the vehicle stood before, longest first
+    hard_brakes: Estimate  # per drive
+    stood_s: Mapping[str, float]  # standstill in all drives [s] by cause, longest first
 
 
 @dataclass(frozen=True)
 class ClosedLoop(Record):
-    """The arms of the closed loop over the same drives."""
+    """Results of the comparison in closed loop, over the same drives."""
 
     scenarios: int
     drives: int  # of each arm
@@ -63,15 +63,15 @@ class ClosedLoop(Record):
     def sentences(self) -> list[str]:
         """Return the measures in words."""
         return [
-            f"{name}: progress {own.progress.describe()}, {per_hundred(own.crashed)} collisions at fault per hundred "
-            f"drives, {plural(own.red_lights, 'red light')} passed, stood {self.share_stood(own):.0%} of the "
+            f"{name}: progress {arm.progress.describe()}, {per_hundred(arm.crashed)} collisions at fault per hundred "
+            f"drives, {plural(arm.red_lights, 'red light')} passed, stood {self.share_stood(arm):.0%} of the "
             "time"
-            for name, own in self.arms.items()
+            for name, arm in self.arms.items()
         ]
 
-    def share_stood(self, own: ArmResult) -> float:
-        """Return the share of the time that the vehicle stood in an arm."""
-        return sum(own.stood_s.values()) / (self.drives * self.lasts_s)
+    def share_stood(self, arm: ArmResult) -> float:
+        """Return the share of the time at standstill in an arm."""
+        return sum(arm.stood_s.values()) / (self.drives * self.lasts_s)
 
 
 def per_hundred(share: Estimate) -> str:
@@ -82,28 +82,28 @@ def per_hundred(share: Estimate) -> str:
 def compare_perception(
     out: Path, seeds: int = SEEDS, jobs: int = 1, progress: Report = ignore_progress, scenarios: int = SCENARIOS
 ) -> ClosedLoop:
-    """Return the comparison over scenarios of the package and `seeds` seeds; drives are kept in the folder `out`.
+    """Drive scenarios of the package with `seeds` seeds, and return the comparison; drives are kept in `out`.
 
-    Arms go on side by side, so that what a stopped run has kept is comparable.
+    Arms alternate, so that the results of an interrupted run are comparable.
     """
-    pairs = [(each, FIRST_SEED + seed) for seed in range(seeds) for each in spread_scenarios(scenarios)]
+    pairs = [(scenario, FIRST_SEED + seed) for seed in range(seeds) for scenario in spread_scenarios(scenarios)]
     drives: dict[str, list[DriveResult]] = {name: [] for name in ARMS}
     for done in range(0, len(pairs), TOGETHER):
         for name, (sensed, settings) in ARMS.items():
-            own = [DriveJob(*pair, loop=Loop(settings, LASTS_S)) for pair in pairs[done : done + TOGETHER]]
-            drives[name] += run_jobs(own, sensed, jobs, kept=out / "drives.jsonl")
+            batch = [DriveJob(*pair, loop=Loop(settings, LASTS_S)) for pair in pairs[done : done + TOGETHER]]
+            drives[name] += run_jobs(batch, sensed, jobs, kept=out / "drives.jsonl")
         progress(min(done + TOGETHER, len(pairs)), len(pairs), pairs[done][0].name)
     return summarise_arms(drives, scenarios)
 
 
 def summarise_arms(drives: Mapping[str, Sequence[DriveResult]], scenarios: int) -> ClosedLoop:
-    """Return the comparison of the arms' drives, which are of the same scenarios and seeds."""
-    names = [own.scenario for own in drives[NOW]]
+    """Return the comparison of the arms' drives, through the same scenarios with the same seeds."""
+    names = [drive.scenario for drive in drives[NOW]]
     return ClosedLoop(
         scenarios=scenarios,
         drives=len(names),
         lasts_s=LASTS_S,
-        arms={name: _summarise(own) for name, own in drives.items()},
+        arms={name: _summarise(of_arm) for name, of_arm in drives.items()},
         differences={
             f"{one} less {other}": {
                 measure: paired_difference(drives[other], drives[one], names, measure) for measure in MEASURES
@@ -116,16 +116,16 @@ def summarise_arms(drives: Mapping[str, Sequence[DriveResult]], scenarios: int) 
 
 def _summarise(drives: Sequence[DriveResult]) -> ArmResult:
     stood: dict[str, float] = {}
-    for own in drives:
-        for cause, duration in own.stood_s.items():
+    for drive in drives:
+        for cause, duration in drive.stood_s.items():
             stood[cause] = round(stood.get(cause, 0.0) + duration, 1)
     return ArmResult(
         progress=mean_measure(drives, "progress"),
         score=mean_measure(drives, "score"),
-        crashed=score_interval(sum(own.faults > 0 for own in drives) / len(drives), len(drives)),
-        red_lights=sum(own.red_lights for own in drives),
+        crashed=score_interval(sum(drive.faults > 0 for drive in drives) / len(drives), len(drives)),
+        red_lights=sum(drive.red_lights for drive in drives),
         hard_brakes=mean_measure(drives, "hard_brakes"),
-        stood_s=dict(sorted(stood.items(), key=lambda each: -each[1])),
+        stood_s=dict(sorted(stood.items(), key=lambda item: -item[1])),
     )
 
 
@@ -134,14 +134,14 @@ def closed_loop_tables(results: ClosedLoop) -> dict[str, str]:
     rows = [
         [
             name,
-            own.progress.describe(),
-            per_hundred(own.crashed),
-            str(own.red_lights),
-            own.hard_brakes.describe(),
-            f"{results.share_stood(own):.1%}",
-            own.score.describe(),
+            arm.progress.describe(),
+            per_hundred(arm.crashed),
+            str(arm.red_lights),
+            arm.hard_brakes.describe(),
+            f"{results.share_stood(arm):.1%}",
+            arm.score.describe(),
         ]
-        for name, own in results.arms.items()
+        for name, arm in results.arms.items()
     ]
     columns = (
         "perception",
@@ -152,12 +152,14 @@ def closed_loop_tables(results: ClosedLoop) -> dict[str, str]:
         "time it stood",
         "score",
     )
-    gaps = [[name, *(gap[each].describe(sign=True) for each in MEASURES)] for name, gap in results.differences.items()]
-    causes = list(dict.fromkeys(cause for own in results.arms.values() for cause in own.stood_s))
-    stood = [[cause, *(f"{own.stood_s.get(cause, 0.0):.1f}" for own in results.arms.values())] for cause in causes]
+    gaps = [
+        [name, *(gap[measure].describe(sign=True) for measure in MEASURES)] for name, gap in results.differences.items()
+    ]
+    causes = list(dict.fromkeys(cause for arm in results.arms.values() for cause in arm.stood_s))
+    stood = [[cause, *(f"{arm.stood_s.get(cause, 0.0):.1f}" for arm in results.arms.values())] for cause in causes]
     return {
         "arms": format_table(columns, rows),
-        "differences": format_table(("difference", *(each.replace("_", " ") for each in MEASURES)), gaps),
+        "differences": format_table(("difference", *(measure.replace("_", " ") for measure in MEASURES)), gaps),
         "standing": format_table(("stood before [s]", *results.arms), stood),
     }
 

@@ -1,10 +1,9 @@
 """Comparison of edge FL, edge + cloud FL, further edge FL and uploads on rare kinds: recipes/runs/corner_cases.yaml.
 
-The article's premise is that the cloud carries what one region knows to another. One region's vehicles meet rare kinds
-while they learn; those of another, and of a town that nobody learns in, meet them in the test alone. AP of the rare
-kinds counts every other object as neutral: a detection on it is neither true nor false. Labels are ground truth, so
-that what is measured is what networks carry. Over seeds, which have recordings of their own, intervals cover training
-and traffic.
+The article's premise is that the cloud transfers knowledge between regions. Rare kinds of cars occur in one region's
+training data; in another region, and in an unseen town, they only occur in the test. AP of the rare kinds counts other
+objects as neutral: a detection of them is neither true nor false. Labels are ground truth, so that only the transfer by
+networks is measured. Seeds have different recordings, so that intervals over them cover training and traffic.
 """
 
 from collections.abc import Mapping, Sequence
@@ -47,7 +46,7 @@ BORROWED, UPLOADED = f"edge FL of {OTHER}", f"centralised on sweeps of {OTHER}"
 
 
 class Learned(NamedTuple):
-    """Where a network was trained: arm and stage of the run, and the region, None: the one that it is tested in."""
+    """Origin of a network: arm and stage of the run, and its region; None: the region of the test."""
 
     arm: str
     stage: str
@@ -62,12 +61,12 @@ ARMS: Mapping[str, Learned] = {
     BORROWED: Learned(MAIN, EDGE, OTHER),
     UPLOADED: Learned("sweeps", CENTRAL, OTHER),
 }
-TOWNS: Mapping[str, tuple[str, ...]] = {  # arms that are tested in each town; nobody federates in the unseen one
+TOWNS: Mapping[str, tuple[str, ...]] = {  # tested arms by town; the unseen one does not federate
     OWN: (*ARMS,),
     OTHER: (PRETRAINED, LOCAL, GLOBAL, LONGER, UPLOADED),
     UNSEEN: (PRETRAINED, GLOBAL, BORROWED, UPLOADED),
 }
-COMPARED = (  # town, after, before, in what
+COMPARED = (  # town, after, before, objects
     (OTHER, LOCAL, PRETRAINED, "rare"),
     (OWN, GLOBAL, LOCAL, "rare"),
     (OWN, GLOBAL, LONGER, "rare"),
@@ -78,12 +77,12 @@ COMPARED = (  # town, after, before, in what
     (OWN, UPLOADED, GLOBAL, "rare"),
 )
 SIZES = np.array([shape[1:] for kind in CARS for shape in SHAPES[kind] if shape.name in RARE])
-NEAR_M = 0.005  # sizes are those of the shapes
+NEAR_M = 0.005  # tolerance of sizes, which are those of the shapes
 
 
 @dataclass(frozen=True)
 class RareScore:
-    """AP50 of a network on every object and on the rare kinds alone, and the number of targets of these."""
+    """AP50 of a network on all objects and on rare kinds only, and the number of rare targets."""
 
     every: float
     rare: float
@@ -114,7 +113,7 @@ class CornerCaseResult(Record):
 def compare_corner_cases(
     recipe: RunRecipe, runs: Sequence[Run], works: Sequence[Path], progress: Report = ignore_progress
 ) -> CornerCaseResult:
-    """Return the results of the arms of `recipe` from a run of each seed, whose steps lie in the folders `works`."""
+    """Return the results of the arms of `recipe` from a run per seed, with their steps in the folders `works`."""
     seeds: dict[str, dict[str, dict[str, RareScore]]] = {}
     for number, (run, work) in enumerate(zip(runs, works, strict=True), start=1):
         seeds[str(run.recipe.seed)] = {
@@ -126,12 +125,12 @@ def compare_corner_cases(
     def gain(town: str, after: str, before: str, field: str) -> MeanOverSeeds:
         return mean_difference(by_town[town], after, before, attrgetter(field))
 
-    told = {"rare": "rare kinds", "every": "all objects"}
+    objects = {"rare": "rare kinds", "every": "all objects"}
     return CornerCaseResult(
         seeds=seeds,
         rare={town: average_arms(by_town[town], arms, attrgetter("rare")) for town, arms in TOWNS.items()},
         every={town: average_arms(by_town[town], arms, attrgetter("every")) for town, arms in TOWNS.items()},
-        differences={f"{row[0]}, {told[row[3]]}: {row[1]} - {row[2]}": gain(*row) for row in COMPARED},
+        differences={f"{row[0]}, {objects[row[3]]}: {row[1]} - {row[2]}": gain(*row) for row in COMPARED},
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
     )
@@ -148,27 +147,27 @@ def score_arm(run: Run, work: Path, arm: str, town: str) -> RareScore:
 def score_rare(network: Second, split: Frames) -> RareScore:
     """Return the scores of a network on the vehicles' frames of a split."""
     read = frame_reader(split.data, network.config.foreground)
-    found, truths = detect_frames(network, map(read, split.vehicles), None, total=len(split.vehicles))
+    detections, truths = detect_frames(network, map(read, split.vehicles), None, total=len(split.vehicles))
     rare = [only_rare(truth) for truth in truths]
-    every, alone = (_ap50(found, each, network.config.classes) for each in (truths, rare))
+    every, alone = (_ap50(detections, targets, network.config.classes) for targets in (truths, rare))
     return RareScore(every, alone, sum(len(truth.targets) for truth in rare))
 
 
-def _ap50(found: Sequence[Boxes], truths: Sequence[FrameTruth], classes: tuple[str, ...]) -> float:
-    scores = score_detections(found, truths, classes)
+def _ap50(detections: Sequence[Boxes], truths: Sequence[FrameTruth], classes: tuple[str, ...]) -> float:
+    scores = score_detections(detections, truths, classes)
     (ap,) = (row.ap for row in scores if (row.kind, row.iou, row.label) == ("3d", 0.5, "Car"))
     return 0.0 if ap is None else ap
 
 
 def only_rare(truth: FrameTruth) -> FrameTruth:
-    """Return the ground truth whose targets are those of rare kinds; all others are neutral."""
+    """Return the ground truth with only rare kinds as targets; all other targets become neutral."""
     kept = is_rare(truth.targets)
     neutral = concatenate([truth.neutral, truth.targets[~kept]])
     return replace(truth, targets=truth.targets[kept], neutral=neutral, occlusion=None)
 
 
 def is_rare(boxes: Boxes) -> NDArray[np.bool_]:
-    """Return (N,) whether each annotated box has the size of a rare kind."""
+    """Return a mask (N,) of the annotated boxes with the size of a rare kind."""
     apart = np.abs(boxes.size[:, None] - SIZES).max(axis=2)
     return (apart < NEAR_M).any(axis=1)
 
@@ -201,7 +200,7 @@ def _seeds(results: CornerCaseResult) -> str:
     rows = [
         [
             f"{town}, {arm}",
-            *(f"{own[town][arm].rare:.3f}, {own[town][arm].every:.3f}" for own in results.seeds.values()),
+            *(f"{seed[town][arm].rare:.3f}, {seed[town][arm].every:.3f}" for seed in results.seeds.values()),
         ]
         for town, arms in TOWNS.items()
         for arm in arms

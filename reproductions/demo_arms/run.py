@@ -1,9 +1,9 @@
 """Ablation: each stage and sensor against its alternatives, as the arms of recipes/runs/arms.yaml on the same frames.
 
 Centralised arms continue pretraining for as many optimiser steps as the vehicles of stage II take together; the arm
-with further edge rounds takes as many as stage II and stage III do. Every arm has a ledger of its own. Within a seed,
-intervals are a bootstrap over test scenes; over seeds, which have recordings of their own, they cover training and
-traffic too. The verdicts on all differences are corrected together.
+with further edge rounds takes as many as stages II and III. Arms have separate ledgers. Within a seed, intervals are a
+bootstrap over test scenes; seeds have different recordings, so that intervals over seeds cover training and traffic as
+well. The verdicts on all differences are corrected together.
 """
 
 from collections import Counter
@@ -31,7 +31,7 @@ from flcav.storage.records import Record, select
 TASK = "objects"
 FURTHER = "edge FL, as many more rounds"  # instead of those of cloud FL
 IDEAL = "edge FL, VRCSP pole, ideal road detector"
-EFFECT = 0.02  # difference in AP50 that the comparison is to tell
+EFFECT = 0.02  # difference in AP50 that the comparison should detect
 ARMS: dict[str, dict[str, tuple[str, str]]] = {  # by town: name in the tables -> arm, stage
     "grid": {
         "pretrained": (MAIN, PRETRAIN),
@@ -93,7 +93,7 @@ class Pretraining:
 
 @dataclass(frozen=True)
 class PlacedSensor:
-    """Placement of a region's roadside sensor, and the errors it covers."""
+    """Placement of a region's roadside sensor, and its coverage of errors."""
 
     chosen: int
     densest: int  # pole of the densest traffic
@@ -125,7 +125,7 @@ class ArmsSummary:
     ap70: Mapping[str, Mapping[str, MeanOverSeeds]]
     differences: Mapping[str, MeanOverSeeds]
     gap_closed: Mapping[str, MeanOverSeeds]
-    road_share: MeanOverSeeds  # of the ideal detector's gain
+    road_share: MeanOverSeeds  # share of the gain with the ideal road detector
 
 
 @dataclass(frozen=True)
@@ -148,16 +148,16 @@ def compare_arms(recipe: RunRecipe, runs: Sequence[Run]) -> ArmsResult:
 
 
 def one_seed(run: Run) -> ArmsSeed:
-    """Return the numbers of one seed's run."""
+    """Return the results of one seed's run."""
     main, pretrained = run.arms[MAIN], run.pretrained[0]
-    own, plan = main.links, main.plan.tasks[TASK]
+    plan = main.plan.tasks[TASK]
     ap = {town: {arm: _tested(run, town, *stage) for arm, stage in arms.items()} for town, arms in ARMS.items()}
-    found = {
-        (each.region, each.arm, each.stage, each.before_arm, each.before_stage): each.over_scenes
-        for each in run.differences
+    compared = {
+        (change.region, change.arm, change.stage, change.before_arm, change.before_stage): change.over_scenes
+        for change in run.differences
     }
     differences = {
-        f"{town}: {after} - {before}": found[town, *arms[after], *arms[before]]
+        f"{town}: {after} - {before}": compared[town, *arms[after], *arms[before]]
         for town, arms in ARMS.items()
         for after, before in COMPARED
         if {after, before} <= set(arms)
@@ -167,7 +167,7 @@ def one_seed(run: Run) -> ArmsSeed:
         for arm, stage in ARMS["grid"].items()
         if (name := f"grid, {TASK}: {name_stage(*stage)}") in run.gap_closed
     }
-    curve = tuple(vars(each) for each in pretrained.validated)
+    curve = tuple(vars(validation) for validation in pretrained.validated)
     return ArmsSeed(
         seed=run.recipe.seed,
         plan=PlannedCounts(plan.samples, plan.edge_rounds, plan.cloud_rounds),
@@ -176,7 +176,7 @@ def one_seed(run: Run) -> ArmsSeed:
         ap=ap,
         differences=differences,
         gap_closed=closed,
-        used_mb={"edge + cloud FL": {link: use.used_mb for link, use in own.items()}},
+        used_mb={"edge + cloud FL": {link: use.used_mb for link, use in main.links.items()}},
     )
 
 
@@ -213,14 +213,14 @@ def summarise(seeds: Sequence[ArmsSeed]) -> ArmsSummary:
 
 
 def _road_share(reached: Mapping[str, ReachedAP]) -> float:
-    """Return the share of edge FL's gain with an ideal road detector that the trained one brings."""
+    """Return the gain of edge FL with the trained road detector as a share of that with an ideal one."""
     return gap_closed(*(reached[arm].ap50 for arm in ("pretrained", "edge FL, VRCSP pole", IDEAL)))
 
 
 def judge_differences(summary: ArmsSummary) -> dict[str, Judged]:
     """Return the verdicts on the claims that the differences are positive, corrected together.
 
-    Nobody claims that the trained road detector beats an ideal one: what is lost to that is an estimate.
+    The difference to the ideal road detector is no claim, only an estimate.
     """
     return judge_means({name: mean for name, mean in summary.differences.items() if not name.endswith(f" - {IDEAL}")})
 
@@ -249,7 +249,7 @@ def draw_arms(results: ArmsResult) -> bytes:
 
 
 def order_arms(towns: Mapping[str, Mapping[str, MeanOverSeeds]]) -> dict[str, dict[str, MeanOverSeeds]]:
-    """Return the numbers by town and arm in the order of `ARMS`: files have their keys sorted."""
+    """Return means by town and arm in the order of `ARMS`, since the keys in files are sorted."""
     return {
         town: {arm: towns[town][arm] for arm in arms if arm in towns[town]}
         for town, arms in ARMS.items()
@@ -269,7 +269,7 @@ def tables(results: ArmsResult) -> dict[str, str]:
 
 
 def _town(results: ArmsResult, town: str) -> str:
-    """Return AP by arm; in grid, which has an oracle, also the fraction of the gap to it that each arm closes."""
+    """Return AP by arm; for grid, which has an oracle, also the share of the gap to it that an arm closes."""
     summary = results.summary
     closed = summary.gap_closed if town == "grid" else {}
     rows = [
@@ -282,14 +282,15 @@ def _town(results: ArmsResult, town: str) -> str:
 
 
 def _differences(results: ArmsResult) -> str:
-    rows, judged = [], judge_differences(results.summary)
+    judged = judge_differences(results.summary)
+    rows = []
     for name, mean in results.summary.differences.items():
-        own = [seed.differences[name] for seed in results.seeds]
-        times = Counter(verdict(each.low, each.high) for each in own)
-        counted = " / ".join(str(times[each]) for each in (HELD, UNDECIDED, NOT_HELD))
+        by_seed = [seed.differences[name] for seed in results.seeds]
+        times = Counter(verdict(estimate.low, estimate.high) for estimate in by_seed)
+        counted = " / ".join(str(times[state]) for state in (HELD, UNDECIDED, NOT_HELD))
         one = judged.get(name)
-        told = (one.p_cell, one.verdict) if one else ("", ESTIMATE)
-        rows.append([name, mean.describe(sign=True), *told, counted])
+        cells = (one.p_cell, one.verdict) if one else ("", ESTIMATE)
+        rows.append([name, mean.describe(sign=True), *cells, counted])
     header = (
         "difference in AP50",
         "mean over seeds",
@@ -301,14 +302,15 @@ def _differences(results: ArmsResult) -> str:
 
 
 def _power(results: ArmsResult) -> str:
-    """Return how many seeds it takes to tell `EFFECT`, and differences of the size found, after correction."""
-    judged, rows = judge_differences(results.summary), []
+    """Return the numbers of seeds that detect `EFFECT` and a difference of the observed size, after correction."""
+    judged = judge_differences(results.summary)
+    rows = []
     for name, mean in results.summary.differences.items():
         one = judged.get(name)
         level = LEVEL / max(one.family, 1) if one else LEVEL
         half = f"{half_width(mean.sd, mean.seeds):.3f}" if mean.seeds > 1 else ""
         wanted = plan_seeds(EFFECT, mean.sd, level) if mean.known else None
-        rows.append([name, f"{mean.sd:.3f}", half, _told(wanted, mean), one.takes_cell if one else ""])
+        rows.append([name, f"{mean.sd:.3f}", half, _count_cell(wanted, mean), one.takes_cell if one else ""])
     header = (
         "difference in AP50",
         "standard deviation over seeds",
@@ -319,8 +321,8 @@ def _power(results: ArmsResult) -> str:
     return format_table(header, rows)
 
 
-def _told(seeds: int | None, mean: MeanOverSeeds) -> str:
-    """Return a number of seeds as text; None: too many, or not known."""
+def _count_cell(seeds: int | None, mean: MeanOverSeeds) -> str:
+    """Return a number of seeds as text: "" where unknown; None stands for too many."""
     if not mean.known:
         return ""
     return f"more than {MOST_SEEDS}" if seeds is None else str(seeds)

@@ -1,8 +1,8 @@
 """Comparison of labels for stage II, the arms of recipes/runs/distillation.yaml: same frames, steps and budget.
 
-Arms differ only in their labels and in the pole that these come from. Every arm has a ledger of its own with the boxes
-that its vehicles send. Over seeds, which have recordings of their own, intervals cover training and traffic. The
-verdicts on all differences are corrected together.
+Arms differ only in their labels and the pole of these. Arms have separate ledgers, which include the boxes that their
+vehicles send. Seeds have different recordings, so that intervals over them cover training and traffic. The verdicts on
+all differences are corrected together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -63,8 +63,8 @@ class DistillationArm:
 
     ap50: float
     ap70: float
-    up_mb: float  # by wireless in stage II, weights and boxes
-    labels: tuple[LabelQuality, ...]  # before each round; labels that stay: once; of the pretrained network: none
+    up_mb: float  # wireless uplink of stage II [MB]: weights and boxes
+    labels: tuple[LabelQuality, ...]  # before each round, or once if labels do not change; empty for the pretrained
 
 
 @dataclass(frozen=True)
@@ -74,12 +74,12 @@ class DistillationResult(Record):
     seeds: Mapping[str, Mapping[str, DistillationArm]]  # by seed and arm
     ap50: Mapping[str, MeanOverSeeds]  # by arm
     differences: Mapping[str, MeanOverSeeds]  # "after - before", in AP50
-    closed: MeanOverSeeds  # share of the gain with the road sensor that tracks bring without one
+    closed: MeanOverSeeds  # gain of tracks without a road sensor, as a share of the gain with it
     recipe: Mapping[str, Json]
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return AP50 by arm, the verdicts on differences, and what tracks bring without a road sensor, in words."""
+        """Return AP50 by arm, the verdicts on differences, and the share of the gain without a sensor, in words."""
         reached = [f"{arm}: AP50 {mean.describe()}" for arm, mean in self.ap50.items()]
         share = f"share of the gain with the road sensor that tracks bring without one: {self.closed.describe()}"
         return [*reached, *describe_means(self.differences), share]
@@ -128,23 +128,24 @@ def tables(results: DistillationResult) -> dict[str, str]:
 def _arms(results: DistillationResult) -> str:
     rows = []
     for name in ARMS:
-        own = [seed[name] for seed in results.seeds.values()]
-        ap70, sent = (float(np.mean([getattr(each, field) for each in own])) for field in ("ap70", "up_mb"))
+        arms = [seed[name] for seed in results.seeds.values()]
+        ap70 = float(np.mean([arm.ap70 for arm in arms]))
+        sent = float(np.mean([arm.up_mb for arm in arms]))
         rows.append([name, results.ap50[name].describe(), f"{ap70:.3f}", f"{sent:.2f} MB" if sent else ""])
     return format_table(("stage II learns from", "AP50", "AP70, mean", "wireless uplink of stage II, mean"), rows)
 
 
 def _labels(results: DistillationResult) -> str:
-    """Return precision and recall of the labels before the first and the last round, means over seeds."""
+    """Return the mean precision and recall over seeds of the labels before the first and the last round."""
     rows = []
     for name in ARMS:
         if name == PRETRAINED:
             continue
         cells = []
         for place in (0, -1):
-            found = [seed[name].labels[place] for seed in results.seeds.values() if seed[name].labels]
+            labels = [seed[name].labels[place] for seed in results.seeds.values() if seed[name].labels]
             for field in ("precision", "recall"):
-                known = [value for each in found if (value := getattr(each, field)) is not None]
+                known = [value for quality in labels if (value := getattr(quality, field)) is not None]
                 cells.append(f"{np.mean(known):.3f}" if known else "")
         rows.append([name, *cells])
     at = (f"{name}, {when} round" for when in ("first", "last") for name in ("precision", "recall"))

@@ -1,11 +1,11 @@
-"""Failure search: how many distinct failures of a detector an adaptive search finds, against Sobol points.
+"""Failure search: distinct failures of a detector that an adaptive search finds, compared with Sobol points.
 
-All rules (`odd.searching.RULES`) test as many scenarios, and as many frames of each, in the same domain and towns with
-the same detector. The rule "path" chooses frames as the search may, and learns nothing: it separates the two. Distinct
-are failures in different cells of a grid (`odd.failures.GRID`).
+All rules (`odd.searching.RULES`) test equally many scenarios and frames, in the same domain and towns with the same
+detector. The rule "path" draws from the same frames as the search, but does not learn: it separates the two effects.
+Failures are distinct if they are in different cells of a grid (`odd.searching.GRID`).
 
-Expected, before any run with these seeds: the search finds two to four times as many as Sobol points, and most of that
-is from choosing frames in which there is somebody to miss; against such frames drawn at random it gains little.
+Expected, before any run with these seeds: the search finds two to four times as many as Sobol points, mostly because it
+chooses frames with road users to miss; compared with random frames of this kind it gains little.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,7 +34,7 @@ from flcav.world.map.town import TOWNS, load_town
 
 DOMAIN = "urban"
 SCENARIOS, SEEDS = 60, 5
-APART = 10_000  # between the seeds of two searches, which give their scenarios the seeds that follow
+APART = 10_000  # between the seeds of two searches, whose scenarios have consecutive seeds
 SOBOL, PATH, SEARCH = RULES
 PAIRS = ((SEARCH, SOBOL), (SEARCH, PATH), (PATH, SOBOL))
 NAMES: Mapping[str, str] = {
@@ -48,8 +48,8 @@ NAMES: Mapping[str, str] = {
 class Found(Record):
     """Failures found by one search rule with one seed."""
 
-    frames: int  # tested
-    failing: int  # of them with a failure
+    frames: int  # number of tested frames
+    failing: int  # number of frames with a failure
     failures: int
     growth: tuple[int, ...]  # distinct failures after each scenario
 
@@ -64,10 +64,10 @@ class FailureSearchResult(Record):
     """Distinct failures of each rule, and their ratios, paired over seeds."""
 
     scenarios: int  # of each rule and seed
-    found: Mapping[str, tuple[Found, ...]]  # by rule: one for each seed
+    found: Mapping[str, tuple[Found, ...]]  # by rule and seed
     distinct: Mapping[str, MeanOverSeeds]  # by rule
     ratios: Mapping[str, Estimate]  # "failures / sobol", ...: geometric mean; interval by Student's t of logarithms
-    together: Mapping[str, int]  # by rule: distinct failures of all seeds together
+    together: Mapping[str, int]  # number of distinct failures in all seeds, by rule
     provenance: Provenance
 
     def sentences(self) -> list[str]:
@@ -80,15 +80,15 @@ class FailureSearchResult(Record):
         return [*lines, *(f"{name}: {ratio.describe()}" for name, ratio in self.ratios.items())]
 
     def picture(self) -> bytes:
-        """Return the growth of distinct failures with the frames as a PNG."""
-        lines = {NAMES[rule]: np.array([each.growth for each in self.found[rule]]) for rule in RULES}
+        """Return the growth of distinct failures with tested frames as a PNG."""
+        lines = {NAMES[rule]: np.array([search.growth for search in self.found[rule]]) for rule in RULES}
         return style.png(draw_growth(lines, self.found[SOBOL][0].frames / self.scenarios))
 
 
 def compare_searches(
     out: Path, seeds: int = SEEDS, scenarios: int = SCENARIOS, progress: Report = ignore_progress
 ) -> FailureSearchResult:
-    """Return what each rule finds with seeds 1, 2, ...; tested frames are kept in the folder `out`."""
+    """Run the searches of all rules with seeds 1, 2, ..., and return their results; frames are kept in `out`."""
     sceneries = [Scenery(load_town(name)) for name in TOWNS]
     space, network = Space(read_domain(DOMAIN), sceneries), resolve_network(OBJECTS, None, "cpu")
     searched: dict[str, list[list[Searched]]] = {rule: [] for rule in RULES}
@@ -106,13 +106,13 @@ def compare_searches(
 
 
 def summarise(searched: Mapping[str, Sequence[Sequence[Searched]]]) -> FailureSearchResult:
-    """Return the figures of the searches by rule: one for each seed."""
-    found = {rule: tuple(count(own) for own in every) for rule, every in searched.items()}
-    every = {rule: set[tuple[str, ...]]().union(*map(distinct, own)) for rule, own in searched.items()}
+    """Return the results of searches, by rule and seed."""
+    found = {rule: tuple(count(search) for search in searches) for rule, searches in searched.items()}
+    every = {rule: set[tuple[str, ...]]().union(*map(distinct, searches)) for rule, searches in searched.items()}
     return FailureSearchResult(
         scenarios=len(next(iter(searched.values()))[0]),
         found=found,
-        distinct={rule: mean_over_seeds([float(each.distinct) for each in own]) for rule, own in found.items()},
+        distinct={rule: mean_over_seeds([float(one.distinct) for one in counts]) for rule, counts in found.items()},
         ratios={f"{one} / {other}": mean_ratio(found[one], found[other]) for one, other in PAIRS},
         together={rule: len(cells) for rule, cells in every.items()},
         provenance=provenance(),
@@ -120,8 +120,8 @@ def summarise(searched: Mapping[str, Sequence[Sequence[Searched]]]) -> FailureSe
 
 
 def count(searched: Sequence[Searched]) -> Found:
-    """Return the figures of one search."""
-    frames = [frame for each in searched for frame in each.tested]
+    """Return the counts of one search."""
+    frames = [frame for scenario in searched for frame in scenario.tested]
     return Found(
         frames=len(frames),
         failing=sum(bool(frame.failures) for frame in frames),
@@ -131,7 +131,7 @@ def count(searched: Sequence[Searched]) -> Found:
 
 
 def mean_ratio(one: Sequence[Found], other: Sequence[Found]) -> Estimate:
-    """Return the geometric mean over seeds of the ratio of distinct failures; none counts as one half."""
+    """Return the geometric mean over seeds of the ratio of distinct failures; 0 failures count as one half."""
     ratios = [max(a.distinct, 0.5) / max(b.distinct, 0.5) for a, b in zip(one, other, strict=True)]
     logs = mean_over_seeds(np.log(ratios).tolist())
     low, high = (None if end is None else float(np.exp(end)) for end in (logs.low, logs.high))
@@ -141,23 +141,23 @@ def mean_ratio(one: Sequence[Found], other: Sequence[Found]) -> Estimate:
 def failure_search_tables(results: FailureSearchResult) -> dict[str, str]:
     """Return Markdown by name: found, ratios."""
     rows = []
-    for rule, own in results.found.items():
+    for rule, searches in results.found.items():
         frames, failing, failures = (
-            float(np.mean([getattr(each, name) for each in own])) for name in ("frames", "failing", "failures")
+            float(np.mean([getattr(one, name) for one in searches])) for name in ("frames", "failing", "failures")
         )
-        half = float(np.mean([each.growth[len(each.growth) // 2 - 1] for each in own]))
+        half = float(np.mean([one.growth[len(one.growth) // 2 - 1] for one in searches]))
         mean = results.distinct[rule].describe()
         row = [f"{frames:.0f}", f"{failing:.1f}", f"{failures:.1f}", f"{half:.1f}", mean, str(results.together[rule])]
         rows.append([NAMES[rule], *row])
     columns = ("rule", "frames", "with a failure", "failures", "distinct after half", "distinct", "all seeds together")
-    told = [
+    ratios = [
         [f"{NAMES[one]} / {NAMES[other]}", results.ratios[name].describe()]
         for name in results.ratios
         for one, other in [name.split(" / ")]
     ]
     return {
         "found": format_table(columns, rows),
-        "ratios": format_table(("distinct failures", "ratio, interval"), told),
+        "ratios": format_table(("distinct failures", "ratio, interval"), ratios),
     }
 
 
@@ -166,13 +166,13 @@ COLOURS = (style.MUTED, style.BLUE, style.ORANGE)
 
 @style.styled
 def draw_growth(lines: Mapping[str, NDArray[np.int64]], frames: float) -> Figure:
-    """Return distinct failures (seeds, scenarios) of each rule against tested frames, `frames` of each scenario."""
+    """Return the chart of distinct failures (seeds, scenarios) by rule against tested frames, `frames` per scenario."""
     figure = style.canvas(6.0, 3.4)
     axes = figure.subplots()
-    for (name, found), colour in zip(lines.items(), COLOURS):
-        at = frames * np.arange(1, found.shape[1] + 1)
-        axes.plot(at, found.mean(axis=0), color=colour, label=name)
-        axes.fill_between(at, found.min(axis=0), found.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+    for (name, counts), colour in zip(lines.items(), COLOURS):
+        at = frames * np.arange(1, counts.shape[1] + 1)
+        axes.plot(at, counts.mean(axis=0), color=colour, label=name)
+        axes.fill_between(at, counts.min(axis=0), counts.max(axis=0), color=colour, alpha=0.2, linewidth=0)
     axes.set(xlabel="frames tested", ylabel="distinct failures")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)

@@ -1,7 +1,7 @@
-"""Drives of ten vehicles through all weathers, and the last two layers of LeNet as what they train and exchange.
+"""Drives of ten vehicles through all weathers, which train and exchange the last two layers of LeNet.
 
-The convolutions are those of the package and stay as they are, so that a picture is the 120 numbers that they make of
-it (layer C5), and a local step is a few matrix products.
+The convolutions are those of the package's network and are frozen. A picture is represented by its 120 features (layer
+C5), and a local step is a few matrix products.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,7 +48,7 @@ RECIPE: Mapping[str, Any] = {
 TEST: Mapping[str, Any] = {**RECIPE, "seed": 9102, "split": "test", "scenes": 10, "cavs": 4}
 CLASSES, BATCH = len(WEATHER_CLASSES), 16
 HIDDEN, OUT = "layers.9", "layers.11"  # F6 and the output layer of `LeNet.layers`
-F6 = 9  # place of F6 in them
+F6 = 9  # index of F6 in `LeNet.layers`
 
 Vector = NDArray[np.float32]
 Labels = NDArray[np.int64]
@@ -56,7 +56,7 @@ Labels = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class Pictures:
-    """Labelled pictures as the convolutions see them."""
+    """N labelled pictures, represented by the features of the convolutions."""
 
     features: Vector  # (N, 120)
     labels: Labels  # (N,)
@@ -65,17 +65,18 @@ class Pictures:
 
 @dataclass(frozen=True)
 class Drives:
-    """Pictures of a federation."""
+    """Pictures of a federation's vehicles and of its test."""
 
     vehicles: Mapping[str, Pictures]  # by name
     test: Pictures  # of other drives in the same town
 
 
 def record_drives(out: Path, progress: Report = ignore_progress) -> Drives:
-    """Record the drives into `out`, or go on with what is there; return their pictures."""
+    """Record the drives to `out`, or resume an interrupted recording, and return their pictures."""
     for name, recipe in (("train", RECIPE), ("test", TEST)):
         record(EmbeddedSource(parse_config(Recipe, dict(recipe), name)), out / name, progress=progress)
-    data, network = Dataset.open(out / "train"), resolve_network(WEATHER, None)
+    data = Dataset.open(out / "train")
+    network = resolve_network(WEATHER, None)
     frames: dict[str, list[int]] = {}
     for number, key in enumerate(data.keys):
         frames.setdefault(key.agent, []).append(number)
@@ -88,20 +89,20 @@ def see_pictures(network: Classifier, data: Dataset, frames: Sequence[int] | Non
     assert isinstance(network, LeNet)
     samples = WEATHER.samples(data, network.config, frames)
     with torch.inference_mode():
-        features = network.layers[:F6](tensor_of(network, [each.picture for each in samples])).numpy()
-    labels = np.array([each.label for each in samples])
-    return Pictures(features, labels, tuple(each.scene for each in samples))
+        features = network.layers[:F6](tensor_of(network, [sample.picture for sample in samples])).numpy()
+    labels = np.array([sample.label for sample in samples])
+    return Pictures(features, labels, tuple(sample.scene for sample in samples))
 
 
 def draw_head(seed: int) -> Weights:
-    """Return first weights of the two layers, as those of a new LeNet (not of that whose convolutions these are)."""
+    """Return initial weights of the two layers: those of a new LeNet, unlike the frozen convolutions."""
     arrays = to_arrays(build_network(WEATHER, WEATHER.configurations["tiny"], derive_seed(seed, "head")))
     return {name: array for name, array in arrays.items() if name.startswith((f"{HIDDEN}.", f"{OUT}."))}
 
 
 def predict(weights: Weights, features: Vector) -> tuple[Vector, Vector]:
-    """Return activations of F6 (N, 84) and class probabilities (N, 8)."""
-    with np.errstate(all="ignore"):  # of weights that an attack made useless
+    """Return the activations of F6 (N, 84) and the class probabilities (N, 8) for features (N, 120)."""
+    with np.errstate(all="ignore"):  # weights may overflow after an attack
         hidden = np.maximum(features @ weights[f"{HIDDEN}.weight"].T + weights[f"{HIDDEN}.bias"], 0)
         logits = hidden @ weights[f"{OUT}.weight"].T + weights[f"{OUT}.bias"]
         powers = np.exp(logits - logits.max(axis=1, keepdims=True))
@@ -109,14 +110,14 @@ def predict(weights: Weights, features: Vector) -> tuple[Vector, Vector]:
 
 
 def find_right(weights: Weights, pictures: Pictures) -> NDArray[np.bool_]:
-    """Return whether the network names the class of each picture (N,)."""
+    """Return a mask (N,) of the correctly classified pictures."""
     return predict(weights, pictures.features)[1].argmax(axis=1) == pictures.labels
 
 
 def spread_over_scenes(pictures: Pictures, values: Sequence[NDArray[np.float64]]) -> SharedScenes:
-    """Return the spread over draws of the test scenes, which all seeds share, of a mean over pictures and seeds.
+    """Return the spread of a mean over pictures and seeds under resampling of the test scenes, which seeds share.
 
-    values: of each seed, the number (N,) of each picture. A single seed has no scenes to share: `OWN_SCENES`.
+    `values` are numbers (N,) of the pictures by seed. For a single seed it is `OWN_SCENES`.
     """
     if len(values) == 1:
         return OWN_SCENES
@@ -125,13 +126,13 @@ def spread_over_scenes(pictures: Pictures, values: Sequence[NDArray[np.float64]]
 
 
 def average_pictures(pictures: Pictures, values: Sequence[NDArray[np.float64]], *, share: bool) -> MeanOverSeeds:
-    """Return the mean over seeds and pictures; `values`: of each seed, the number (N,) of each picture."""
-    means = [float(each.mean()) for each in values]
+    """Return the mean over seeds and pictures; `values` are numbers (N,) of the pictures by seed."""
+    means = [float(of_seed.mean()) for of_seed in values]
     return mean_over_seeds(means, share=share, shared=spread_over_scenes(pictures, values))
 
 
 def measure_losses(weights: Weights, pictures: Pictures) -> NDArray[np.float64]:
-    """Return the cross entropy of each picture (N,)."""
+    """Return the cross entropies (N,) of the pictures."""
     probabilities = predict(weights, pictures.features)[1]
     return -np.log(np.maximum(probabilities[np.arange(len(pictures.labels)), pictures.labels], 1e-30))
 

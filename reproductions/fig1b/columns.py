@@ -20,13 +20,13 @@ WIDTH_IN, HEIGHT_IN = 13.0, 9.0
 ASPECT = 0.6  # height of a panel, divided by its width
 FROM_ABOVE: dict[str, Any] = {"xlim": (-28, 28), "ylim": (0, 33.6), "aspect": "auto"}  # limits of axes for a sweep [m]
 BEHIND_M, ABOVE_M = 9.0, 5.0  # viewpoint of a sweep in perspective, from its sensor
-SHOWN_MAPS = 3  # most active feature maps of a layer
+SHOWN_MAPS = 3  # number of feature maps shown per layer, the most active ones
 ACTIVE = LinearSegmentedColormap.from_list("active", ["#f4f7fa", style.SKY, style.BLUE, "#00284a"])
 
 
 @dataclass(frozen=True)
 class Layer:
-    """The output of a layer for one sample."""
+    """Output of a layer for one sample."""
 
     name: str
     values: NDArray[np.float32]  # (C, H, W) maps or (C,) a vector
@@ -39,7 +39,7 @@ class Layer:
 
 @dataclass(frozen=True)
 class Column:
-    """The column of one task: a drawing function and a caption for each of `ROWS`."""
+    """The column of one task: drawing functions and captions by row (`ROWS`)."""
 
     title: str
     draws: Mapping[str, Draw]  # by row
@@ -48,7 +48,7 @@ class Column:
 
 @style.styled
 def task_columns(columns: Sequence[Column]) -> Figure:
-    """Return the figure: a column per task, a row for each of `ROWS`."""
+    """Return the figure with a column per task and a row for each of `ROWS`."""
     figure = style.canvas(WIDTH_IN, HEIGHT_IN)
     panels = figure.subplots(len(ROWS), len(columns), squeeze=False)
     for number, column in enumerate(columns):
@@ -156,7 +156,7 @@ def show_sweep(axes: Axes, points: NDArray[np.float32], range_m: Sequence[float]
 
 
 def show_raster(axes: Axes, raster: NDArray[np.float32], colours: Sequence[str | tuple[float, ...] | None]) -> None:
-    """Draw the layers (L, H, W) of a raster over each other, each in its colour; None: the layer is left out."""
+    """Draw the layers (L, H, W) of a raster over each other in their colours; layers with colour None are left out."""
     picture = np.ones((*raster.shape[1:], 3))
     for layer, colour in zip(raster, colours, strict=True):
         if colour is not None:

@@ -49,7 +49,7 @@ from flcav.sources.recipe import Recipe
 
 WIDE, NARROW, LIDAR = "wide", "narrow", "velodyne"
 CAMERA = {"mount": {"x": 0.5, "z": 1.5}, "settings": {"width": 640, "height": 384}}
-PRESENT = 5  # spin that is shown: 2.5 s after the first, 3.5 s before the last
+PRESENT = 5  # the shown spin: 2.5 s after the first, 3.5 s before the last
 RECIPE: Mapping[str, Any] = {
     "town": "grid",
     "seed": 79,
@@ -67,8 +67,8 @@ RECIPE: Mapping[str, Any] = {
     "weather": "clear",
 }
 MAP_M = 50.0  # shown to either side of the observer
-SCORE = 0.3  # lowest score that is shown
-CELL_M = 0.4  # of a drawn voxel, four of the network's wide: its own would be too small to see
+SCORE = 0.3  # least score of shown detections
+CELL_M = 0.4  # of a drawn voxel, four times the network's, which would be too small to see
 WAY, SELF, OTHERS, PEDESTRIAN = (0.75, 0.87, 0.95), (0.84, 0.37, 0), (0.0, 0.45, 0.7), (0.8, 0.47, 0.65)
 RASTER_COLOURS = {
     **dict(zip(("road", "lane", "crossing"), MAP_COLOURS, strict=True)),
@@ -80,7 +80,7 @@ RASTER_COLOURS = {
 
 
 def fig1b(out: Path, progress: Report = ignore_progress) -> bytes:
-    """Record the scene into `out`, run the package's networks on it, and return the figure as a PNG.
+    """Record the scene to `out`, run the package's networks on it, and return the figure as a PNG.
 
     Raises `InputError` where one of the tasks has no weights in the package.
     """
@@ -261,7 +261,7 @@ LAYERS: dict[str, Callable[[Any], Named]] = {
 
 @contextlib.contextmanager
 def capture_outputs(layers: Named) -> Iterator[dict[str, Layer]]:
-    """Yield a dictionary of each layer's last output, by name, for the first sample of its batch."""
+    """Yield a dictionary of the layers' last outputs by name, for the first sample of the batch."""
     seen: dict[str, Layer] = {}
 
     def keep(name: str) -> Callable[[nn.Module, Any, Any], None]:
@@ -290,7 +290,7 @@ def capture_inputs(layer: nn.Module) -> Iterator[list[Any]]:
 
 
 def _values(out: Any) -> NDArray[np.float32]:
-    """Return the output (C, H, W) or (C,) of the first sample; of a recurrent layer, its last time step."""
+    """Return the output (C, H, W) or (C,) of the first sample; for a recurrent layer, that of its last time step."""
     if isinstance(out, SparseTensor):
         out = out.birds_eye()
     if isinstance(out, tuple):

@@ -1,6 +1,6 @@
 """Fig. 3a of Wang et al. (IEEE Network 37(3), 2023): the three-layer graph, and learning curves with confidence bands.
 
-One set of curves is fitted to the article's own points, in its form accuracy = 1 - a x^(-b); the other to the history
+One set of curves is fitted to the points of the article, in its form accuracy = 1 - a x^(-b); the other to the history
 of this package's runs, in the additive form that plans use.
 """
 
@@ -30,7 +30,7 @@ from flcav.storage.records import Record
 Array = NDArray[np.float64]
 
 PRINTED = {"weather": (11.84, 1.23), "signs": (8.15, 0.62), "objects": (0.51, 0.10)}  # a and b of the authors' software
-NEAR = 0.03  # relative: deviation of fitted from printed constants that counts as near
+NEAR = 0.03  # greatest relative deviation of fitted from printed constants that counts as near
 LEVEL = 0.95  # confidence level of the bands
 
 
@@ -49,28 +49,28 @@ class ArticleCurve:
     points: tuple[tuple[float, float], ...]  # samples, accuracy
     fitted: Additive
     printed: Constants
-    off: Constants  # relative deviation: fitted / printed - 1
+    off: Constants  # relative deviation, fitted / printed - 1
     rmse: float  # of accuracy
-    resource: tuple[float, ...]  # samples at which the next three are given
+    resource: tuple[float, ...]  # numbers of samples of the following values
     accuracy: tuple[float, ...]
-    low: tuple[float, ...]  # band
+    low: tuple[float, ...]  # lower end of the band
     high: tuple[float, ...]
 
 
 @dataclass(frozen=True)
 class OwnLine:
-    """The package's own curve at one number of samples, along the rounds of a run."""
+    """The package's curve at one number of samples, along the rounds of a run."""
 
     samples: int
-    accuracy: tuple[float, ...]  # at each of `OwnCurves.route`
-    low: tuple[float, ...]  # band
+    accuracy: tuple[float, ...]  # along `OwnCurves.route`
+    low: tuple[float, ...]  # lower end of the band
     high: tuple[float, ...]
     points: tuple[tuple[int, float], ...]  # index in the route, accuracy
 
 
 @dataclass(frozen=True)
 class OwnCurves:
-    """The learning curve fitted to the package's own history."""
+    """The learning curve fitted to the package's history."""
 
     route: tuple[tuple[int, int], ...]  # edge rounds, cloud rounds
     curve: Additive
@@ -117,34 +117,34 @@ def _article_curve(points: History, printed: tuple[float, float]) -> ArticleCurv
     )
 
 
-def _line(fit: Fit[Additive], found: Bands | None, where: Array) -> tuple[tuple[float, ...], ...]:
-    """Return the accuracy at `where` (n, 3), and the low and high ends of its band; without a band, the accuracy."""
+def _line(fit: Fit[Additive], bands: Bands | None, where: Array) -> tuple[tuple[float, ...], ...]:
+    """Return the accuracy at `where` (n, 3), and the ends of its band, which are the accuracy without a band."""
     accuracy = 1 - fit.curve.error(*where.T)
-    low, high = (accuracy, accuracy) if found is None else (1 - error for error in found.between(where)[::-1])
-    return tuple(tuple(each.tolist()) for each in (accuracy, low, high))
+    low, high = (accuracy, accuracy) if bands is None else (1 - error for error in bands.between(where)[::-1])
+    return tuple(tuple(values.tolist()) for values in (accuracy, low, high))
 
 
 def _own_curves() -> OwnCurves:
-    """Return a line for each number of samples in the history: pretrained, then edge rounds, then cloud rounds."""
+    """Return a line for each number of samples in the history, along pretraining, edge rounds and cloud rounds."""
     history = level_seeds(load_known_history("objects")).history
     samples, edge_rounds, cloud_rounds = history.resources.T
     fit = fit_additive(samples, edge_rounds, cloud_rounds, history.accuracy, history.weight)
     points = np.column_stack((history.resources, history.accuracy)).tolist()
-    found = bootstrap_bands(fit, level=LEVEL)
+    bands = bootstrap_bands(fit, level=LEVEL)
     route = [(e, 0) for e in range(int(edge_rounds.max()) + 1)]
     route += [(int(edge_rounds.max()), c) for c in range(1, int(cloud_rounds.max()) + 1)]
-    place = {each: number for number, each in enumerate(route)}
+    place = {rounds: number for number, rounds in enumerate(route)}
     lines = []
     for count in np.unique(samples):
-        accuracy, low, high = _line(fit, found, np.array([(count, *each) for each in route], dtype=np.float64))
-        own = tuple((place[int(e), int(c)], float(y)) for x, e, c, y in points if x == count)
-        lines.append(OwnLine(int(count), accuracy, low, high, own))
+        accuracy, low, high = _line(fit, bands, np.array([(count, *rounds) for rounds in route], dtype=np.float64))
+        measured = tuple((place[int(e), int(c)], float(y)) for x, e, c, y in points if x == count)
+        lines.append(OwnLine(int(count), accuracy, low, high, measured))
     return OwnCurves(tuple(route), fit.curve, fit.rmse, tuple(lines))
 
 
 def _findings(article: Mapping[str, ArticleCurve], own: OwnCurves) -> tuple[str, ...]:
     """Return the findings as sentences."""
-    off = {(task, name): value for task, each in article.items() for name, value in vars(each.off).items()}
+    off = {(task, name): value for task, curve in article.items() for name, value in vars(curve.off).items()}
     (task, name), worst = max(off.items(), key=lambda item: abs(item[1]))
     near = all(abs(value) <= NEAR for value in off.values())
     points = sum(len(line.points) for line in own.lines)
@@ -189,17 +189,17 @@ def _effective(a: float, b: float, group_samples: int) -> dict[str, str | float]
 
 
 def draw_fig3a(results: Fig3a) -> bytes:
-    """Return the figure as a PNG: the graph, the article's curves, the package's own curves."""
+    """Return the figure as a PNG: the graph, the article's curves, and the package's curves."""
     article = [
         curve_charts.Curve(
-            f"{task}\n1 − {each.fitted.pretrain.a:.3g}·x$^{{-{each.fitted.pretrain.b:.2g}}}$",
-            each.resource,
-            each.accuracy,
-            each.low,
-            each.high,
-            each.points,
+            f"{task}\n1 − {curve.fitted.pretrain.a:.3g}·x$^{{-{curve.fitted.pretrain.b:.2g}}}$",
+            curve.resource,
+            curve.accuracy,
+            curve.low,
+            curve.high,
+            curve.points,
         )
-        for task, each in results.article.items()
+        for task, curve in results.article.items()
     ]
     places = range(len(results.own.route))
     own = [
@@ -221,20 +221,20 @@ def tables(results: Fig3a) -> dict[str, str]:
 
 def _article(results: Fig3a) -> str:
     rows = []
-    for task, each in results.article.items():
-        decay, printed, off = each.fitted.pretrain, each.printed, each.off
+    for task, curve in results.article.items():
+        decay, printed, off = curve.fitted.pretrain, curve.printed, curve.off
         constants = ((decay.a, printed.a, off.a), (decay.b, printed.b, off.b))
         cells = [f"{fitted:.4g} ({wanted:g}, {by:+.1%})" for fitted, wanted, by in constants]
-        rows.append([task, len(each.points), *cells, f"{each.rmse:.3f}"])
+        rows.append([task, len(curve.points), *cells, f"{curve.rmse:.3f}"])
     return format_table(("task", "points", "a (printed, off)", "b (printed, off)", "rmse of accuracy"), rows)
 
 
 def _curve(results: Fig3a) -> str:
-    """Return the decays that the error of the own curve is the sum of, and what there is to say of their exponents."""
+    """Return the decay terms of the package's curve, whose sum is the error, with notes on their exponents."""
     rows = []
     for stage, decay, name in zip(STAGES, results.own.curve.decays(), "xyz"):
-        said = explain_exponent(stage, decay.b) or ""
-        rows.append([stage, str(decay).replace("x", name), said.removeprefix(f"{stage}: ")])
+        note = explain_exponent(stage, decay.b) or ""
+        rows.append([stage, str(decay).replace("x", name), note.removeprefix(f"{stage}: ")])
     return format_table(("stage", "error", "note"), rows)
 
 

@@ -2,7 +2,7 @@
 
 Vehicles drive through `grid` with the detector of the package. Its errors are counted in zones around the candidate
 poles; the pole that covers most errors is compared with conventional placements, by visible objects and by traffic.
-As many drives in other towns show how many sensors each takes.
+The same number of drives in each of three other towns shows how many sensors those need.
 """
 
 from collections.abc import Mapping, Sequence
@@ -44,22 +44,22 @@ REACHED = (0.5, 0.75, 0.9)  # shares of the errors in reach of any pole
 
 @dataclass(frozen=True)
 class TownCover:
-    """Errors of a town, and what sensors cover of them."""
+    """Errors in a town, and the shares of them that sensors on its poles cover."""
 
     town: str
     errors: int
     poles: int  # candidates
-    shares: tuple[float, ...]  # of the errors, covered at best by 1, 2, ... sensors on as many poles
+    shares: tuple[float, ...]  # of the errors: the largest that 1, 2, ... sensors on different poles cover
     wanted: tuple[int | None, ...]  # fewest sensors for each of `ASKED`; None where all poles cover less
     kinds: Mapping[str, float]  # by kind of scenario, mean number of errors within range of a candidate pole of it
 
     def count_for_reached(self, share: float) -> int:
         """Return the fewest sensors for a share of the errors that sensors on all poles together cover."""
-        return 1 + next(n for n, own in enumerate(self.shares) if own >= share * self.shares[-1] * (1 - TIE))
+        return 1 + next(n for n, covered in enumerate(self.shares) if covered >= share * self.shares[-1] * (1 - TIE))
 
 
 def cover_town(town: Town, errors: NDArray[np.float64], range_m: float) -> TownCover:
-    """Return what sensors of a range cover of the errors (E, 3), world [m], on the town's candidate poles."""
+    """Return the cover of the errors (E, 3), world frame [m], by sensors of range `range_m` on candidate poles."""
     candidates = find_candidates(errors, town.poles.position, [range_m]).at_unit_cost()
     poles = len(town.poles.id)
     shares = tuple(place_count(candidates, count).covered / len(errors) for count in range(1, poles + 1))
@@ -76,7 +76,7 @@ def cover_town(town: Town, errors: NDArray[np.float64], range_m: float) -> TownC
 
 
 def list_kinds(towns: Sequence[TownCover]) -> list[str]:
-    """Return the kinds of scenarios of all towns, those of fewest errors around a pole first."""
+    """Return the kinds of scenarios of all towns, in ascending order of the errors around a pole."""
     kinds = {kind for town in towns for kind in town.kinds}
     return sorted(kinds, key=lambda kind: float(np.mean([town.kinds[kind] for town in towns if kind in town.kinds])))
 
@@ -133,49 +133,51 @@ class Fig3b(Record):
     def sentences(self) -> list[str]:
         """Return zones and placements in words."""
         first = self.zones[0]
-        told = [
+        sentences = [
             f"{self.errors} errors in {self.frames} frames; most per hectare around pole {first.pole} ({first.kind}): "
             f"{first.per_hectare:.0f}"
         ]
         for count in COUNTS:
             rules = [
-                f"{each.rule} {', '.join(map(str, each.poles))}: {each.covered}"
-                for each in self.placed
-                if each.count == count
+                f"{chosen.rule} {', '.join(map(str, chosen.poles))}: {chosen.covered}"
+                for chosen in self.placed
+                if chosen.count == count
             ]
-            told.append(f"{count} sensor{'s' if count > 1 else ''}, errors covered by the poles of {'; '.join(rules)}")
+            sentences.append(
+                f"{count} sensor{'s' if count > 1 else ''}, errors covered by the poles of {'; '.join(rules)}"
+            )
         for town in self.towns:
             first = f"{town.town}: {town.errors} errors; one sensor covers {town.shares[0]:.0%}"
-            told.append(f"{first}, {town.poles} cover {town.shares[-1]:.0%}")
-        return told
+            sentences.append(f"{first}, {town.poles} cover {town.shares[-1]:.0%}")
+        return sentences
 
 
 def fig3b(out: Path, progress: Report = ignore_progress) -> tuple[Fig3b, dict[str, bytes]]:
-    """Record drives into `out`, register the detector's errors; return the numbers, and PNG files by name."""
-    data, town, found = _drive(RECIPE, out / "data", progress)
-    towns = [cover_town(town, found.positions, RANGE_M)]
-    for name, seed in OTHERS.items():
-        _, other, errors = _drive({**RECIPE, "town": name, "seed": seed}, out / name, progress)
+    """Record drives into `out` and register the detector's errors; return the results, and PNG files by name."""
+    data, town, registry = _drive(RECIPE, out / "data", progress)
+    towns = [cover_town(town, registry.positions, RANGE_M)]
+    for town_name, seed in OTHERS.items():
+        _, other, errors = _drive({**RECIPE, "town": town_name, "seed": seed}, out / town_name, progress)
         towns.append(cover_town(other, errors.positions, RANGE_M))
     traces = [trace for scene in sorted({key.scene for key in data.keys}) if (trace := data.trace(scene)) is not None]
     places = np.array([data.world_from_agent(number)[:2, 3] for number in range(len(data))])
-    candidates = find_candidates(found.positions, town.poles.position, [RANGE_M]).at_unit_cost()
+    candidates = find_candidates(registry.positions, town.poles.position, [RANGE_M]).at_unit_cost()
     density = measure_traffic_density(town.poles.position, traces, RANGE_M)
     visible = count_visible_actors(town, traces, town.poles.position, [RANGE_M]).ravel()
     results = Fig3b(
         frames=len(data),
-        errors=len(found),
-        zones=_count_zones(town, found.positions, places, density),
+        errors=len(registry),
+        zones=_count_zones(town, registry.positions, places, density),
         placed=tuple(_place(candidates, town, {"visible objects": visible, "traffic density": density})),
         towns=tuple(towns),
         provenance=provenance(),
     )
-    pictures = {"fig3b.png": _draw(town, found.positions, np.array(found.kinds, dtype=np.str_), results)}
+    pictures = {"fig3b.png": _draw(town, registry.positions, np.array(registry.kinds, dtype=np.str_), results)}
     return results, pictures | {"cover.png": draw_towns(towns)}
 
 
 def _drive(recipe: Mapping[str, Any], folder: Path, progress: Report) -> tuple[Dataset, Town, Registry]:
-    """Record drives in a town of the package; return them, the town, and the errors of the package's detector."""
+    """Record drives in a town; return the data set, the town, and the errors of the package's detector."""
     record(EmbeddedSource(parse_config(Recipe, dict(recipe), "fig3b")), folder)
     data = Dataset.open(folder)
     town = data.town()
@@ -184,10 +186,10 @@ def _drive(recipe: Mapping[str, Any], folder: Path, progress: Report) -> tuple[D
 
 
 def draw_towns(towns: Sequence[TownCover]) -> bytes:
-    """Return the picture of what each number of sensors covers in each town, and of errors by scenario, as a PNG."""
+    """Return a PNG: the share of errors that each number of sensors covers in each town, and errors by scenario."""
     kinds = list_kinds(towns)
-    shares = {each.town: each.shares for each in towns}
-    around = {each.town: [each.kinds.get(kind) for kind in kinds] for each in towns}
+    shares = {cover.town: cover.shares for cover in towns}
+    around = {cover.town: [cover.kinds.get(kind) for kind in kinds] for cover in towns}
     return style.png(draw_cover(shares, kinds, around))
 
 
@@ -205,18 +207,18 @@ def _count_zones(
 
 
 def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.float64]]) -> Sequence[ChosenPoles]:
-    def tell(rule: str, count: int, placed: Placement) -> ChosenPoles:
+    def make_row(rule: str, count: int, placed: Placement) -> ChosenPoles:
         return ChosenPoles(rule, count, tuple(int(town.poles.id[pole]) for pole in placed.chosen), placed.covered)
 
     rows = []
     for count in COUNTS:
-        rows.append(tell("VRCSP", count, place_count(candidates, count)))
-        rows += [tell(rule, count, place_by_score(candidates, score, count)) for rule, score in scores.items()]
+        rows.append(make_row("VRCSP", count, place_count(candidates, count)))
+        rows += [make_row(rule, count, place_by_score(candidates, score, count)) for rule, score in scores.items()]
     return rows
 
 
 def _draw(town: Town, errors: NDArray[np.float64], kind: NDArray[np.str_], results: Fig3b) -> bytes:
-    first = {each.rule: [str(pole) for pole in each.poles] for each in results.placed if each.count == 1}
+    first = {chosen.rule: [str(pole) for pole in chosen.poles] for chosen in results.placed if chosen.count == 1}
     scene = ErrorMap(
         town,
         errors,
@@ -244,19 +246,19 @@ def tables(results: Fig3b) -> dict[str, str]:
         ]
         for zone in results.zones
     ]
-    placed = [[each.count, each.rule, ", ".join(map(str, each.poles)), each.covered] for each in results.placed]
+    placed = [[row.count, row.rule, ", ".join(map(str, row.poles)), row.covered] for row in results.placed]
     header = ("pole", "zone", "errors", "per hectare", "per frame driven there", "actors in reach")
     towns = [
         [
-            each.town,
-            each.errors,
-            each.poles,
-            *(f"{each.shares[count - 1]:.0%}" for count in COUNTS),
-            f"{each.shares[-1]:.0%}",
-            *("" if wanted is None else wanted for wanted in each.wanted),
-            *(each.count_for_reached(share) for share in REACHED),
+            row.town,
+            row.errors,
+            row.poles,
+            *(f"{row.shares[count - 1]:.0%}" for count in COUNTS),
+            f"{row.shares[-1]:.0%}",
+            *("" if wanted is None else wanted for wanted in row.wanted),
+            *(row.count_for_reached(share) for share in REACHED),
         ]
-        for each in results.towns
+        for row in results.towns
     ]
     covered = (*(f"covered by {count}" for count in COUNTS), "by all poles")
     asked = (

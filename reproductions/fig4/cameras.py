@@ -1,7 +1,7 @@
-"""Cameras of roadside suites and the LiDARs beside them: whose cars are associated, and how far extrinsics are off.
+"""Association of cars between the cameras and LiDARs of roadside suites, and the errors of the cameras' extrinsics.
 
-The LiDAR's cars are those of the road detector, the camera's boxes those of the picture detector; which actors they are
-is known from the ground truth, which measures and takes no part in the association.
+The LiDAR's cars are those of the road detector, the camera's boxes those of the picture detector. The ground truth says
+which actors they are: it judges the association and takes no part in it.
 """
 
 from collections.abc import Callable, Sequence
@@ -37,28 +37,28 @@ from flcav.storage.markdown import format_table
 CALIBRATED, CORRECTED, EXACT = "as calibrated", "corrected", "true extrinsics"
 OVERLAP = 0.5  # bird's-eye IoU of a car that the LiDAR found, and IoU of one that the picture shows
 VISIBLE_PX = 100  # least visible pixels of a car that counts
-SURE_DEG, SURE_M = 0.05, 0.01  # how well extrinsics are known that are called exact
+SURE_DEG, SURE_M = 0.05, 0.01  # standard deviations assumed for the true extrinsics
 
 Detect = Callable[[int], Boxes]  # cars in the sweep of a frame, LiDAR frame
 
 
 @dataclass(frozen=True)
 class Associated:
-    """The pairs of all pictures of one camera, by one choice of its extrinsics."""
+    """Counts of the pairs of cars and boxes over all pictures of one camera, for one choice of its extrinsics."""
 
     off: Offset  # of the extrinsics from the true ones
-    squared_error: float | None  # in their own standard deviations, 6 in the mean if those are right; None: exact
+    squared_error: float | None  # squared Mahalanobis distance of that error: 6 in expectation; None: exact
     pairs: int
-    right: int  # of the pairs, both of one actor
-    found: int  # of the pictures' cars, in a right pair
-    lone_cars: int  # of the LiDAR's, in the picture
-    lone_boxes: int  # of the picture's
+    right: int  # pairs whose car and box are one actor
+    found: int  # of the LiDAR's cars that show in the picture, those in a right pair
+    lone_cars: int  # the LiDAR's cars in the picture, without a box
+    lone_boxes: int  # the picture's boxes, without a car
     residual_px: float | None  # median over pairs; None without any
 
 
 @dataclass(frozen=True)
 class CameraResult:
-    """A camera beside a LiDAR, over a window of pictures."""
+    """The associations of a camera with the LiDAR of its suite, over a window of pictures."""
 
     name: str
     pictures: int
@@ -70,7 +70,7 @@ class CameraResult:
 
 @dataclass(frozen=True)
 class Known:
-    """Actors of the cars and of the boxes of one shot, as rows of the frame's annotations; -1: none."""
+    """The actors that the cars and boxes of one shot are, as rows of the frame's annotations; -1: none."""
 
     cars: NDArray[np.int64]  # (N,) of the LiDAR's cars
     boxes: NDArray[np.int64]  # (M,) of the picture's boxes
@@ -82,15 +82,16 @@ def associate_camera(
 ) -> CameraResult:
     """Return how the cars of a pole's LiDAR and of its camera are associated, over all frames of the pole in `data`.
 
-    `error` says how far either sensor's mount may be off from its calibration, in standard deviations.
+    `find` returns the LiDAR's cars of a frame; `error` gives the standard deviations of each mount from its
+    calibration.
     """
     network, numbers = load_picture_network(), data.select(agents={agent})
     read = picture_reader(data, network.config.background)
-    made = []
+    named = []
     for number in numbers:
         boxes = detect_in_picture(network, read(number, camera), threshold=PICTURE_THRESHOLD).box
-        made.append(name_actors(data.frame(number), lidar, camera, PairedShot(find(number), boxes)))
-    shots, known = [shot for shot, _ in made], [actors for _, actors in made]
+        named.append(name_actors(data.frame(number), lidar, camera, PairedShot(find(number), boxes)))
+    shots, known = [shot for shot, _ in named], [actors for _, actors in named]
     height, width = data.plane(numbers[0], camera, "rgb").shape[:2]
     both, size = data.calibrations[agent], (width, height)
     apart = np.sqrt(2)  # both mounts are off
@@ -106,8 +107,8 @@ def associate_camera(
     return CameraResult(
         name,
         len(shots),
-        sum(int(each.visible.sum()) for each in known),
-        sum(int((each.visible & np.isin(each.cars, each.boxes)).sum()) for each in known),
+        sum(int(actors.visible.sum()) for actors in known),
+        sum(int((actors.visible & np.isin(actors.cars, actors.boxes)).sum()) for actors in known),
         {
             CALIBRATED: judge([pair(shot, calibrated) for shot in shots], calibrated),
             CORRECTED: judge(corrected.pairs, corrected.view),
@@ -120,7 +121,7 @@ def associate_camera(
 def make_view(
     calibration: Calibration, lidar: str, camera: str, size: tuple[int, int], covariance: NDArray[np.float64]
 ) -> AssociatedCamera:
-    """Return the view of a camera beside a LiDAR by an agent's calibration; size: width, height of its picture [px]."""
+    """Return a camera's view of a LiDAR's cars by an agent's calibration; size: width, height of its picture [px]."""
     mounts = calibration.agent_from_sensor
     return AssociatedCamera(
         inverse(mounts[camera]) @ mounts[lidar],
@@ -136,25 +137,27 @@ def judge_pairs(
 ) -> Associated:
     """Return the counts over all shots of one camera, whose extrinsics are off by `off`."""
     right = [
-        (own.cars[each.car] >= 0) & (own.cars[each.car] == own.boxes[each.box])
-        for each, own in zip(pairs, known, strict=True)
+        (actors.cars[matched.car] >= 0) & (actors.cars[matched.car] == actors.boxes[matched.box])
+        for matched, actors in zip(pairs, known, strict=True)
     ]
-    found = [ok & own.visible[each.car] for each, own, ok in zip(pairs, known, right, strict=True)]
-    residual_px = np.concatenate([each.residual_px for each in pairs])
+    found = [
+        is_right & actors.visible[matched.car] for matched, actors, is_right in zip(pairs, known, right, strict=True)
+    ]
+    residual_px = np.concatenate([matched.residual_px for matched in pairs])
     return Associated(
         off,
         squared_error,
         len(residual_px),
-        sum(int(ok.sum()) for ok in right),
-        sum(int(ok.sum()) for ok in found),
-        sum(len(each.lone_cars) for each in pairs),
-        sum(len(each.lone_boxes) for each in pairs),
+        sum(int(is_right.sum()) for is_right in right),
+        sum(int(is_right.sum()) for is_right in found),
+        sum(len(matched.lone_cars) for matched in pairs),
+        sum(len(matched.lone_boxes) for matched in pairs),
         float(np.median(residual_px)) if len(residual_px) else None,
     )
 
 
 def name_actors(frame: Frame, lidar: str, camera: str, shot: PairedShot) -> tuple[PairedShot, Known]:
-    """Return what LiDAR and camera found in a frame, and which actors that is."""
+    """Return `shot`, what LiDAR and camera found in a frame, and which actors its cars and boxes are."""
     truth, views = frame.annotations, frame.annotations.views[camera]
     rows = _actors_of_cars(shot.cars.transform(frame.world_from_sensor(lidar)), truth)
     visible = rows >= 0
@@ -163,14 +166,14 @@ def name_actors(frame: Frame, lidar: str, camera: str, shot: PairedShot) -> tupl
 
 
 def _actors_of_cars(cars: Boxes, truth: Annotations) -> NDArray[np.int64]:
-    """Return (N,) the annotation of each of the LiDAR's cars, world frame; -1 for none."""
-    own = np.flatnonzero(np.isin(truth.boxes.label, CARS))
-    target = assign_targets(cars, replace(truth.boxes[own], label=np.full(len(own), "Car")), OVERLAP, "bev")
-    return np.where(target >= 0, own[target], -1) if len(own) else target
+    """Return (N,) the row in `truth` of the actor that each of the LiDAR's cars is, world frame; -1 for none."""
+    rows = np.flatnonzero(np.isin(truth.boxes.label, CARS))
+    target = assign_targets(cars, replace(truth.boxes[rows], label=np.full(len(rows), "Car")), OVERLAP, "bev")
+    return np.where(target >= 0, rows[target], -1) if len(rows) else target
 
 
 def _actors_of_boxes(boxes: NDArray[np.float64], views: Views) -> NDArray[np.int64]:
-    """Return (M,) the annotation whose visible pixels each of a picture's boxes is around; -1 for none."""
+    """Return (M,) the row of the actor whose visible pixels each of a picture's boxes encloses; -1 for none."""
     shown = np.flatnonzero(views.pixels > 0)
     if not len(boxes) or not len(shown):
         return np.full(len(boxes), -1)
@@ -179,7 +182,7 @@ def _actors_of_boxes(boxes: NDArray[np.float64], views: Views) -> NDArray[np.int
 
 
 def tabulate_cameras(cameras: Sequence[CameraResult]) -> str:
-    """Return a row for each camera and choice of its extrinsics, as Markdown."""
+    """Return a Markdown table with a row for each camera and choice of its extrinsics."""
     header = (
         "camera",
         "extrinsics",
@@ -196,20 +199,20 @@ def tabulate_cameras(cameras: Sequence[CameraResult]) -> str:
     )
     rows = [
         [
-            each.name,
+            camera.name,
             name,
-            f"{own.off.position_cm:.0f} cm, {own.off.rotation_deg:.2f}°",
-            "" if own.squared_error is None else f"{own.squared_error:.1f}",
-            each.cars,
-            each.pictured,
-            f"{own.found} ({own.found / each.cars:.2f})" if each.cars else "",
-            own.pairs,
-            f"{own.right} ({own.right / own.pairs:.2f})" if own.pairs else "",
-            own.lone_cars,
-            own.lone_boxes,
-            "" if own.residual_px is None else f"{own.residual_px:.1f}",
+            f"{counts.off.position_cm:.0f} cm, {counts.off.rotation_deg:.2f}°",
+            "" if counts.squared_error is None else f"{counts.squared_error:.1f}",
+            camera.cars,
+            camera.pictured,
+            f"{counts.found} ({counts.found / camera.cars:.2f})" if camera.cars else "",
+            counts.pairs,
+            f"{counts.right} ({counts.right / counts.pairs:.2f})" if counts.pairs else "",
+            counts.lone_cars,
+            counts.lone_boxes,
+            "" if counts.residual_px is None else f"{counts.residual_px:.1f}",
         ]
-        for each in cameras
-        for name, own in each.by_extrinsics.items()
+        for camera in cameras
+        for name, counts in camera.by_extrinsics.items()
     ]
     return format_table(header, rows)

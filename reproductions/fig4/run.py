@@ -1,9 +1,10 @@
 """Fig. 4 of Wang et al. (IEEE Network 37(3), 2023): suites of a crossing and a street registered, associated and fused.
 
-Two LiDARs stand at a crossing of `grid`, on either side of it, a third on the straight street that leads away. Each is
-off from where its calibration says. The second and third are registered to the first by generalised ICP on the static
-background; then the road detector's boxes of all three are averaged. Two cameras hang beside the first LiDAR and two
-beside the third, off as well: their cars are associated with those of the LiDAR, which corrects their extrinsics.
+Two LiDARs stand at a crossing of `grid`, one on each side, a third on the straight street that leads away from it. The
+pose of each is off from its calibration. The second and third are registered to the first by generalised ICP on the
+static background; then the road detector's boxes of all three are averaged. Two cameras are mounted next to the first
+LiDAR and two next to the third, with calibration errors as well. Their cars are associated with those of the LiDAR,
+which corrects their extrinsics.
 """
 
 from collections.abc import Mapping, Sequence
@@ -65,18 +66,18 @@ RECIPE: dict[str, Any] = {
     },
     "calibration_error": {"position_m": 0.3, "rotation_deg": 1.5},
 }
-SWEEPS = 4  # of each suite, whose backgrounds are registered together
+SWEEPS = 4  # of each suite: the returns of their static background are registered
 EDGES_M = tuple(range(0, 91, 10))  # of distance from the first suite
-OVERLAP = 0.5  # bird's-eye IoU of a car that was found
+OVERLAP = 0.5  # least bird's-eye IoU with a box for a car to count as found
 ARMS = ("first suite alone", "three suites as calibrated", "three suites registered")
-REACHED = 0.8  # recall that makes a range
+REACHED = 0.8  # least recall within an arm's range
 
 Found = Mapping[tuple[int, str], Boxes]  # cars in a sweep, LiDAR frame, by frame number and LiDAR
 
 
 @dataclass(frozen=True)
 class Suite:
-    """A suite's pose in the frame of the first one: how far off before and after the registration."""
+    """Errors of a suite's pose in the frame of the first suite, before and after the registration."""
 
     name: str
     apart_m: float  # from the first suite
@@ -86,36 +87,36 @@ class Suite:
 
 @dataclass(frozen=True)
 class Fig4(Record):
-    """Residuals of registered suites, the share of cars found against distance, and the cameras' associations."""
+    """Pose errors of registered suites, the share of cars found against distance, and the cameras' associations."""
 
     suites: tuple[Suite, ...]  # the second and the third
     cars: tuple[int, ...]  # seen by any suite, in each interval of `EDGES_M`
-    found: dict[str, tuple[int, ...]]  # of these, by arm
-    range_m: dict[str, float]  # to which an arm finds the share `REACHED` of the cars; 0 where nowhere
+    found: dict[str, tuple[int, ...]]  # by arm: of these, how many it finds
+    range_m: dict[str, float]  # by arm: distance up to which it finds the share `REACHED` of the cars; 0 where nowhere
     cameras: tuple[CameraResult, ...]
     provenance: Provenance
 
     def sentences(self) -> list[str]:
         """Return residuals and ranges in words."""
-        told = [
-            f"{each.name}, {each.apart_m:.0f} m away: off by {each.before.position_cm:.0f} cm and "
-            f"{each.before.rotation_deg:.2f} degrees as calibrated, {each.after.position_cm:.1f} cm and "
-            f"{each.after.rotation_deg:.2f} degrees registered"
-            for each in self.suites
+        sentences = [
+            f"{suite.name}, {suite.apart_m:.0f} m away: off by {suite.before.position_cm:.0f} cm and "
+            f"{suite.before.rotation_deg:.2f} degrees as calibrated, {suite.after.position_cm:.1f} cm and "
+            f"{suite.after.rotation_deg:.2f} degrees registered"
+            for suite in self.suites
         ]
-        told += [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
-        for each in self.cameras:
-            before, after = (each.by_extrinsics[name] for name in (CALIBRATED, CORRECTED))
-            told.append(
-                f"{each.name}: of {each.cars} cars {before.found} are rightly associated as calibrated, off by "
+        sentences += [f"{arm}: {REACHED:.0%} of the cars are found up to {self.range_m[arm]:.0f} m" for arm in ARMS]
+        for camera in self.cameras:
+            before, after = (camera.by_extrinsics[name] for name in (CALIBRATED, CORRECTED))
+            sentences.append(
+                f"{camera.name}: of {camera.cars} cars {before.found} are rightly associated as calibrated, off by "
                 f"{before.off.rotation_deg:.2f} degrees, {after.found} corrected, off by {after.off.rotation_deg:.2f}"
-                + ("" if each.settled else "; the pairs had not settled")
+                + ("" if camera.settled else "; the pairs had not settled")
             )
-        return told
+        return sentences
 
 
 def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str, bytes]]:
-    """Record the suites into `out`; return the numbers of the figure, and its picture as PNG by file name.
+    """Record the suites into `out`; return the figure's numbers, and its picture as a PNG by file name.
 
     Raises `InputError` where small_gicp is not installed.
     """
@@ -124,8 +125,8 @@ def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str,
     truth = [_pose(data, agent, lidar, assumed=False) for agent, lidar in SUITES]
     calibrated = [_pose(data, agent, lidar, assumed=True) for agent, lidar in SUITES]
     clouds = [_background(data, agent, lidar) for agent, lidar in SUITES]
-    guess = [inverse(calibrated[0]) @ each for each in calibrated]
-    exact = [inverse(truth[0]) @ each for each in truth]
+    guess = [inverse(calibrated[0]) @ world_from_lidar for world_from_lidar in calibrated]
+    exact = [inverse(truth[0]) @ world_from_lidar for world_from_lidar in truth]
     registered = [np.eye(4), *(register_clouds(clouds[0], c, g) for c, g in zip(clouds[1:], guess[1:], strict=True))]
     suites = tuple(
         Suite(
@@ -154,7 +155,7 @@ def fig4(out: Path, progress: Report = ignore_progress) -> tuple[Fig4, dict[str,
         )
         for arm in ARMS[1:]
     ]
-    shares = {arm: [f / c if c else None for f, c in zip(own, cars, strict=True)] for arm, own in found.items()}
+    shares = {arm: [f / c if c else None for f, c in zip(hits, cars, strict=True)] for arm, hits in found.items()}
     return result, {"fig4.png": style.png(draw_suites(shown, NAMES, EDGES_M, shares))}
 
 
@@ -166,10 +167,10 @@ def _pose(data: Dataset, agent: str, lidar: str, *, assumed: bool) -> NDArray[np
 
 
 def _background(data: Dataset, agent: str, lidar: str) -> NDArray[np.float32]:
-    """Return the returns (N, 4) of the static background in a few sweeps of a suite, its own frame."""
-    behind = pole_backgrounds(data, agent)[lidar]
+    """Return the returns (N, 4) of the static background in `SWEEPS` sweeps of a suite, LiDAR frame."""
+    background = pole_backgrounds(data, agent)[lidar]
     sweeps = [data.frame(number).lidar[lidar] for number in data.select(agents={agent})[:SWEEPS]]
-    return np.concatenate([sweep[~behind.in_front(sweep)] for sweep in sweeps])
+    return np.concatenate([sweep[~background.in_front(sweep)] for sweep in sweeps])
 
 
 def _detect_cars(data: Dataset) -> Found:
@@ -186,7 +187,7 @@ def _detect_cars(data: Dataset) -> Found:
 def _count_found(
     data: Dataset, found: Found, world_from_first: NDArray[np.float64], placed: dict[str, list[NDArray[np.float64]]]
 ) -> tuple[tuple[int, ...], dict[str, tuple[int, ...]]]:
-    """Return the cars in each interval of `EDGES_M` and those that each arm finds, over all spins.
+    """Return how many cars are in each interval of `EDGES_M`, and how many of them each arm finds, over all spins.
 
     A car counts where one of the suites has `MIN_RETURNS` from it. Boxes are compared in the first suite's frame.
     """
@@ -200,8 +201,8 @@ def _count_found(
         distance = np.linalg.norm(targets.center[:, :2], axis=1)
         cars += np.histogram(distance, EDGES_M)[0]
         for arm, poses in placed.items():
-            told = [BoxReport(f"suite{row}", 0.0, boxes[row].transform(pose)) for row, pose in enumerate(poses)]
-            labels = average_boxes(told, 0.0).boxes
+            reports = [BoxReport(f"suite{row}", 0.0, boxes[row].transform(pose)) for row, pose in enumerate(poses)]
+            labels = average_boxes(reports, 0.0).boxes
             target = assign_targets(labels, targets, OVERLAP, "bev")
             hits[arm] += np.histogram(distance[target[target >= 0]], EDGES_M)[0]
     return tuple(cars.tolist()), {arm: tuple(counts.tolist()) for arm, counts in hits.items()}
@@ -222,23 +223,24 @@ def list_cars(data: Dataset, views: Sequence[tuple[int, str]]) -> Boxes:
 def find_range(edges_m: Sequence[float], cars: Sequence[int], found: Sequence[int]) -> float:
     """Return the far edge of the last interval in which the share `REACHED` of the cars is found; 0 where in none.
 
-    cars, found: in each interval between `edges_m`. What is nearer counts not: right below a sensor is a blind spot.
+    cars, found: in each interval between `edges_m`. Nearer intervals may hold less: right below a sensor is a blind
+    spot.
     """
-    every, own = np.array(cars), np.array(found)
-    good = np.flatnonzero((own >= REACHED * every) & (every > 0))
+    cars_in, found_in = np.array(cars), np.array(found)
+    good = np.flatnonzero((found_in >= REACHED * cars_in) & (cars_in > 0))
     return float(edges_m[good[-1] + 1]) if len(good) else 0.0
 
 
 SUITE_COLOURS = (style.BLUE, style.VERMILLION, style.GREEN)
 ARM_COLOURS = (style.MUTED, style.ORANGE, style.BLUE)
-BAND_M = (-5.2, 0.5)  # heights about the first suite's LiDAR that are drawn: walls and trees, without the ground
-VIEW_M = (-22.0, 62.0, -48.0, 36.0)  # x and y about the first suite
+BAND_M = (-5.2, 0.5)  # heights relative to the first suite's LiDAR that are drawn: walls and trees without the ground
+VIEW_M = (-22.0, 62.0, -48.0, 36.0)  # least and most x, least and most y in the first suite's frame
 CLOSE_M = 6.0  # half the edge of the close-up
 
 
 @dataclass(frozen=True)
 class Shown:
-    """The clouds of all suites in the frame of the first one."""
+    """A map to draw: the clouds of all suites in the frame of the first one."""
 
     title: str
     clouds: Sequence[NDArray]  # (N, 3) each
@@ -259,16 +261,16 @@ def draw_suites(
     figure = style.canvas(9.6, 6.4)
     grid = figure.add_gridspec(2, 3, height_ratios=(1.25, 1))
     corner = _choose_corner(shown[-1].clouds)
-    for column, each in enumerate(shown):
+    for column, view in enumerate(shown):
         wide, near = figure.add_subplot(grid[0, column]), figure.add_subplot(grid[1, column])
-        for cloud, colour in zip(each.clouds, SUITE_COLOURS, strict=True):
-            own = cloud[(cloud[:, 2] > BAND_M[0]) & (cloud[:, 2] < BAND_M[1])]
-            wide.plot(*own[:, :2].T, ".", color=colour, markersize=0.7, markeredgewidth=0)
-            near.plot(*own[:, :2].T, ".", color=colour, markersize=2.2, markeredgewidth=0)
-        for number, ((x, y, _), colour) in enumerate(zip(each.places, SUITE_COLOURS, strict=True), start=1):
+        for cloud, colour in zip(view.clouds, SUITE_COLOURS, strict=True):
+            in_band = cloud[(cloud[:, 2] > BAND_M[0]) & (cloud[:, 2] < BAND_M[1])]
+            wide.plot(*in_band[:, :2].T, ".", color=colour, markersize=0.7, markeredgewidth=0)
+            near.plot(*in_band[:, :2].T, ".", color=colour, markersize=2.2, markeredgewidth=0)
+        for number, ((x, y, _), colour) in enumerate(zip(view.places, SUITE_COLOURS, strict=True), start=1):
             wide.plot(x, y, "o", markersize=12, color=colour, markeredgecolor="white")
             wide.text(x, y, str(number), color="white", ha="center", va="center_baseline", fontsize=style.SMALL)
-        wide.set(xlim=VIEW_M[:2], ylim=VIEW_M[2:], aspect="equal", title=each.title)
+        wide.set(xlim=VIEW_M[:2], ylim=VIEW_M[2:], aspect="equal", title=view.title)
         x, y = corner
         near.set(xlim=(x - CLOSE_M, x + CLOSE_M), ylim=(y - CLOSE_M, y + CLOSE_M), aspect="equal", title="close-up")
         wide.plot(*_square(x, y), color=style.INK, linewidth=1)
@@ -278,8 +280,8 @@ def draw_suites(
     axes, below = figure.add_subplot(grid[0, 2]), figure.add_subplot(grid[1, 2])
     middle = (np.array(edges_m[:-1]) + np.array(edges_m[1:])) / 2
     for (arm, values), colour in zip(shares.items(), ARM_COLOURS, strict=True):
-        drawn = np.array([np.nan if value is None else value for value in values])
-        axes.plot(middle, drawn, "o-", color=colour, markersize=4, label=arm)
+        shares_of_arm = np.array([np.nan if value is None else value for value in values])
+        axes.plot(middle, shares_of_arm, "o-", color=colour, markersize=4, label=arm)
     axes.set(
         ylim=(0, 1.02), xlim=(0, edges_m[-1]), xlabel="distance from the first suite [m]", title="share of cars found"
     )
@@ -295,12 +297,12 @@ def draw_suites(
 
 
 def _choose_corner(clouds: Sequence[NDArray]) -> tuple[float, float]:
-    """Return the place x, y in view where the clouds of most suites, and most of their points, come together."""
+    """Return the place x, y in view where two suites' clouds overlap most."""
     counts = []
     for cloud in clouds:
-        own = cloud[(cloud[:, 2] > BAND_M[0]) & (cloud[:, 2] < BAND_M[1])]
-        counts.append(np.histogram2d(*own[:, :2].T, bins=(14, 14), range=(VIEW_M[:2], VIEW_M[2:]))[0])
-    common = np.sort(np.stack(counts), axis=0)[-2]  # of the suite with second most points
+        drawn = cloud[(cloud[:, 2] > BAND_M[0]) & (cloud[:, 2] < BAND_M[1])]
+        counts.append(np.histogram2d(*drawn[:, :2].T, bins=(14, 14), range=(VIEW_M[:2], VIEW_M[2:]))[0])
+    common = np.sort(np.stack(counts), axis=0)[-2]  # points of the suite with second most: large where two have many
     row, column = np.unravel_index(int(common.argmax()), common.shape)
     step = (VIEW_M[1] - VIEW_M[0]) / 14, (VIEW_M[3] - VIEW_M[2]) / 14
     return VIEW_M[0] + (row + 0.5) * step[0], VIEW_M[2] + (column + 0.5) * step[1]
@@ -315,14 +317,14 @@ def fig4_tables(results: Fig4) -> dict[str, str]:
     """Return Markdown by name: residuals, range, cameras."""
     rows = [
         [
-            each.name,
-            f"{each.apart_m:.0f}",
-            f"{each.before.position_cm:.0f} cm, {each.before.rotation_deg:.2f}°",
-            f"{each.after.position_cm:.2f} cm, {each.after.rotation_deg:.3f}°",
+            suite.name,
+            f"{suite.apart_m:.0f}",
+            f"{suite.before.position_cm:.0f} cm, {suite.before.rotation_deg:.2f}°",
+            f"{suite.after.position_cm:.2f} cm, {suite.after.rotation_deg:.3f}°",
         ]
-        for each in results.suites
+        for suite in results.suites
     ]
-    near = list(pairwise(EDGES_M))
+    intervals = list(pairwise(EDGES_M))
     found = [
         [
             arm,
@@ -331,7 +333,7 @@ def fig4_tables(results: Fig4) -> dict[str, str]:
         ]
         for arm in ARMS
     ]
-    header = ("share of cars found", *(f"{low}–{high} m" for low, high in near), "range [m]")
+    header = ("share of cars found", *(f"{low}–{high} m" for low, high in intervals), "range [m]")
     return {
         "residuals": format_table(("suite", "from the first [m]", "off as calibrated", "off as registered"), rows),
         "range": format_table(header, [["cars", *results.cars, ""], *found]),

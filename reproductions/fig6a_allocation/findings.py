@@ -15,12 +15,12 @@ from flcav.storage.records import Record
 
 EQUAL, JOINT = "equal-stages", "joint"  # the plans
 MEAN = "mean of towns"  # place of what the planner's history measures: the mean of the federating towns
-COUNTS = ("samples", "edge_rounds", "cloud_rounds")
+COUNTS = ("samples", "edge_rounds", "cloud_rounds")  # keys of `Planned.counts`
 
 
 @dataclass(frozen=True)
 class Planned:
-    """A plan, and the error that its curve predicts after the last stage."""
+    """A plan's counts, its price, and the error (1 - AP50) that the learning curve predicts after the last stage."""
 
     samples: int
     edge_rounds: int
@@ -44,7 +44,7 @@ class StageAP:
 
 @dataclass(frozen=True)
 class AllocationSeed:
-    """Results of one seed. Plans are `EQUAL` and `JOINT`; stages are pretrain, edge and cloud."""
+    """Results of both plans in one seed. Plans are `EQUAL` and `JOINT`; stages are pretrain, edge and cloud."""
 
     seed: int
     plans: Mapping[str, Planned]
@@ -56,7 +56,7 @@ class AllocationSeed:
 
     @property
     def coincide(self) -> bool:
-        """Return whether both plans are the same: as many samples and rounds."""
+        """Return whether both plans are the same, with equal numbers of samples and rounds."""
         return self.plans[EQUAL].counts == self.plans[JOINT].counts
 
 
@@ -72,16 +72,16 @@ class AllocationSummary:
 
 @dataclass(frozen=True)
 class PlanFinding:
-    """The verdict on one claim."""
+    """A question on the plans, the verdict, and a sentence with the numbers behind it."""
 
     question: str
     verdict: str
-    sentence: str  # with the numbers behind it
+    sentence: str
 
 
 @dataclass(frozen=True)
 class AtBudgets:
-    """Both plans under one pair of budgets: numbers by seed, means over seeds, and findings."""
+    """Results of both plans under one pair of budgets: numbers by seed, means over seeds, and findings."""
 
     factor: float  # of the recipe's budgets
     seeds: tuple[AllocationSeed, ...]
@@ -90,7 +90,7 @@ class AtBudgets:
 
     @property
     def name(self) -> str:
-        """Return the budgets in words: x 0.25, x 1."""
+        """Return the name of the budgets, as "x 0.25"."""
         return f"x {self.factor:g}"
 
     @property
@@ -101,7 +101,7 @@ class AtBudgets:
 
 @dataclass(frozen=True)
 class AllocationResult(Record):
-    """Results of the comparison, under several multiples of the recipe's budgets."""
+    """Results of the comparison under several multiples of the recipe's budgets."""
 
     history: Mapping[str, tuple[float, float]]  # least and most of each count in the planner's history
     budgets: tuple[AtBudgets, ...]
@@ -120,15 +120,17 @@ COUNT_NAMES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds
 def allocation_findings(budgets: Sequence[AtBudgets], history: Ranges) -> tuple[tuple[PlanFinding, ...], ...]:
     """Return the findings under each pair of budgets: gain, ranking by prediction, gain of every stage, accuracy, use.
 
-    The claims that are tests over seeds, the joint plan's gain, those of the stages and the exactness of predictions,
-    are judged together, under all budgets. Where both plans are one, there is nothing to judge. `history`: least and
-    most of each count in the history that the plans are predicted from.
+    Some claims are tests over seeds: the joint plan's gain, the gains of the stages, and the exactness of predictions.
+    These are judged together under all budgets. Where both plans are the same, there is nothing to judge. `history`:
+    least and most of each count in the history that the plans are predicted from.
     """
-    claims = [[] if each.coincide else _claims(each) for each in budgets]
-    judged = iter(judge([claim for own in claims for claim in own]))
+    claims = [[] if results.coincide else _claims(results) for results in budgets]
+    judged = iter(judge([claim for group in claims for claim in group]))
     return tuple(
-        _told(each, history, [next(judged) for _ in own]) if own else (_one_plan(each), _budgets(each))
-        for each, own in zip(budgets, claims, strict=True)
+        _all_findings(results, history, [next(judged) for _ in group])
+        if group
+        else (_one_plan(results), _budgets(results))
+        for results, group in zip(budgets, claims, strict=True)
     )
 
 
@@ -149,11 +151,11 @@ def _one_plan(results: AtBudgets) -> PlanFinding:
     return _finding(BETTER, UNDECIDED, sentence)
 
 
-def _told(results: AtBudgets, history: Ranges, judged: Sequence[Judged]) -> tuple[PlanFinding, ...]:
+def _all_findings(results: AtBudgets, history: Ranges, judged: Sequence[Judged]) -> tuple[PlanFinding, ...]:
     """Return the findings under one pair of budgets, from the verdicts on its claims."""
     difference, gains = results.summary.realised_difference[MEAN][CLOUD], _stage_gains(results)
     first, *others, exact = judged
-    verdicts = {key: each.verdict for key, each in zip(gains, others, strict=True)}
+    verdicts = {key: other.verdict for key, other in zip(gains, others, strict=True)}
     return (
         _better(results, difference, first),
         _ranking(results, history, difference, first),
@@ -174,8 +176,8 @@ def _better(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> Pl
         f"{realised[JOINT][CLOUD].mean:.3f} with the joint plan: {_interval(difference)}"
     )
     if difference.seeds == 1:
-        own = results.seeds[0].differences[MEAN][CLOUD]
-        over_scenes = Estimate(own.mean, own.low, own.high).describe(sign=True)
+        estimate = results.seeds[0].differences[MEAN][CLOUD]
+        over_scenes = Estimate(estimate.mean, estimate.low, estimate.high).describe(sign=True)
         sentence += f"; {over_scenes} over test scenes of one seed, in which training does not vary."
     else:
         over = f"over {difference.seeds} seeds, paired, of standard deviation {difference.sd:.3f}"
@@ -184,7 +186,7 @@ def _better(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> Pl
 
 
 def _needed(results: AtBudgets, difference: MeanOverSeeds, judged: Judged) -> str:
-    """Return how many seeds it takes to tell the difference that was predicted."""
+    """Return a sentence: how many seeds it takes to detect the predicted difference."""
     predicted = results.summary.predicted_difference[CLOUD]
     seeds = plan_seeds(predicted, difference.sd, LEVEL / max(judged.family, 1))
     count = f"more than {MOST_SEEDS}" if seeds is None else seeds
@@ -199,8 +201,8 @@ def _ranking(results: AtBudgets, history: Ranges, difference: MeanOverSeeds, jud
     seeds = results.seeds
     agree = sum(predicted * (_ap(seed, JOINT, CLOUD) - _ap(seed, EQUAL, CLOUD)) > 0 for seed in seeds)
     expected = f"The curve predicts {signed(predicted)} for the joint plan; {agree} of {len(seeds)} seeds agree in sign"
-    turned = {HELD: NOT_HELD, NOT_HELD: HELD, UNDECIDED: UNDECIDED}
-    decided = judged.verdict if predicted > 0 else turned[judged.verdict]
+    opposite = {HELD: NOT_HELD, NOT_HELD: HELD, UNDECIDED: UNDECIDED}
+    decided = judged.verdict if predicted > 0 else opposite[judged.verdict]
     sure = ", but that is undecided" if decided == UNDECIDED else ""
     if difference.mean * predicted > 0:
         return _finding(question, decided, f"{expected}, and so does their mean{sure}.")
@@ -208,7 +210,7 @@ def _ranking(results: AtBudgets, history: Ranges, difference: MeanOverSeeds, jud
 
 
 def _why(results: AtBudgets, history: Ranges) -> str:
-    """Return where prediction and training differ most, and which counts of the plans are outside the history."""
+    """Return sentences: the stage where prediction and training differ most, and the counts beyond the history."""
     summary = results.summary
     predicted = _gains(summary.predicted_difference)
     realised = _gains({stage: each.mean for stage, each in summary.realised_difference[MEAN].items()})
@@ -230,29 +232,29 @@ def _why(results: AtBudgets, history: Ranges) -> str:
 def _every_stage(
     results: AtBudgets, gains: Mapping[Gain, MeanOverSeeds], verdicts: Mapping[Gain, str], family: int
 ) -> PlanFinding:
-    """Return the gain of each federated stage in each plan, and of one that lost what the curve predicted."""
+    """Return the finding on the gain of each federated stage in each plan, with the prediction for those that lost."""
     plans = results.seeds[0].plans
     rounds = {(name, stage): plans[name].counts[f"{stage}_rounds"] for name, stage in gains}
-    told = [
+    gain_parts = [
         f"{STAGE_NAMES[stage]} of the {name} plan ({rounds[name, stage]} round{'s' * (rounds[name, stage] != 1)}) "
         f"{_interval(gain)}, {verdicts[name, stage]}"
         for (name, stage), gain in gains.items()
     ]
     corrected = f", with verdicts corrected for {family} claims" if family else ""
-    sentences = [f"In the {MEAN}, over the stage before it{corrected}: {'; '.join(told)}."]
-    lost = [key for key, each in verdicts.items() if each == NOT_HELD]
+    sentences = [f"In the {MEAN}, over the stage before it{corrected}: {'; '.join(gain_parts)}."]
+    lost = [key for key, verdict in verdicts.items() if verdict == NOT_HELD]
     if lost:
         foreseen = [
             f"{signed(_foreseen(results, *key))} for {STAGE_NAMES[key[1]]} of the {key[0]} plan" for key in lost
         ]
         sentences.append(f"The curve predicted {'; '.join(foreseen)}.")
     for name, stage in (key for key in lost if key[1] == CLOUD):
-        beside = "; ".join(
+        elsewhere = "; ".join(
             f"on {town} the same stage brought {_interval(_gain(results, town, name, stage))}"
             for town in results.summary.realised
             if town != MEAN
         )
-        sentences.append(f"The cloud's average of all regions' networks serves them all: {beside}.")
+        sentences.append(f"The cloud's average of all regions' networks serves them all: {elsewhere}.")
     decided = NOT_HELD if lost else HELD if set(verdicts.values()) == {HELD} else UNDECIDED
     return _finding("Did every stage raise the accuracy?", decided, " ".join(sentences))
 
@@ -281,14 +283,14 @@ def _gains(after: Mapping[str, float]) -> dict[str, float]:
 
 
 def _claim_exact(results: AtBudgets) -> Claim:
-    """Return the claim that runs are off their predictions by less than is predicted to lie between the plans."""
-    errors = [[abs(error) for error in own] for own in _errors(results)]
-    means = [sum(own) / len(own) for own in errors]
+    """Return the claim that predictions are off by less than the difference that they predict between the plans."""
+    errors = [[abs(error) for error in seed_errors] for seed_errors in _errors(results)]
+    means = [sum(seed_errors) / len(seed_errors) for seed_errors in errors]
     return Claim(mean_over_seeds(means), than=abs(results.summary.predicted_difference[CLOUD]), at_most=True)
 
 
 def _errors(results: AtBudgets) -> list[list[float]]:
-    """Return by how much both plans of each seed ended above their predictions."""
+    """Return the AP50 after the last stage minus its prediction, by seed, for both plans."""
     return [
         [seed.realised[MEAN][name][CLOUD].ap50 - seed.predicted[name][CLOUD] for name in (EQUAL, JOINT)]
         for seed in results.seeds
@@ -296,7 +298,7 @@ def _errors(results: AtBudgets) -> list[list[float]]:
 
 
 def _accuracy(results: AtBudgets, claim: Claim, judged: Judged) -> PlanFinding:
-    errors = [error for own in _errors(results) for error in own]
+    errors = [error for seed_errors in _errors(results) for error in seed_errors]
     sentence = (
         f"Over {len(errors)} runs, AP50 after the last stage was off its prediction by {claim.mean.describe()} on "
         f"average (from {signed(min(errors))} to {signed(max(errors))}), where {claim.than:.3f} are predicted to lie "

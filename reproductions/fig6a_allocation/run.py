@@ -1,10 +1,10 @@
 """Validation of MLGRA by training (Wang et al., IEEE Network 37(3), 2023, Fig. 6a): joint plan against equal stages.
 
-Both plans, the arms of recipes/runs/allocation.yaml, have the same budgets (a quarter of the recipe's, the recipe's, or
-four times as much), the same learning curve, and the same limits: what its history covers. Runs of a seed share their
-recorded frames; each places its sensors by the errors of its own pretrained network. The score that the
-curve predicts after each stage is compared with the score after training, in the mean of the federating towns, which is
-what the history measures.
+The plans are arms of recipes/runs/allocation.yaml. Both have the same budgets (a quarter of the recipe's, the recipe's,
+or four times as much), the same learning curve, and the same limits: the counts that the curve's history covers. Runs
+of a seed share their recorded frames; each places its sensors by the errors of its own pretrained network. The score
+that the curve predicts after each stage is compared with the score after training, in the mean of the federating towns,
+which is what the history measures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -42,13 +42,13 @@ from flcav.storage.markdown import format_bullets, format_signed, format_table
 
 TASK = "objects"
 PLANS = (EQUAL, JOINT)
-BUDGETS = (0.25, 1.0, 4.0)  # multiples of the recipe's
+BUDGETS = (0.25, 1.0, 4.0)  # multiples of the recipe's budgets
 ARM_OF = {EQUAL: "equal", JOINT: MAIN}
 STAGES = (PRETRAIN, EDGE, CLOUD)
 
 
 def budget_recipes(recipe: RunRecipe, seeds: Sequence[int], factors: Sequence[float] = BUDGETS) -> dict[str, RunRecipe]:
-    """Return the recipe of each run, every factor of the budgets with every seed, by the name of its folder."""
+    """Return the recipes of the runs, one for each factor of the budgets and seed, by the names of their folders."""
     return {
         _name_run(factor, seed): recipe.model_copy(
             update={
@@ -63,9 +63,9 @@ def budget_recipes(recipe: RunRecipe, seeds: Sequence[int], factors: Sequence[fl
 
 
 def plans_differ(run: Run) -> bool:
-    """Return whether the joint plan of a run has other samples or rounds than equal stages.
+    """Return whether the joint plan of a run differs from equal stages in samples or rounds.
 
-    Where it has not, both arms are one training, and more seeds tell nothing about their difference.
+    Where it does not, both arms are one training, and more seeds would show no difference.
     """
     return not one_seed(run).coincide
 
@@ -75,37 +75,37 @@ def _name_run(factor: float, seed: int) -> str:
 
 
 def compare_plans(recipe: RunRecipe, runs: Mapping[float, Sequence[Run]]) -> AllocationResult:
-    """Return the results of both plans of `recipe`, from runs of each seed by the factor of its budgets.
+    """Return the results of both plans of `recipe`, from the runs of all seeds by factor of the budgets.
 
     Raises `InputError` where no sensor was placed in a region.
     """
-    rows = {factor: tuple(one_seed(run) for run in own) for factor, own in runs.items()}
-    budgets = [AtBudgets(factor, own, summarise(own)) for factor, own in rows.items()]
-    asked, history = recipe.model_dump(mode="json", exclude={"seed"}), _history_ranges()
+    rows = {factor: tuple(one_seed(run) for run in seeds) for factor, seeds in runs.items()}
+    budgets = [AtBudgets(factor, seeds, summarise(seeds)) for factor, seeds in rows.items()]
+    settings, history = recipe.model_dump(mode="json", exclude={"seed"}), _history_ranges()
     found = allocation_findings(budgets, history)
-    told = tuple(replace(each, findings=own) for each, own in zip(budgets, found, strict=True))
-    return AllocationResult(history, told, recipe=asked, provenance=provenance())
+    with_findings = tuple(replace(results, findings=findings) for results, findings in zip(budgets, found, strict=True))
+    return AllocationResult(history, with_findings, recipe=settings, provenance=provenance())
 
 
 def one_seed(run: Run) -> AllocationSeed:
-    """Return the numbers of one seed's run.
+    """Return the results of both plans in one seed's run.
 
-    What is predicted is told by the plans before the run: those made anew by the joint plan's run rest on its scores.
+    Predictions are those of the plans made before the run: plans made anew during the run know its scores.
     """
     towns = run.recipe.with_role("federate")
     arms = {name: run.arms[arm] for name, arm in ARM_OF.items()}
     plan_of = {name: arm.plan.tasks[TASK] for name, arm in arms.items()}
-    found = {
-        (each.region, each.stage): each.over_scenes
-        for each in run.differences
-        if (each.arm, each.before_arm) == (MAIN, ARM_OF[EQUAL])
+    estimates = {
+        (difference.region, difference.stage): difference.over_scenes
+        for difference in run.differences
+        if (difference.arm, difference.before_arm) == (MAIN, ARM_OF[EQUAL])
     }
     predicted = {name: dict(arm.plans[0].tasks[TASK].predicted or {}) for name, arm in arms.items()}
     realised = {
         town: {name: {stage: StageAP(_ap50(run, arm, stage, town)) for stage in STAGES} for name, arm in ARM_OF.items()}
         for town in towns
     }
-    differences = {town: {stage: _difference(found.get((town, stage))) for stage in STAGES} for town in towns}
+    differences = {town: {stage: _difference(estimates.get((town, stage))) for stage in STAGES} for town in towns}
     return AllocationSeed(
         seed=run.recipe.seed,
         plans={
@@ -133,7 +133,10 @@ def one_seed(run: Run) -> AllocationSeed:
 def _average_reached(towns: Mapping[str, Mapping[str, Mapping[str, StageAP]]]) -> dict[str, dict[str, StageAP]]:
     """Return AP50 by plan and stage in the mean of the towns."""
     return {
-        name: {stage: StageAP(float(np.mean([own[name][stage].ap50 for own in towns.values()]))) for stage in STAGES}
+        name: {
+            stage: StageAP(float(np.mean([by_plan[name][stage].ap50 for by_plan in towns.values()])))
+            for stage in STAGES
+        }
         for name in PLANS
     }
 
@@ -282,8 +285,8 @@ def _differences(results: AtBudgets) -> list[Row]:
     for town, stages in summary.realised_difference.items():
         for key, stage in STAGE_NAMES.items():
             predicted = format_signed(summary.predicted_difference[key]) if town == MEAN else ""
-            own = [seed.differences[town][key] for seed in results.seeds]
-            per_seed = ", ".join(each.describe(sign=True) for each in own)
+            estimates = [seed.differences[town][key] for seed in results.seeds]
+            per_seed = ", ".join(estimate.describe(sign=True) for estimate in estimates)
             rows.append([town, stage, predicted, stages[key].describe(sign=True), per_seed])
     return rows
 
@@ -310,7 +313,9 @@ def _run(out: Path, options: Options) -> Outcome[AllocationResult]:
 
         first = finish([1], BUDGETS)
         others = finish(range(2, options.seeds + 1), [factor for factor, (run,) in first.items() if plans_differ(run)])
-    results = compare_plans(recipe, {factor: [*own, *others.get(factor, [])] for factor, own in first.items()})
+    results = compare_plans(
+        recipe, {factor: [*first_runs, *others.get(factor, [])] for factor, first_runs in first.items()}
+    )
     sentences = [
         f"Budgets {each.name}. {finding.question} {finding.verdict}. {finding.sentence}"
         for each in results.budgets

@@ -1,10 +1,10 @@
 """Comparison of federations and label sources by their share of what ground truth gains: recipes/runs/gap.yaml.
 
-Centralised training on ground truth (*oracle*) is what stage II on ground truth is compared with, which tells what the
-federation itself costs, with its rates and steps; ground truth with one fault of the tracks at a time tells what each
-fault costs. Beside the town that federates stands the town of pretraining, where boxes may get worse. Over seeds, which
-have recordings of their own, intervals cover training and traffic. The verdicts on all differences are corrected
-together.
+Stage II on ground truth is compared with centralised training on ground truth (*oracle*): the difference is the cost of
+the federation, with its rates and steps. Ground truth with one fault of the tracks at a time shows the cost of each
+fault. Networks are tested in the town that federates, and in the town of pretraining, where boxes may get worse. Each
+seed has its own recordings, so that intervals over seeds cover training and traffic. The verdicts on all differences
+are corrected together.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,21 +40,21 @@ FEDERATED: Mapping[str, str] = {"edge FL on tracks": MAIN, "edge FL on ground tr
 IN_BYTES = "edge FL on ground truth, int8"
 LONGER_ARMS = (("longer", EDGE), ("longer", MORE_EDGE), ("longest", MORE_EDGE))  # arms and stages of that curve
 UPLOADED = "centralised on uploaded sweeps"
-ROUNDS = (1, 2, 3, 5, 10)  # after which a federation is tested; those that it has
+ROUNDS = (1, 2, 3, 5, 10)  # after which a federation is tested, as far as it has them
 
 
 @dataclass(frozen=True)
 class AtBytes:
-    """AP50 on test frames after so many megabytes [MB, wireless uplink of a region's stage II]."""
+    """AP50 on test frames, and the megabytes sent until then on the wireless uplink in a region's stage II."""
 
-    label: str  # rounds or sweeps
+    label: str  # rounds or sweeps, as "3 rounds"
     mb: float
     ap50: float
 
 
 @dataclass(frozen=True)
 class MeanAtBytes:
-    """The mean over seeds of `AtBytes`."""
+    """AP50 and megabytes at a point of a curve, as means over seeds."""
 
     label: str
     mb: float
@@ -65,17 +65,20 @@ Curves = Mapping[str, tuple[AtBytes, ...]]  # by name
 
 
 def trace_bytes(run: Run, work: Path, region: str) -> Curves:
-    """Return the curves of a run whose steps lie in `work`, in one region: they begin with the pretrained network."""
+    """Return AP50 against megabytes in one region of a run, by training; `work` is the folder of the run's steps.
+
+    All curves begin with the pretrained network.
+    """
     (task,) = run.recipe.tasks
     test = Frames.open(work / run.steps.recording(region, "test", task))
     start = load_network(OBJECTS, work / run.steps.pretrain(MAIN, task) / WEIGHTS)
-    begun = AtBytes("pretraining", 0.0, score_network(OBJECTS, start, test.data, test.vehicles))
+    pretrained = AtBytes("pretraining", 0.0, score_network(OBJECTS, start, test.data, test.vehicles))
 
     def federated(arm: str) -> Iterator[AtBytes]:
-        how, folder = run.recipe.training_of(task), work / run.steps.edge(arm, region, task)
+        settings, folder = run.recipe.training_of(task), work / run.steps.edge(arm, region, task)
         sent = Ledger.load(folder / LEDGER).entries
         for number in (each for each in ROUNDS if each <= max(entry.round for entry in sent)):
-            ended = load_round_network(OBJECTS, start, folder, number, how.average_rounds, how.start_share)
+            ended = load_round_network(OBJECTS, start, folder, number, settings.average_rounds, settings.start_share)
             up = (
                 entry.bytes
                 for entry in sent
@@ -92,13 +95,13 @@ def trace_bytes(run: Run, work: Path, region: str) -> Curves:
             yield AtBytes(plural(number, "round"), Ledger.load(folder / LEDGER).used_mb("wireless"), ap50)
 
     def uploaded() -> Iterator[AtBytes]:
-        for arm, own in list_uploads(run.recipe):
+        for arm, sweeps in list_uploads(run.recipe):
             book = Ledger.load(work / run.steps.central(arm, region, task) / LEDGER)
             ap50 = run.test(arm=arm, stage=CENTRAL, region=region, task=task).estimate.mean
-            yield AtBytes(plural(own, "sweep"), book.used_mb("wireless"), ap50)
+            yield AtBytes(plural(sweeps, "sweep"), book.used_mb("wireless"), ap50)
 
-    curves = {name: (begun, *federated(arm)) for name, arm in FEDERATED.items()}
-    return {**curves, IN_BYTES: (begun, *in_bytes()), UPLOADED: (begun, *uploaded())}
+    curves = {name: (pretrained, *federated(arm)) for name, arm in FEDERATED.items()}
+    return {**curves, IN_BYTES: (pretrained, *in_bytes()), UPLOADED: (pretrained, *uploaded())}
 
 
 def list_uploads(recipe: RunRecipe) -> list[tuple[str, int]]:
@@ -111,7 +114,7 @@ def average_curves(curves: Sequence[Curves]) -> dict[str, tuple[MeanAtBytes, ...
     """Return the mean over seeds of the points of each curve."""
     means = {}
     for name in curves[0]:
-        rows = zip(*(own[name] for own in curves), strict=True)
+        rows = zip(*(curve[name] for curve in curves), strict=True)
         means[name] = tuple(
             MeanAtBytes(
                 points[0].label,
@@ -210,7 +213,7 @@ COMPARED = (  # (after, before): claims that the difference in AP50 is positive
 
 @dataclass(frozen=True)
 class GapArm:
-    """AP of an arm in one seed, and precision and recall of the labels that it learns from."""
+    """AP of an arm in one seed, and precision and recall of its labels."""
 
     ap50: float
     ap70: float
@@ -260,8 +263,8 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]
     home = {str(run.recipe.seed): {name: _reached(run, name, HOME) for name in AT_HOME} for run in runs}
 
     def closed(arm: str, field: str) -> MeanOverSeeds:
-        of = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in seeds.values()]
-        return mean_over_seeds([gap_closed(*values) for values in of])
+        scores = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in seeds.values()]
+        return mean_over_seeds([gap_closed(*values) for values in scores])
 
     ap50, ap70 = attrgetter("ap50"), attrgetter("ap70")
     return GapResult(
@@ -316,10 +319,10 @@ def gap_tables(results: GapResult) -> dict[str, str]:
 def _arms(results: GapResult) -> str:
     rows = []
     for name in ARMS:
-        own = [seed[name] for seed in results.seeds.values()]
-        labels = (_mean([getattr(each, field) for each in own]) for field in ("precision", "recall"))
+        arms = [seed[name] for seed in results.seeds.values()]
+        labels = (_mean([getattr(arm, field) for arm in arms]) for field in ("precision", "recall"))
         numbers = (results.ap50, results.closed50, results.ap70, results.closed70)
-        rows.append([name, *(each[name].describe() for each in numbers), *labels])
+        rows.append([name, *(means[name].describe() for means in numbers), *labels])
     share = "share of the gain of truth"
     titles = ("arm", "AP50", share, "AP70", share, "labels' precision", "labels' recall")
     return format_table(titles, rows)
@@ -328,11 +331,11 @@ def _arms(results: GapResult) -> str:
 def _home(results: GapResult) -> str:
     rows = []
     for name in AT_HOME:
-        own = [seed[name] for seed in results.home.values()]
+        arms = [seed[name] for seed in results.home.values()]
         row = [name]
         for field, change in (("ap50", results.home50), ("ap70", results.home70)):
             row += [
-                _mean([getattr(each, field) for each in own]),
+                _mean([getattr(arm, field) for arm in arms]),
                 change[name].describe(sign=True) if name in change else "",
             ]
         rows.append(row)

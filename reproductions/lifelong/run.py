@@ -1,7 +1,7 @@
 """Comparison of lifelong learning with replay, without replay, and doing nothing: recipes/runs/lifelong.yaml.
 
-Every seed has traffic, initial weights and test scenes of its own, so that intervals over seeds cover training and
-scenes. Arms of a seed share its frames, its pretrained network and the random draws of its rounds.
+Each seed has its own traffic, initial weights and test scenes, so that intervals over seeds cover training and scenes.
+Arms of a seed share its frames, its pretrained network and the random draws of its rounds.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -33,12 +33,12 @@ COMPARED = ((FINAL, REPLAY, NOTHING), (FINAL, REPLAY, PLAIN), (FINAL, PLAIN, NOT
 
 @dataclass(frozen=True)
 class Mended(Record):
-    """Conditions of all seeds in an arm, and how many were mended."""
+    """Counts of the conditions that an arm passed in all seeds, and of those where its network was mended."""
 
     passed: int
-    broken: int  # for which the network that drove was not good enough when they came
-    mended: int  # of these
-    seconds: float | None  # until a network drove that was; median of the mended; None: none was
+    broken: int  # conditions for which the network in use was not good enough when they came
+    mended: int  # of these, those that got a network that was
+    seconds: float | None  # median time from the condition's start until that network was in use; None without any
 
 
 @dataclass(frozen=True)
@@ -59,31 +59,33 @@ class LifelongResult(Record):
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return what each arm reached, and the verdicts on differences, in words."""
+        """Return sentences: the scores and megabytes of each arm, and the verdicts on differences."""
         reached = [
             f"{arm}: {FINAL} {self.final[arm].describe()}, {BACKWARD} {self.backward[arm].describe(sign=True)}, "
-            f"{self.up_mb[arm].mean:.1f} MB up, {own.mended} of {own.broken} mended"
-            for arm, own in self.mended.items()
+            f"{self.up_mb[arm].mean:.1f} MB up, {counts.mended} of {counts.broken} mended"
+            for arm, counts in self.mended.items()
         ]
         return [*reached, *describe_means(self.differences)]
 
 
 def compare_lifelong(recipe: RunRecipe, runs: Sequence[Run]) -> LifelongResult:
     """Return the results of a run of each seed of `recipe`."""
-    seeds = {str(run.recipe.seed): {own.arm: own for own in select(run.lifelong or (), task=TASK)} for run in runs}
+    seeds = {
+        str(run.recipe.seed): {result.arm: result for result in select(run.lifelong or (), task=TASK)} for run in runs
+    }
     conditions = next(iter(seeds.values()))[NOTHING].conditions
 
     def mean_tested(arm: str, row: int, column: int) -> MeanOverSeeds:
-        return average_arms(seeds, (arm,), lambda own: own.tested[row][column])[arm]
+        return average_arms(seeds, (arm,), lambda result: result.tested[row][column])[arm]
 
     return LifelongResult(
         conditions=conditions,
         seeds=seeds,
         final=average_arms(seeds, ARMS, _MEASURES[FINAL]),
         backward=average_arms(seeds, ARMS, _MEASURES[BACKWARD], share=False),
-        forward=average_arms(seeds, ARMS, lambda own: own.forward, share=False),
-        up_mb=average_arms(seeds, ARMS, lambda own: own.up_bytes / 1e6, share=False),
-        down_mb=average_arms(seeds, ARMS, lambda own: own.down_bytes / 1e6, share=False),
+        forward=average_arms(seeds, ARMS, lambda result: result.forward, share=False),
+        up_mb=average_arms(seeds, ARMS, lambda result: result.up_bytes / 1e6, share=False),
+        down_mb=average_arms(seeds, ARMS, lambda result: result.down_bytes / 1e6, share=False),
         tested={
             condition: {arm: tuple(mean_tested(arm, row, column) for row in range(len(conditions) + 1)) for arm in ARMS}
             for column, condition in enumerate(conditions)
@@ -99,17 +101,17 @@ def compare_lifelong(recipe: RunRecipe, runs: Sequence[Run]) -> LifelongResult:
 
 
 _MEASURES: Mapping[str, Callable[[LifelongArm], float]] = {
-    FINAL: lambda own: own.final,
-    BACKWARD: lambda own: own.backward,
+    FINAL: lambda arm: arm.final,
+    BACKWARD: lambda arm: arm.backward,
 }
 
 
 def count_mended(arms: Sequence[LifelongArm]) -> Mended:
-    """Return how many conditions of all seeds of an arm were mended."""
-    seconds = [each for own in arms for each in own.mended]
-    broken = sum(len(own.broken) for own in arms)
+    """Return the counts over an arm's results in all seeds."""
+    seconds = [time_s for arm in arms for time_s in arm.mended]
+    broken = sum(len(arm.broken) for arm in arms)
     median = float(np.median(seconds)) if seconds else None
-    return Mended(sum(len(own.passed) for own in arms), broken, len(seconds), median)
+    return Mended(sum(len(arm.passed) for arm in arms), broken, len(seconds), median)
 
 
 def draw_lifelong(results: LifelongResult) -> bytes:
@@ -129,18 +131,18 @@ def lifelong_tables(results: LifelongResult) -> dict[str, str]:
 
 
 def tell_seed(arm: LifelongArm) -> str:
-    """Return the final mean and the backward transfer of an arm in a seed."""
+    """Return the cell of the table by seed: final mean AP50 and backward transfer."""
     return f"{arm.final:.3f}, {arm.backward:+.3f}"
 
 
 def _arms(results: LifelongResult) -> str:
     rows = []
     for arm in ARMS:
-        own = results.mended[arm]
-        seconds = "–" if own.seconds is None else f"{own.seconds:.0f}"
+        counts_mended = results.mended[arm]
+        seconds = "–" if counts_mended.seconds is None else f"{counts_mended.seconds:.0f}"
         moved = [results.backward[arm].describe(sign=True), results.forward[arm].describe(sign=True)]
         sent = [f"{results.up_mb[arm].mean:.1f}", f"{results.down_mb[arm].mean:.1f}"]
-        counts = [f"{own.broken} of {own.passed}", f"{own.mended}", seconds]
+        counts = [f"{counts_mended.broken} of {counts_mended.passed}", f"{counts_mended.mended}", seconds]
         rows.append([arm, results.final[arm].describe(), *moved, *sent, *counts])
     titles = ("final mean AP50", "backward transfer", "forward transfer", "MB up", "MB down")
     return format_table(("arm", *titles, "conditions with errors", "mended", "median s until mended"), rows)
@@ -150,9 +152,9 @@ def _conditions(results: LifelongResult) -> str:
     rows = []
     for number, condition in enumerate(results.conditions):
         for arm in ARMS:
-            own = results.tested[condition][arm]
+            means = results.tested[condition][arm]
             rows.append(
-                [condition, arm, *(each.describe() for each in (own[0], own[number], own[number + 1], own[-1]))]
+                [condition, arm, *(mean.describe() for mean in (means[0], means[number], means[number + 1], means[-1]))]
             )
     titles = ("pretrained", "before it came", "after it", "at the end")
     return format_table(("AP50 in", "arm", *titles), rows)
@@ -162,11 +164,27 @@ def _rounds(results: LifelongResult) -> str:
     rows = []
     for seed, arms in results.seeds.items():
         for arm in ARMS[:2]:
-            for own in arms[arm].passed:
-                seconds = "–" if own.mended_s is None else f"{own.mended_s:.0f}"
-                first, last = own.scores[own.condition][0], own.scores[own.condition][-1]
-                told = [f"{first:.3f}", f"{last:.3f}", f"{own.reachable:.3f}", "yes" if own.replaced else "no", seconds]
-                rows.append([seed, arm, own.condition, f"{len(own.asked)}", f"{own.members}", f"{own.rounds}", *told])
+            for passed in arms[arm].passed:
+                seconds = "–" if passed.mended_s is None else f"{passed.mended_s:.0f}"
+                first, last = passed.scores[passed.condition][0], passed.scores[passed.condition][-1]
+                cells = [
+                    f"{first:.3f}",
+                    f"{last:.3f}",
+                    f"{passed.reachable:.3f}",
+                    "yes" if passed.replaced else "no",
+                    seconds,
+                ]
+                rows.append(
+                    [
+                        seed,
+                        arm,
+                        passed.condition,
+                        f"{len(passed.asked)}",
+                        f"{passed.members}",
+                        f"{passed.rounds}",
+                        *cells,
+                    ]
+                )
     titles = ("asked", "members", "rounds", "before", "after", "reachable", "new network drives", "s until mended")
     return format_table(("seed", "arm", "condition", *titles), rows)
 

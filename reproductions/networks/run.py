@@ -1,9 +1,9 @@
 """Accuracy of detectors against the CPU time of their training, for a vehicle without a GPU.
 
-Every candidate is trained as the demo pretrains: in `suburb`, on as many sweeps as its plan uploads, for as many steps.
-Accuracy is AP on frames of that town and of `arterial`, in which the demo neither trains nor tests. Seeds draw other
-sweeps of one recording, and other weights. CPU time is that of the training process, one thread, on this machine; of
-use is its ratio to that of `tiny`, from the same command.
+Every candidate is trained as the demo pretrains its network: in `suburb`, with the same numbers of sweeps and steps.
+Accuracy is AP on frames of that town and of `arterial`, in which the demo neither trains nor tests. Each seed draws its
+own sweeps from one recording, and its own initial weights. CPU time is that of the training process, one thread, on
+this machine; only its ratio to that of `tiny`, from the same command, carries over to other machines.
 """
 
 import time
@@ -44,8 +44,8 @@ NETWORKS: Mapping[str, Callable[[], SecondConfig]] = {
     ),
 }
 TRAINED, SAMPLES, STEPS = "suburb", 48, 1000  # as in recipes/runs/demo.yaml
-TOWNS = (TRAINED, "arterial")  # that are validated in
-RECORDING: Mapping[str, Mapping[str, Json]] = {  # fields of recordings beside those of recipes/suburb.yaml
+TOWNS = (TRAINED, "arterial")  # of the validation frames
+RECORDING: Mapping[str, Mapping[str, Json]] = {  # fields of recordings that replace those of recipes/suburb.yaml
     "train": {"town": TRAINED, "seed": 3301, "scenes": 16},
     **{f"validation-{town}": {"town": town, "seed": 3302, "scenes": 10, "split": "validation"} for town in TOWNS},
 }
@@ -53,9 +53,9 @@ RECORDING: Mapping[str, Mapping[str, Json]] = {  # fields of recordings beside t
 
 @dataclass(frozen=True)
 class TrainedNetwork:
-    """A candidate of one seed: the CPU time of its training, and its accuracy by town."""
+    """A candidate in one seed: the CPU time of its training, and its accuracy by town."""
 
-    seconds: float  # CPU time of training
+    seconds: float  # CPU time of training [s]
     ap50: Mapping[str, float]
     ap70: Mapping[str, float]
 
@@ -65,15 +65,15 @@ class NetworkCost(Record):
     """Cost and accuracy of a candidate over seeds."""
 
     parameters: int
-    seconds: float  # median CPU time of a training
-    share: float  # of the reference's, both of the same seeds
+    seconds: float  # CPU time of training [s], median over seeds
+    share: float  # median over seeds of its CPU time as a share of the reference's
     ap50: Mapping[str, MeanOverSeeds]  # by town
     ap70: Mapping[str, MeanOverSeeds]
 
 
 @dataclass(frozen=True)
 class NetworksResult(Record):
-    """Results of the search: candidates by name, and which of them no other beats in time and accuracy."""
+    """Results of the search: candidates by name, and those that no other beats in both time and accuracy."""
 
     networks: Mapping[str, NetworkCost]
     front: tuple[str, ...]  # Pareto front of time and mean AP50 over towns
@@ -82,12 +82,12 @@ class NetworksResult(Record):
 
     def sentences(self) -> list[str]:
         """Return time and accuracy of every candidate, and the front, in words."""
-        told = [
-            f"{name}: {own.share:.2f} of the CPU time of {REFERENCE}; "
-            + ", ".join(f"AP50 {mean.describe()} in {town}" for town, mean in own.ap50.items())
-            for name, own in self.networks.items()
+        lines = [
+            f"{name}: {cost.share:.2f} of the CPU time of {REFERENCE}; "
+            + ", ".join(f"AP50 {mean.describe()} in {town}" for town, mean in cost.ap50.items())
+            for name, cost in self.networks.items()
         ]
-        return [*told, f"Nothing is both faster and more accurate than {' and '.join(self.front)}."]
+        return [*lines, f"Nothing is both faster and more accurate than {' and '.join(self.front)}."]
 
 
 def search_networks(
@@ -109,11 +109,11 @@ def list_steps(seeds: Sequence[int], quick: bool) -> list[Step]:
     if quick:
         recorded = {name: {**fields, "scenes": 2, "spins_per_scene": 2} for name, fields in recorded.items()}
     steps = [Step(name, record_split, {"recipe": fields}) for name, fields in recorded.items()]
-    how = {"samples": 4, "steps": 2} if quick else {"samples": SAMPLES, "steps": STEPS}
+    size = {"samples": 4, "steps": 2} if quick else {"samples": SAMPLES, "steps": STEPS}
     for seed in seeds:
         for name in NETWORKS:
             steps.append(
-                Step(_name_step(name, seed), train_candidate, {"name": name, "seed": seed, **how}, (*recorded,))
+                Step(_name_step(name, seed), train_candidate, {"name": name, "seed": seed, **size}, (*recorded,))
             )
     return steps
 
@@ -125,40 +125,40 @@ def _name_step(name: str, seed: int) -> str:
 def train_candidate(work: Work, *, name: str, seed: int, samples: int, steps: int) -> Json:
     """Train a candidate on a seed's draw of sweeps; return the fields of its `TrainedNetwork`."""
     config, data = NETWORKS[name](), open_split(work.inputs["train"])
-    drawn = np.sort(stream(seed, "sweeps").choice(len(data), min(samples, len(data)), replace=False)).tolist()
-    held = OBJECTS.samples(data, config, drawn)
-    kept = [held[number] for number in range(len(held))]
+    sweeps = np.sort(stream(seed, "sweeps").choice(len(data), min(samples, len(data)), replace=False)).tolist()
+    dataset = OBJECTS.samples(data, config, sweeps)
+    in_memory = [dataset[number] for number in range(len(dataset))]
     network = build_network(OBJECTS, config, seed)
     began = time.process_time()
-    train(OBJECTS, network, kept, steps=steps, batch=2, seed=seed, progress=work.report)
+    train(OBJECTS, network, in_memory, steps=steps, batch=2, seed=seed, progress=work.report)
     seconds = time.process_time() - began
-    found = {}
+    precision = {}
     for town in TOWNS:
         frames = open_split(work.inputs[f"validation-{town}"])
         outcomes = OBJECTS.outcomes(network, frames, range(len(frames)), work.report)
         once = np.ones((1, len(outcomes.scene)), dtype=np.int64)
-        found[town] = (
+        precision[town] = (
             float(OBJECTS.measure(outcomes, once)[0]),
             float(OBJECTS.further_measures["AP70"](outcomes, once)[0]),
         )
-    ap50, ap70 = ({town: pair[number] for town, pair in found.items()} for number in range(2))
+    ap50, ap70 = ({town: pair[number] for town, pair in precision.items()} for number in range(2))
     return {"seconds": seconds, "ap50": ap50, "ap70": ap70}
 
 
 def _summarise(name: str, seeds: Sequence[Mapping[str, TrainedNetwork]]) -> NetworkCost:
-    own, reference = [seed[name] for seed in seeds], [seed[REFERENCE] for seed in seeds]
+    trained, reference = [seed[name] for seed in seeds], [seed[REFERENCE] for seed in seeds]
     return NetworkCost(
-        parameters=sum(each.numel() for each in OBJECTS.build(NETWORKS[name]()).parameters()),
-        seconds=float(np.median([each.seconds for each in own])),
-        share=float(np.median([a.seconds / b.seconds for a, b in zip(own, reference, strict=True)])),
-        ap50={town: mean_over_seeds([each.ap50[town] for each in own], share=True) for town in TOWNS},
-        ap70={town: mean_over_seeds([each.ap70[town] for each in own], share=True) for town in TOWNS},
+        parameters=sum(network.numel() for network in OBJECTS.build(NETWORKS[name]()).parameters()),
+        seconds=float(np.median([network.seconds for network in trained])),
+        share=float(np.median([a.seconds / b.seconds for a, b in zip(trained, reference, strict=True)])),
+        ap50={town: mean_over_seeds([network.ap50[town] for network in trained], share=True) for town in TOWNS},
+        ap70={town: mean_over_seeds([network.ap70[town] for network in trained], share=True) for town in TOWNS},
     )
 
 
 def find_front(networks: Mapping[str, NetworkCost]) -> tuple[str, ...]:
-    """Return the names of the candidates than which none is faster and as accurate, in the mean AP50 over towns."""
-    at = {name: (own.seconds, np.mean([mean.mean for mean in own.ap50.values()])) for name, own in networks.items()}
+    """Return the names of the candidates on the Pareto front of CPU time and mean AP50 over towns."""
+    at = {name: (cost.seconds, np.mean([mean.mean for mean in cost.ap50.values()])) for name, cost in networks.items()}
     return tuple(
         name
         for name, (seconds, ap) in at.items()
@@ -170,7 +170,7 @@ def draw_networks(results: NetworksResult) -> bytes:
     """Return a PNG of AP50 against CPU time for each town."""
     return style.png(
         costs(
-            {town: {name: (own.share, own.ap50[town]) for name, own in results.networks.items()} for town in TOWNS},
+            {town: {name: (cost.share, cost.ap50[town]) for name, cost in results.networks.items()} for town in TOWNS},
             f"CPU time of training, share of that of {REFERENCE}",
             "AP50",
             results.front,
@@ -181,9 +181,9 @@ def draw_networks(results: NetworksResult) -> bytes:
 def networks_tables(results: NetworksResult) -> dict[str, str]:
     """Return Markdown by name: networks."""
     rows = []
-    for name, own in results.networks.items():
-        ap50, ap70 = ([ap[town].describe() for town in TOWNS] for ap in (own.ap50, own.ap70))
-        cost = (f"{own.parameters / 1e6:.2f} M", f"{own.share:.2f}", f"{own.seconds:.0f}")
+    for name, candidate in results.networks.items():
+        ap50, ap70 = ([ap[town].describe() for town in TOWNS] for ap in (candidate.ap50, candidate.ap70))
+        cost = (f"{candidate.parameters / 1e6:.2f} M", f"{candidate.share:.2f}", f"{candidate.seconds:.0f}")
         rows.append([name, *cost, *ap50, *ap70, "yes" if name in results.front else ""])
     titles = [f"{measure}, {town}" for measure in ("AP50", "AP70") for town in TOWNS]
     head = ("network", "parameters", "CPU time of training, share", "in seconds", *titles, "on the front")

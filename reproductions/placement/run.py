@@ -1,12 +1,17 @@
-"""Proof of placement by learning: what vehicles learn from a sensor on each pole, against what it covers.
+"""Test of placement by learning: the gain of vehicles from a sensor on each pole, against the errors that it covers.
 
 All arms of recipes/runs/placement.yaml start from the same pretrained network and train on the same frames in the same
 order; they differ in the poles whose sensors help to label them. The gain of poles is the AP50 after edge FL with their
 sensors minus that without any, on the same test frames: all of them, and the half with most registered errors around.
 If placement by coverage is right, poles that cover more errors have higher gains (Spearman's rank correlation; Wang et
 al., IEEE Network 37(3), 2023, finding iii), and the choice of VRCSP gains more than the densest or random poles.
-Each federating region with an arm of a single pole is a proof of its own. Regions of one seed share their pretraining,
-so that pooled numbers are means over regions first, and over seeds then.
+
+Two more quantities may predict the gain of a pole. *Expected labels*: the registered misses in its line of sight, each
+with the probability that the road detector finds it at that distance (`expect_labels`). *Added labels*: those that its
+sensor really adds to the pseudo-labels of the training frames (`count_added_labels`).
+
+Each federating region with an arm of a single pole is tested on its own. Regions of one seed share their pretraining,
+so that pooled numbers are means over regions first, and over seeds second.
 """
 
 from collections.abc import Mapping, Sequence
@@ -73,14 +78,14 @@ from flcav.world.trace import Trace
 
 TASK = "objects"
 
-Numbers = Mapping[str, ByFrames]  # by name and frames
+Numbers = Mapping[str, ByFrames]  # by name and choice of frames
 
 IMPORTED = "quarter"  # map of the package that is imported as a town
 
 
 @dataclass(frozen=True)
 class _Folders:
-    """The steps of a run in one region that the proof reads."""
+    """The recordings, errors and pretrained network that a run left in one region."""
 
     test: Frames
     registry: Frames
@@ -102,10 +107,10 @@ def list_regions(recipe: RunRecipe) -> tuple[str, ...]:
     """Return the federating regions in which an arm has a sensor on a single pole; raises `InputError` for none."""
     federating = recipe.with_role("federate")
     single = [arm for arm in recipe.arms.values() if len(arm.placement.get("poles", ())) == 1]
-    found = tuple(region for region in federating if any(region in (arm.regions or federating) for arm in single))
-    if not found:
+    regions = tuple(region for region in federating if any(region in (arm.regions or federating) for arm in single))
+    if not regions:
         raise InputError("no arm has a sensor on a single pole")
-    return found
+    return regions
 
 
 def prove_placement(
@@ -113,8 +118,8 @@ def prove_placement(
 ) -> PlacementProof:
     """Return gains by pole and rule in the regions of `list_regions`, over the runs of the recipe's seeds.
 
-    `works`: the folder of each run's steps, with the outcomes of its tests; `beside`: where towns are looked for.
-    Raises `InputError` where a run has no arm with a single pole, or the test frames hold nothing to find.
+    `works`: the folder of each run's steps, with the outcomes of its tests; `beside`: the folder in which towns are
+    looked for. Raises `InputError` where a run has no arm with a single pole, or the test frames contain no targets.
     """
     measured = {
         region: tuple(measure_gains(run, work, region) for run, work in zip(runs, works, strict=True))
@@ -128,7 +133,7 @@ def summarise_gains(
 ) -> PlacementProof:
     """Return the means over seeds of gains, of VRCSP's advantages and of correlations, with 95 % intervals.
 
-    measured: the same seeds of each region.
+    measured: gains by region, of the same seeds in all.
     """
     regions = {}
     for region, seeds in measured.items():
@@ -154,19 +159,19 @@ def summarise_gains(
 def _mean(seeds: Sequence[Sequence[SeedGains]]) -> Means:
     """Return means over `seeds` of the mean over the regions of each."""
     return Means(
-        correlation=_mean_numbers([[each.correlation for each in seed] for seed in seeds]),
-        gain=_mean_numbers([[_list_gains(each) for each in seed] for seed in seeds]),
-        advantage=_mean_numbers([[_list_advantages(each) for each in seed] for seed in seeds]),
+        correlation=_mean_numbers([[gains.correlation for gains in regions] for regions in seeds]),
+        gain=_mean_numbers([[_list_gains(gains) for gains in regions] for regions in seeds]),
+        advantage=_mean_numbers([[_list_advantages(gains) for gains in regions] for regions in seeds]),
     )
 
 
 def _mean_numbers(seeds: Sequence[Sequence[Numbers]]) -> dict[str, dict[str, MeanOverSeeds]]:
-    """Return the means over seeds of the mean over regions, of the names that all have."""
-    every = [each for seed in seeds for each in seed]
-    names = [name for name in every[0] if all(name in each for each in every)]
+    """Return the means over seeds of the mean over regions, for the names that all have."""
+    flat = [numbers for regions in seeds for numbers in regions]
+    names = [name for name in flat[0] if all(name in numbers for numbers in flat)]
     return {
         name: {
-            frames: mean_over_seeds([float(np.mean([each[name][frames] for each in seed])) for seed in seeds])
+            frames: mean_over_seeds([float(np.mean([row[name][frames] for row in regions])) for regions in seeds])
             for frames in FRAMES
         }
         for name in names
@@ -187,14 +192,15 @@ def _list_advantages(seed: SeedGains) -> Numbers:
 
 
 def plan_half_width(sd: float, half: float = HALF_WIDTH) -> int | None:
-    """Return the least number of seeds whose mean has an interval of half-width `half`; None for too many."""
+    """Return the least number of seeds whose mean has a half-width of at most `half`; None above `MOST_SEEDS`."""
     return next((seeds for seeds in range(2, MOST_SEEDS) if half_width(sd, seeds) <= half), None)
 
 
 def choose_near(places: NDArray[np.float64], errors: NDArray[np.float64], range_m: float) -> NDArray[np.bool_]:
-    """Return (F,) whether a frame is of the half with most errors within `range_m`, horizontally.
+    """Return (F,) whether a frame belongs to the half with most errors within the horizontal distance `range_m`.
 
-    `places` (F, 2) of the vehicles, `errors` (E, 3), world [m]; of equals the earlier frames are taken.
+    `places` (F, 2) of the vehicles, `errors` (E, 3), world frame [m]. Of frames with equally many errors the earlier
+    ones are chosen.
     """
     apart = np.linalg.norm(places[:, None] - errors[None, :, :2], axis=2)
     order = np.argsort(-(apart <= range_m).sum(axis=1), kind="stable")
@@ -204,7 +210,7 @@ def choose_near(places: NDArray[np.float64], errors: NDArray[np.float64], range_
 
 
 def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
-    """Return the gains of one seed's run in a region from the outcomes of its tests, whose folders are in `work`."""
+    """Return the gains in one seed's run in a region, from the outcomes of its tests in folders of `work`."""
     recipe, folders = run.recipe, _Folders.open(run, work, region)
     split = folders.test
     places = np.array([split.data.world_from_agent(number)[:2, 3] for number in split.vehicles])
@@ -218,7 +224,7 @@ def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
         for test in run.tested
         if (test.region, test.task) == (region, TASK)
     }
-    tested = {each: _precision(own, counted, region) for each, own in outcomes.items()}
+    tested = {key: _precision(result, counted, region) for key, result in outcomes.items()}
     without = tested[MAIN, EDGE]
     gains = {
         arm: {frames: value[frames] - without[frames] for frames in value}
@@ -230,11 +236,11 @@ def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
     if not poles:
         raise InputError(f"region '{region}': no arm has a sensor on a single pole that sees road users")
     known = {pole.pole for pole in poles}
-    single = [arm for arm, own in placed.items() if own.rule == "fixed" and own.chosen in {(pole,) for pole in known}]
+    single = [arm for arm, at in placed.items() if at.rule == "fixed" and at.chosen in {(pole,) for pole in known}]
     several = tuple(
-        ChoiceGain(RULES[each.rule], len(each.chosen), each.chosen, gains[arm])
-        for arm, each in placed.items()
-        if each.rule in RULES
+        ChoiceGain(RULES[placement.rule], len(placement.chosen), placement.chosen, gains[arm])
+        for arm, placement in placed.items()
+        if placement.rule in RULES
     )
     return SeedGains(
         seed=recipe.seed,
@@ -251,26 +257,27 @@ def measure_gains(run: Run, work: Path, region: str) -> SeedGains:
 def _measure_poles(
     recipe: RunRecipe, folders: _Folders, placed: Mapping[str, Placed], gains: Mapping[str, ByFrames]
 ) -> tuple[PoleGain, ...]:
-    """Return gains and predictors of the single poles of arms that see road users."""
+    """Return gains and predictors of the poles that see road users and have the only sensor of an arm."""
     known = {site.pole: site for site in placed[MAIN].poles if site.actors > 0}
     single = {
         pole: gains[arm]
-        for arm, each in placed.items()
-        if each.rule == "fixed" and len(each.chosen) == 1 and (pole := each.chosen[0]) in known
+        for arm, placement in placed.items()
+        if placement.rule == "fixed" and len(placement.chosen) == 1 and (pole := placement.chosen[0]) in known
     }
     if not single:
         return ()
     sites, town = find_sites(folders.registry, None), folders.registry.data.town()
     if town is None:
         raise InputError(f"{folders.registry.data.folder}: recorded in no known town, so that no pole's sight is known")
-    where = dict(zip(sites.number.tolist(), sites.position, strict=True))
+    position_of = dict(zip(sites.number.tolist(), sites.position, strict=True))
     traces = read_traces(folders.registry.data, folders.registry.vehicles)
-    mounts = np.array([where[pole] for pole in single]).reshape(-1, 3)
+    mounts = np.array([position_of[pole] for pole in single]).reshape(-1, 3)
     expected = dict(zip(single, expect_labels(town, traces, folders.errors, mounts).tolist(), strict=True))
     network, threshold = load_network(OBJECTS, folders.pretrained / WEIGHTS), _threshold(folders)
-    near = np.array([where[pole][:2] for each in placed.values() for pole in each.chosen]).reshape(-1, 2)
+    occupied = [position_of[pole][:2] for placement in placed.values() for pole in placement.chosen]
+    near = np.array(occupied).reshape(-1, 2)
     frames = select_frames_near(folders.edge, near, recipe.placement.group_range_m)
-    added = count_added_labels(network, threshold, folders.edge, frames, {pole: where[pole] for pole in single})
+    added = count_added_labels(network, threshold, folders.edge, frames, {pole: position_of[pole] for pole in single})
     return tuple(
         PoleGain(
             pole,
@@ -287,7 +294,7 @@ def _measure_poles(
 
 
 def _threshold(folders: _Folders) -> float:
-    """Return the score threshold of pseudo-labels; raises `InputError` where labels do not come from detections."""
+    """Return the score threshold of pseudo-labels; raises `InputError` if labels are not made from detections."""
     threshold = Pretrained.load(folders.pretrained).threshold
     if threshold is None:
         raise InputError("the labels of 'objects' come from no detections, so that no sensor adds any")
@@ -295,19 +302,22 @@ def _threshold(folders: _Folders) -> float:
 
 
 def _placed(run: Run, arm: str, region: str) -> Placed:
-    return next(each for each in run.arms[arm].placed if each.region == region)
+    return next(placement for placement in run.arms[arm].placed if placement.region == region)
 
 
 def _precision(outcomes: Outcomes, counted: Mapping[str, NDArray[np.bool_]], region: str) -> dict[str, float]:
-    """Return AP50 on each choice of frames; raises `InputError` where one holds nothing to find."""
-    found = {frames: float(OBJECTS.measure(outcomes, own[None].astype(np.int64))[0]) for frames, own in counted.items()}
-    if any(np.isnan(value) for value in found.values()):
+    """Return AP50 on each choice of frames; raises `InputError` where one contains no targets."""
+    ap50 = {
+        frames: float(OBJECTS.measure(outcomes, is_counted[None].astype(np.int64))[0])
+        for frames, is_counted in counted.items()
+    }
+    if any(np.isnan(value) for value in ap50.values()):
         raise InputError(f"region '{region}': the test frames hold nothing to find; take more scenes")
-    return found
+    return ap50
 
 
 def _choose_one(poles: Sequence[PoleGain]) -> tuple[ChoiceGain, ...]:
-    """Return the gains of one sensor by each rule; at random it is the mean over all poles."""
+    """Return the gains of a single sensor by each rule; for the random rule the mean over all poles."""
     rules = {RULES["vrcsp"]: COVERAGE, RULES["densest"]: TRAFFIC, EXPECTED: EXPECTED}
     best = {rule: max(poles, key=lambda pole: pole.predictors[name]) for rule, name in rules.items()}
     mean = {frames: float(np.mean([pole.gain[frames] for pole in poles])) for frames in FRAMES}
@@ -323,12 +333,12 @@ def _correlate(poles: Sequence[PoleGain], name: str) -> dict[str, float]:
 
 
 def draw_proof(results: PlacementProof) -> dict[str, bytes]:
-    """Return by file name the pictures of every pole's gain against each predictor as PNG, one of each region."""
+    """Return a PNG per region, by file name: the gains of all poles against each predictor."""
     pictures = {}
-    for region, own in results.regions.items():
+    for region, proof in results.regions.items():
         panels = {
             (frames, name): {
-                seed.seed: [(pole.predictors[name], pole.gain[frames]) for pole in seed.poles] for seed in own.seeds
+                seed.seed: [(pole.predictors[name], pole.gain[frames]) for pole in seed.poles] for seed in proof.seeds
             }
             for frames in FRAMES
             for name in PREDICTORS
@@ -338,7 +348,7 @@ def draw_proof(results: PlacementProof) -> dict[str, bytes]:
 
 
 def overlap_of_circles(apart: float, radius: float) -> float:
-    """Return the share of a circle's area that lies in another one of the same radius, `apart` between the centres."""
+    """Return the share of a circle's area in another one of equal radius; `apart`: distance of centres, same unit."""
     half = apart / (2 * radius)
     if half >= 1:
         return 0.0
@@ -346,9 +356,9 @@ def overlap_of_circles(apart: float, radius: float) -> float:
 
 
 def list_overlaps(recipe: RunRecipe, region: str, beside: Path | None = None) -> tuple[Pair, ...]:
-    """Return the pairs of candidate poles of a region whose circles overlap, the most first.
+    """Return the pairs of candidate poles of a region whose circles overlap, in descending order of overlap.
 
-    Its town is looked for in the folder `beside`.
+    The region's town is looked for in the folder `beside`.
     """
     poles, radius = load_town(recipe.regions[region].town or region, beside).poles, recipe.placement.range_m
     pairs = []
@@ -360,32 +370,31 @@ def list_overlaps(recipe: RunRecipe, region: str, beside: Path | None = None) ->
 
 
 def describe_overlaps(pairs: Mapping[str, Sequence[Pair]], range_m: float) -> list[str]:
-    """Return in words, a sentence for each region, how much the circles of candidate poles overlap."""
-    told = {
-        region: ", ".join(f"{pair.poles[0]} and {pair.poles[1]} by {pair.overlap:.0%}" for pair in own)
-        for region, own in pairs.items()
+    """Return a sentence for each region: which circles of candidate poles overlap, and by how much."""
+    lists = {
+        region: ", ".join(f"{pair.poles[0]} and {pair.poles[1]} by {pair.overlap:.0%}" for pair in pairs_here)
+        for region, pairs_here in pairs.items()
     }
     return [
-        f"{region}: circles of {range_m:g} m around candidate poles that overlap: {each}"
-        if each
+        f"{region}: circles of {range_m:g} m around candidate poles that overlap: {listed}"
+        if listed
         else f"{region}: no two circles of {range_m:g} m around candidate poles overlap"
-        for region, each in told.items()
+        for region, listed in lists.items()
     ]
 
 
 Array = NDArray[np.float64]
 
-BIN_M = 5.0  # of horizontal distance from the pole
-RECALL = np.array(
-    (0.67, 0.99, 0.92, 0.96, 0.91, 0.97, 0.94, 0.86, 0.53, 0.29, 0.05, 0.0)
-)  # reproductions/sensor-ranges
-REACH_M = 100.0  # between a pole and a vehicle, farther than both see together
+BIN_M = 5.0  # width of the bins of horizontal distance from the pole
+# Recall of the road detector in each bin, as measured by reproductions/sensor_ranges.
+RECALL = np.array((0.67, 0.99, 0.92, 0.96, 0.91, 0.97, 0.94, 0.86, 0.53, 0.29, 0.05, 0.0))
+REACH_M = 100.0  # farther apart, a pole and a vehicle see no common objects
 
 
 def expect_labels(town: Town, traces: Sequence[Trace], errors: Sequence[PerceptionError], sites: Array) -> Array:
-    """Return (P,) the expected labels of a sensor on each of `sites` (P, 3), world [m]: see the module.
+    """Return (P,) the expected labels of a sensor on each of `sites` (P, 3), world frame [m]: see the module.
 
-    traces: of the traffic that may stand in the way.
+    traces: traffic, whose vehicles may block the line of sight.
     """
     missed = [error for error in errors if error.kind == MISS and error.returns > 0]
     places = np.array([(error.x, error.y, error.z) for error in missed]).reshape(-1, 3)
@@ -399,13 +408,13 @@ def expect_labels(town: Town, traces: Sequence[Trace], errors: Sequence[Percepti
 def count_added_labels(
     network: Second, threshold: float, split: Frames, frames: Sequence[int], poles: Mapping[int, Array]
 ) -> dict[int, int]:
-    """Return by pole the labels that its sensor adds to vehicles' `frames` of a split: see the module.
+    """Return by pole the number of labels that its sensor adds to vehicles' `frames` of a split: see the module.
 
-    The network's detections that score `threshold` or more are the vehicles' own. poles: places (3,) of those whose
-    sweeps are in the split, world [m].
+    The vehicles' own labels are the detections of `network` that score `threshold` or more. poles: positions (3,) of
+    poles whose sweeps are in the split, world frame [m].
     """
     keys, relief = split.data.keys, DatasetGround(split.data).relief
-    own = {i: detect_in(network, [split.data.frame(i)], score_threshold=threshold)[0] for i in frames}
+    detected = {i: detect_in(network, [split.data.frame(i)], score_threshold=threshold)[0] for i in frames}
     added = {}
     for pole, place in poles.items():
         near = [i for i in frames if np.linalg.norm((split.data.world_from_agent(i)[:3, 3] - place)[:2]) <= REACH_M]
@@ -413,13 +422,15 @@ def count_added_labels(
         views = road_views(split, [pole], True, spins)
         added[pole] = 0
         for i in near:
-            frame, told = split.data.frame(i), [*views.get((keys[i].scene, keys[i].index), {}).values()]
+            frame, views_here = split.data.frame(i), [*views.get((keys[i].scene, keys[i].index), {}).values()]
             lidar = choose_lidar(frame)
-            alone, helped = (label_sample(frame, own[i], each, network.config, lidar, relief) for each in ([], told))
+            alone, helped = (
+                label_sample(frame, detected[i], road, network.config, lidar, relief) for road in ([], views_here)
+            )
             if helped.exact is not None:
-                road, known = helped.boxes[helped.exact], alone.boxes.center[:, :2]
-                offset = np.linalg.norm(road.center[:, None, :2] - known[None], axis=2)
-                added[pole] += int((offset >= road.size[:, :1] / 2).all(axis=1).sum())
+                from_road, known = helped.boxes[helped.exact], alone.boxes.center[:, :2]
+                offset = np.linalg.norm(from_road.center[:, None, :2] - known[None], axis=2)
+                added[pole] += int((offset >= from_road.size[:, :1] / 2).all(axis=1).sum())
     return added
 
 

@@ -1,4 +1,4 @@
-"""Markdown tables of the proof of placement."""
+"""Markdown tables of the test of placement."""
 
 import numpy as np
 
@@ -22,18 +22,22 @@ POOLED = "mean over regions"
 
 def tables(results: PlacementProof) -> dict[str, str]:
     """Return Markdown by name: claims, correlation, rules, spread, and of each region poles, seeds and overlaps."""
-    every = {name: own.means for name, own in results.regions.items()}
-    if len(every) > 1:
-        every[POOLED] = results.pooled
-    told = {
+    means = {name: proof.means for name, proof in results.regions.items()}
+    if len(means) > 1:
+        means[POOLED] = results.pooled
+    markdown = {
         "claims": _claims(results),
-        "correlation": _correlation(every),
-        "rules": _rules(every),
+        "correlation": _correlation(means),
+        "rules": _rules(means),
         "spread": _spread(results),
     }
-    for name, own in results.regions.items():
-        told |= {f"poles {name}": _poles(own), f"seeds {name}": _seeds(own), f"overlaps {name}": _overlaps(own)}
-    return told
+    for name, proof in results.regions.items():
+        markdown |= {
+            f"poles {name}": _poles(proof),
+            f"seeds {name}": _seeds(proof),
+            f"overlaps {name}": _overlaps(proof),
+        }
+    return markdown
 
 
 def _claims(results: PlacementProof) -> str:
@@ -53,41 +57,48 @@ def _claims(results: PlacementProof) -> str:
     )
 
 
-def _correlation(every: dict[str, Means]) -> str:
+def _correlation(regions: dict[str, Means]) -> str:
     rows = [
         [region, name, *(means.correlation[name][frames].describe(sign=True) for frames in FRAMES)]
-        for region, means in every.items()
+        for region, means in regions.items()
         for name in PREDICTORS
     ]
     return format_table(("region", "rank correlation of a pole's gain with its", *FRAMES), rows)
 
 
-def _rules(every: dict[str, Means]) -> str:
+def _rules(regions: dict[str, Means]) -> str:
     rows = []
-    for region, means in every.items():
+    for region, means in regions.items():
         for count, rule in sorted((name.split(", ") for name in means.gain), key=_order):
             name = f"{count}, {rule}"
             gain = means.gain[name]
             beaten = means.advantage.get(name)
-            told = [beaten[frames].describe(sign=True) if beaten else "" for frames in FRAMES]
-            rows.append([region, count, rule, *(gain[frames].describe(sign=True) for frames in FRAMES), *told])
+            advantages = [beaten[frames].describe(sign=True) if beaten else "" for frames in FRAMES]
+            rows.append([region, count, rule, *(gain[frames].describe(sign=True) for frames in FRAMES), *advantages])
     header = ("sensors", "rule", *(f"gain in AP50 {f}" for f in FRAMES), *(f"VRCSP gains more {f}" for f in FRAMES))
     return format_table(("region", *header), rows)
 
 
 def _order(choice: list[str]) -> tuple[int, int]:
-    """Return the place in a table of "count" and "rule": files sort them by letters."""
+    """Return the sort key of [count, rule]: by number, and in the order of `RULES`, as JSON files sort by letters."""
     count, rule = choice
     return int(count), (*RULES.values(), EXPECTED).index(rule)
 
 
 def _poles(region: RegionProof) -> str:
-    """Return each pole's means over the seeds in which it sees road users, most errors first."""
+    """Return each pole's means over the seeds in which it sees road users, in descending order of errors covered."""
     rows = []
-    for pole in sorted({each.pole for seed in region.seeds for each in seed.poles}):
-        own = [each for seed in region.seeds for each in seed.poles if each.pole == pole]
-        means = [float(np.mean([each.predictors[name] for each in own])) for name in PREDICTORS]
-        rows.append((pole, len(own), means, [float(np.mean([e.gain[frames] for e in own])) for frames in FRAMES]))
+    for pole in sorted({row.pole for seed in region.seeds for row in seed.poles}):
+        by_seed = [row for seed in region.seeds for row in seed.poles if row.pole == pole]
+        means = [float(np.mean([row.predictors[name] for row in by_seed])) for name in PREDICTORS]
+        rows.append(
+            (
+                pole,
+                len(by_seed),
+                means,
+                [float(np.mean([row.gain[frames] for row in by_seed])) for frames in FRAMES],
+            )
+        )
     rows.sort(key=lambda row: -row[2][0])
     return format_table(
         ("pole", "seeds", *PREDICTORS, *(f"mean gain in AP50 {frames}" for frames in FRAMES)),
@@ -112,13 +123,13 @@ def _seeds(region: RegionProof) -> str:
 
 
 def _spread(results: PlacementProof) -> str:
-    """Return how far the difference of two poles' gains varies between seeds, and the seeds that this asks for."""
-    rows, known = [], all(own.scene_sd is not None for own in results.regions.values())
-    for name, own in results.regions.items():
-        several = len(own.seeds) > 1
+    """Return the standard deviations of the difference of two poles' gains, and the number of seeds needed."""
+    rows, known = [], all(proof.scene_sd is not None for proof in results.regions.values())
+    for name, proof in results.regions.items():
+        several = len(proof.seeds) > 1
         for frames in FRAMES:
-            wanted = own.seeds_wanted[frames] or (f"more than {MOST_SEEDS}" if several else "")
-            spread = [own.pair_sd[frames], *([own.scene_sd[frames]] if known and own.scene_sd else [])]
+            wanted = proof.seeds_wanted[frames] or (f"more than {MOST_SEEDS}" if several else "")
+            spread = [proof.pair_sd[frames], *([proof.scene_sd[frames]] if known and proof.scene_sd else [])]
             rows.append([name, frames, *(f"{sd:.3f}" if several else "" for sd in spread), wanted])
     header = (
         "standard deviation over seeds of the difference of two poles' gains",

@@ -1,11 +1,11 @@
-"""Redundant tasks: as many as scenarios are complex against an even split, for the same bytes of uplink.
+"""Redundant tasks: numbers in proportion to the complexity of scenarios against an even split, for equal uplink bytes.
 
-Redundant are the tasks of a scenario beyond its first: other vehicles with the same labels and network. All splits have
-as many tasks, thus as many updates by radio. By complexity they are in proportion to the number that the rule of
-`flcav.odd.scenario_tasks` gives each scenario; reversed, the least complex has the most.
+The tasks of a scenario beyond its first are redundant: other vehicles with the same labels and network. All splits have
+the same total number of tasks, and thus of updates by radio. The split by complexity is in proportion to the numbers
+that the rule of `flcav.odd.scenario_tasks` gives the scenarios; in the reversed one, the least complex has the most.
 
 Expected, before any run: the most complex scenario gains .01 to .03 AP50 by its further tasks, and the least complex
-loses as much, so that the mean of the scenarios moves by less than .01 and five seeds do not tell it from none.
+loses as much. The mean of the scenarios then changes by less than .01, which five seeds cannot distinguish from 0.
 """
 
 from collections.abc import Mapping, Sequence
@@ -51,7 +51,7 @@ SCORES = (ALL, MOST, LEAST)
 
 @dataclass(frozen=True)
 class Weighed:
-    """A test of a scenario's network, and its weight in a score."""
+    """The outcomes of a scenario's network on test frames, and their weight in a score."""
 
     outcomes: Outcomes
     weight: float
@@ -60,31 +60,31 @@ class Weighed:
 
 @dataclass(frozen=True)
 class RedundantTasksResult(Record):
-    """Accuracy of each split over seeds, and differences to the even one."""
+    """Accuracy of each split over seeds, and differences from the even split."""
 
-    seeds: Mapping[str, tuple[TriedScenario, ...]]  # by seed, the most complex first
+    seeds: Mapping[str, tuple[TriedScenario, ...]]  # by seed, in descending order of complexity
     ap50: Mapping[str, Mapping[str, MeanOverSeeds]]  # by score and split
-    differences: Mapping[str, MeanOverSeeds]  # to the even split, in words
-    up_mb: Mapping[str, float]  # uplink of a seed by split, mean over seeds
+    differences: Mapping[str, MeanOverSeeds]  # from the even split, by "split - even split, score"
+    up_mb: Mapping[str, float]  # uplink of all tasks by split, mean over seeds
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return the uplink and the differences in words."""
+        """Return the uplink and the differences as sentences."""
         sent = ", ".join(f"{split} {mb:.2f} MB" for split, mb in self.up_mb.items())
         return [f"uplink: {sent}", *describe_means(self.differences)]
 
     def picture(self) -> bytes:
         """Return AP50 of each split by score, a dot per seed, as a PNG."""
         panels = {
-            score: [Bar(split, mean.mean, self.scores_of(split, score)) for split, mean in of.items()]
-            for score, of in self.ap50.items()
+            score: [Bar(split, mean.mean, self.scores_of(split, score)) for split, mean in by_split.items()]
+            for score, by_split in self.ap50.items()
         }
         return style.png(precisions(panels, "AP50"))
 
     def scores_of(self, split: str, score: str) -> tuple[float, ...]:
-        """Return the score of a split by seed."""
+        """Return the score of a split in each seed."""
         return tuple(
-            sum(weight * own.ap50[str(count)] for own, count, weight in choose(tried, split, score))
+            sum(weight * scenario.ap50[str(count)] for scenario, count, weight in choose(tried, split, score))
             for tried in self.seeds.values()
         )
 
@@ -105,8 +105,8 @@ def list_steps(seeds: Sequence[int], size: Size) -> list[Step]:
     """Return the steps: recordings, and the trainings and tests of each seed."""
     recordings = list_recordings(size)
     steps = [Step(name, record_split, {"recipe": fields}) for name, fields in recordings.items()]
-    each = [Step(name_step(seed), try_splits, {"seed": seed, "size": size}, (*recordings,)) for seed in seeds]
-    return [*steps, *each]
+    seed_steps = [Step(name_step(seed), try_splits, {"seed": seed, "size": size}, (*recordings,)) for seed in seeds]
+    return [*steps, *seed_steps]
 
 
 def name_step(seed: int) -> str:
@@ -115,18 +115,22 @@ def name_step(seed: int) -> str:
 
 
 def choose(tried: Sequence[TriedScenario], split: str, score: str) -> list[tuple[TriedScenario, int, float]]:
-    """Return the scenarios of a score, the tasks of each by the split, and its weight."""
+    """Return the scenarios of a score, each with its number of tasks in the split and its weight."""
     chosen = {ALL: tried, MOST: tried[:1], LEAST: tried[-1:]}[score]
-    return [(own, own.tasks.get(split, 0), 1 / len(chosen)) for own in chosen]
+    return [(scenario, scenario.tasks.get(split, 0), 1 / len(chosen)) for scenario in chosen]
 
 
 def summarise(tried: Mapping[str, tuple[TriedScenario, ...]], folders: Mapping[str, Path]) -> RedundantTasksResult:
-    """Return means over seeds, which share the test's scenes; the folders hold the outcomes of each seed."""
+    """Return means over seeds, which share the test scenes; `folders`: of the outcomes, by seed."""
 
     def tests(seed: str, split: str, score: str, sign: float = 1.0) -> list[Weighed]:
         return [
-            Weighed(Outcomes.load(outcomes_file(folders[seed], own.town, own.kind, count)), sign * weight, own.town)
-            for own, count, weight in choose(tried[seed], split, score)
+            Weighed(
+                Outcomes.load(outcomes_file(folders[seed], scenario.town, scenario.kind, count)),
+                sign * weight,
+                scenario.town,
+            )
+            for scenario, count, weight in choose(tried[seed], split, score)
         ]
 
     def accuracy(split: str, score: str) -> MeanOverSeeds:
@@ -142,7 +146,14 @@ def summarise(tried: Mapping[str, tuple[TriedScenario, ...]], folders: Mapping[s
             f"{split} - {EVEN}, {score}": difference(split, score) for split in (RULE, REVERSED) for score in SCORES
         },
         up_mb={
-            split: float(np.mean([sum(own.up_mb[str(own.tasks[split])] for own in each) for each in tried.values()]))
+            split: float(
+                np.mean(
+                    [
+                        sum(scenario.up_mb[str(scenario.tasks[split])] for scenario in scenarios)
+                        for scenarios in tried.values()
+                    ]
+                )
+            )
             for split in SPLITS
         },
         provenance=provenance(),
@@ -150,12 +161,12 @@ def summarise(tried: Mapping[str, tuple[TriedScenario, ...]], folders: Mapping[s
 
 
 def mean_score(seeds: Sequence[Sequence[Weighed]], *, share: bool = False) -> MeanOverSeeds:
-    """Return the mean over seeds of the weighted sum of the AP50 of tests, with the spread by the scenes they share."""
-    values = [float(weigh_tests(each, np.ones((1, count_frames(each)), np.int64))[0]) for each in seeds]
+    """Return the mean over seeds of a weighted sum of AP50; its interval covers the test scenes that seeds share."""
+    values = [float(weigh_tests(tests, np.ones((1, count_frames(tests)), np.int64))[0]) for tests in seeds]
     if len(seeds) == 1:
         return mean_over_seeds(values, shared=OWN_SCENES, share=share)
-    scenes = [[f"{test.town}/{scene}" for test in each for scene in test.outcomes.scene] for each in seeds]
-    spread = share_scenes([partial(weigh_tests, each) for each in seeds], scenes, rng=stream(0, "scenes"))
+    scenes = [[f"{test.town}/{scene}" for test in tests for scene in test.outcomes.scene] for tests in seeds]
+    spread = share_scenes([partial(weigh_tests, tests) for tests in seeds], scenes, rng=stream(0, "scenes"))
     return mean_over_seeds(values, shared=spread, share=share)
 
 
@@ -189,7 +200,7 @@ def _accuracy(results: RedundantTasksResult) -> str:
         [
             split,
             f"{results.up_mb[split]:.2f}" if split in results.up_mb else "0",
-            *(of[split].describe() for of in results.ap50.values()),
+            *(by_split[split].describe() for by_split in results.ap50.values()),
         ]
         for split in splits
     ]
@@ -197,16 +208,16 @@ def _accuracy(results: RedundantTasksResult) -> str:
 
 
 def _scenarios(results: RedundantTasksResult) -> str:
-    names = dict.fromkeys(own.name for tried in results.seeds.values() for own in tried)
+    names = dict.fromkeys(scenario.name for tried in results.seeds.values() for scenario in tried)
     rows = []
     for name in names:
-        own = [each for tried in results.seeds.values() for each in tried if each.name == name]
-        complexity = float(np.mean([each.complexity.total for each in own]))
-        errors = float(np.mean([each.complexity.errors for each in own]))
-        by_rule = ", ".join(str(each.by_rule) for each in own)
-        shares = [f"{np.mean([each.tasks[split] for each in own]):.1f}" for split in SPLITS]
-        reached = [f"{np.mean([each.ap50[str(each.tasks[split])] for each in own]):.3f}" for split in SPLITS]
-        start = f"{np.mean([each.ap50['0'] for each in own]):.3f}"
+        tries = [one for tried in results.seeds.values() for one in tried if one.name == name]
+        complexity = float(np.mean([one.complexity.total for one in tries]))
+        errors = float(np.mean([one.complexity.errors for one in tries]))
+        by_rule = ", ".join(str(one.by_rule) for one in tries)
+        shares = [f"{np.mean([one.tasks[split] for one in tries]):.1f}" for split in SPLITS]
+        reached = [f"{np.mean([one.ap50[str(one.tasks[split])] for one in tries]):.3f}" for split in SPLITS]
+        start = f"{np.mean([one.ap50['0'] for one in tries]):.3f}"
         cells = [f"{share} tasks: {ap}" for share, ap in zip(shares, reached, strict=True)]
         rows.append([name, f"{complexity:.2f}", f"{errors:.2f}", by_rule, start, *cells])
     heads = ("complexity", "of it errors", "tasks by the rule, by seed", "AP50, pretrained", *SPLITS)

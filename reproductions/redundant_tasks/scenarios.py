@@ -1,7 +1,7 @@
-"""Scenarios whose tasks train a network each: recordings, pretraining, complexity, and rounds of edge FL.
+"""Scenarios, each with a network that its tasks train: recordings, pretraining, complexity, and rounds of edge FL.
 
-A scenario is a kind of place of one town. A task of it is a vehicle: its sweeps at such places, their ground truth, and
-the scenario's network, which all its tasks train together in rounds of edge FL (stage II) from one pretrained network.
+A scenario is a kind of place in one town. A task of it is a vehicle with its sweeps at such places and their ground
+truth. All tasks of a scenario train its network together in rounds of edge FL (stage II), from one pretrained network.
 """
 
 from collections.abc import Mapping, Sequence
@@ -45,53 +45,56 @@ class Size(Record):
     """Size of the study: of recordings, trainings and tests."""
 
     scenes: int = 10
-    spins: int = 5  # of each scene
+    spins: int = 5  # per scene
     samples: int = 48  # of stage I
     pretrain_steps: int = 600
-    sweeps: int = 10  # of a task
+    sweeps: int = 10  # per task
     rounds: int = 3
-    steps: int = 12  # of a task in a round
-    tested: int = 60  # frames of a scenario, at most
+    steps: int = 12  # per task and round
+    tested: int = 60  # most frames per scenario
 
 
 FULL, TOY = Size(), Size(scenes=3, spins=2, samples=4, pretrain_steps=2, sweeps=1, rounds=1, steps=1, tested=3)
-RATE, FINAL_RATE = 1.0, 0.1  # of the task's learning rate, in the first and in the last round; as in recipes/runs/demo
+RATE, FINAL_RATE = 1.0, 0.1  # multiples of the task's learning rate in the first and the last round, as in the demo
 
 
 @dataclass(frozen=True)
 class TriedScenario(Record):
-    """A scenario of one seed: its complexity, its tasks by each split, and what its network reaches with them."""
+    """A scenario in one seed: its complexity, its numbers of tasks, and its network's AP50 and uplink with them."""
 
     town: str
-    kind: str  # of place
+    kind: str  # of place, as in `SCENARIOS`
     complexity: Complexity
     by_rule: int  # number of tasks by the rule of `flcav.odd.scenario_tasks`
     tasks: Mapping[str, int]  # by split
     ap50: Mapping[str, float]  # by number of tasks; 0: the pretrained network
-    up_mb: Mapping[str, float]  # uplink by number of tasks
+    up_mb: Mapping[str, float]  # uplink of all its tasks, by their number
 
     @property
     def name(self) -> str:
-        """Return the scenario in words."""
+        """Return the name of the scenario, as "arterial, straight road"."""
         return name_scenario(self.town, self.kind)
 
 
 def name_scenario(town: str, kind: str) -> str:
-    """Return the town and the kind of place in words."""
+    """Return the town and the kind of place, as "arterial, straight road"."""
     return f"{town}, {'straight road' if kind == 'none' else kind.replace('_', '-')}"
 
 
 def list_recordings(size: Size) -> Mapping[str, RecipeFields]:
-    """Return the recordings by the names of their steps: of each town's traffic to train on, and of other to test."""
-    of = {"cavs": 5, "scenes": size.scenes, "spins_per_scene": size.spins}
-    whole = {**read_recipe(PRETRAINED), **of}
+    """Return the recording recipes of all towns, to train on and to test, by the names of their steps."""
+    changes = {"cavs": 5, "scenes": size.scenes, "spins_per_scene": size.spins}
+    whole = {**read_recipe(PRETRAINED), **changes}
     train_on = {town: {**whole, "town": town, "seed": 3501} for town in (PRETRAINED, *TOWNS)}
     test = {f"test-{town}": {**whole, "town": town, "seed": 3502, "split": "test"} for town in TOWNS}
     return train_on | test
 
 
 def share_out(counts: Sequence[int], total: int) -> tuple[int, ...]:
-    """Return shares of `total` in proportion to `counts`, at least 1 each, by Webster's method; ties to the first."""
+    """Return integer shares of `total` in proportion to `counts`, at least 1 each, by Webster's method.
+
+    Of counts with equal claims to the next unit, the first gets it.
+    """
     shares = [1] * len(counts)
     for _ in range(total - len(counts)):
         quotients = [count / (2 * share + 1) for count, share in zip(counts, shares, strict=True)]
@@ -100,7 +103,7 @@ def share_out(counts: Sequence[int], total: int) -> tuple[int, ...]:
 
 
 def split_tasks(by_rule: Sequence[int]) -> dict[str, tuple[int, ...]]:
-    """Return the tasks of each scenario by split, of scenarios from the most to the least complex."""
+    """Return the number of tasks of each scenario by split; `by_rule`: from the most to the least complex scenario."""
     shares = share_out(by_rule, TASKS)
     return {EVEN: share_out([1] * len(by_rule), TASKS), RULE: shares, REVERSED: shares[::-1]}
 
@@ -112,16 +115,16 @@ def find_frames(data: Dataset, kind: str) -> NDArray[np.int64]:
 
 
 def try_splits(work: Work, *, seed: int, size: Size) -> Json:
-    """Pretrain, let each scenario's tasks train its network by every split, and test it; keep the outcomes as files.
+    """Pretrain, train and test each scenario's network with its tasks in every split, and save the outcomes as files.
 
-    Return the `TriedScenario` of each scenario, the most complex first.
+    Return the `TriedScenario` of each scenario as JSON, in descending order of complexity.
     """
     network = pretrain(open_split(work.inputs[PRETRAINED]), seed, size)
     start = to_arrays(network)
-    found = judge_scenarios(network, {town: work.inputs[town] for town in TOWNS})
-    splits = split_tasks([count_tasks(complexity) for complexity in found.values()])
+    complexities = judge_scenarios(network, {town: work.inputs[town] for town in TOWNS})
+    splits = split_tasks([count_tasks(complexity) for complexity in complexities.values()])
     tried = []
-    for number, ((town, kind), complexity) in enumerate(found.items()):
+    for number, ((town, kind), complexity) in enumerate(complexities.items()):
         tasks = {split: shares[number] for split, shares in splits.items()}
         train_on, test = open_split(work.inputs[town]), open_split(work.inputs[f"test-{town}"])
         needed = max(tasks.values()) * size.sweeps
@@ -129,51 +132,51 @@ def try_splits(work: Work, *, seed: int, size: Size) -> Json:
         frames = spread_frames(find_frames(test, kind), size.tested)
         ap50, up_mb = {}, {}
         for count in sorted({0, *tasks.values()}):
-            own = sweeps[: count * size.sweeps]
-            weights, up_mb[str(count)] = train_tasks(train_on, own, start, derive_seed(seed, town, kind), size)
+            own_sweeps = sweeps[: count * size.sweeps]
+            weights, up_mb[str(count)] = train_tasks(train_on, own_sweeps, start, derive_seed(seed, town, kind), size)
             from_arrays(network, weights)
             outcomes = OBJECTS.outcomes(network, test, frames)
             outcomes.save(outcomes_file(work.folder, town, kind, count))
             ap50[str(count)] = float(OBJECTS.measure(outcomes, np.ones((1, len(frames)), np.int64))[0])
-            work.report(number, len(found), f"{name_scenario(town, kind)}, {count} tasks")
+            work.report(number, len(complexities), f"{name_scenario(town, kind)}, {count} tasks")
         tried.append(TriedScenario(town, kind, complexity, count_tasks(complexity), tasks, ap50, up_mb).as_json())
     return tried
 
 
 def outcomes_file(folder: Path, town: str, kind: str, tasks: int) -> Path:
-    """Return the file of the outcomes of a scenario's network with so many tasks."""
+    """Return the file of the outcomes of a scenario's network that a number of tasks trained."""
     return folder / f"{town}-{kind}-{tasks}.npz"
 
 
 def pretrain(data: Dataset, seed: int, size: Size) -> Second:
-    """Return the network after stage I on sweeps of the seed's draw."""
+    """Return the network after stage I on sweeps that the seed draws."""
     config = pillars_config()
-    drawn = np.sort(stream(seed, "sweeps").choice(len(data), min(size.samples, len(data)), replace=False)).tolist()
-    held = OBJECTS.samples(data, config, drawn)
+    sweeps = np.sort(stream(seed, "sweeps").choice(len(data), min(size.samples, len(data)), replace=False)).tolist()
+    dataset = OBJECTS.samples(data, config, sweeps)
     network = build_network(OBJECTS, config, seed)
-    kept = [held[number] for number in range(len(held))]
-    train(OBJECTS, network, kept, steps=size.pretrain_steps, batch=OBJECTS.practice.batch, seed=seed)
+    in_memory = [dataset[number] for number in range(len(dataset))]
+    train(OBJECTS, network, in_memory, steps=size.pretrain_steps, batch=OBJECTS.practice.batch, seed=seed)
     return network
 
 
 def judge_scenarios(network: Second, recorded: Mapping[str, Path]) -> dict[tuple[str, str], Complexity]:
-    """Return the complexity of each of `SCENARIOS`, the most complex first, with the errors of the network."""
-    found: dict[tuple[str, str], Complexity] = {}
+    """Return the complexity of each of `SCENARIOS`, from the network's errors, in descending order."""
+    complexities: dict[tuple[str, str], Complexity] = {}
     for town, step in recorded.items():
         data = open_split(step)
         kinds = [kind for other, kind in SCENARIOS if other == town]
         frames = np.sort(np.concatenate([find_frames(data, kind) for kind in kinds])).tolist()
         errors = OBJECTS.register_errors(network, data, frames).errors
-        for each in generate_tasks(data.folder, [(own.scene, own.x, own.y) for own in errors]):
-            if each.kind in kinds:
-                found[town, each.kind] = each.complexity
-    if missing := [name_scenario(*each) for each in SCENARIOS if each not in found]:
+        for tasks in generate_tasks(data.folder, [(error.scene, error.x, error.y) for error in errors]):
+            if tasks.kind in kinds:
+                complexities[town, tasks.kind] = tasks.complexity
+    if missing := [name_scenario(*place) for place in SCENARIOS if place not in complexities]:
         raise InputError(f"{missing[0]}: no frame of the recording is at such a place")
-    return dict(sorted(found.items(), key=lambda each: -each[1].total))
+    return dict(sorted(complexities.items(), key=lambda item: -item[1].total))
 
 
 def draw_sweeps(frames: NDArray[np.int64], count: int, stream_of: tuple[int, str]) -> list[int]:
-    """Return `count` frames in the random order of a seed's scenario; raises `InputError` where there are too few."""
+    """Return `count` frames, drawn at random for a seed and scenario; raises `InputError` where there are too few."""
     seed, name = stream_of
     if len(frames) < count:
         raise InputError(f"{name}: {len(frames)} frames were recorded there, and its tasks need {count}")
@@ -181,22 +184,25 @@ def draw_sweeps(frames: NDArray[np.int64], count: int, stream_of: tuple[int, str
 
 
 def spread_frames(frames: NDArray[np.int64], most: int) -> list[int]:
-    """Return at most so many of the frames, evenly spread over the recording."""
+    """Return at most `most` of the frames, evenly spread over the recording."""
     return frames[np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int))].tolist()
 
 
 def train_tasks(data: Dataset, sweeps: Sequence[int], start: Weights, seed: int, size: Size) -> tuple[Weights, float]:
-    """Return the network after rounds of the tasks that have these sweeps, and their uplink [MB]; of none `start`."""
+    """Return the network after the rounds of tasks with these sweeps, and their uplink [MB].
+
+    A task has `size.sweeps` of them. Without any sweeps the network remains `start`.
+    """
     if not sweeps:
         return start, 0.0
-    held = OBJECTS.samples(data, pillars_config(), sweeps)
+    samples = OBJECTS.samples(data, pillars_config(), sweeps)
     clients = {
         f"task{number}": TaskClient(
-            OBJECTS, pillars_config(), [held[at] for at in range(first, min(first + size.sweeps, len(sweeps)))]
+            OBJECTS, pillars_config(), [samples[at] for at in range(first, min(first + size.sweeps, len(sweeps)))]
         )
         for number, first in enumerate(range(0, len(sweeps), size.sweeps))
     }
     ledger, rate = Ledger(LinkMegabytes(1e6, 0.0)), OBJECTS.practice.learning_rate
     schedule = Schedule(size.rounds, size.steps, RATE * rate, FINAL_RATE * rate, seed)
-    reached = federate(clients, start, schedule, Account(ledger, EDGE, OBJECTS.name, "wireless"))
-    return reached.weights, sum(entry.bytes for entry in ledger if entry.direction == "up") / BYTES_PER_MB
+    trained = federate(clients, start, schedule, Account(ledger, EDGE, OBJECTS.name, "wireless"))
+    return trained.weights, sum(entry.bytes for entry in ledger if entry.direction == "up") / BYTES_PER_MB

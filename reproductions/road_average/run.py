@@ -1,7 +1,7 @@
 """AP50 of the road average against errors of poses, clocks and radio: naive, weighted by uncertainty, pose graph.
 
-Labels are evaluated online: at a spin from the messages of the spins before that have arrived. AP sorts the labels of
-all scenes and spins together.
+Labels are evaluated online: those of a spin are averaged from the messages that have arrived by then. AP ranks the
+labels of all scenes and spins together.
 """
 
 from collections.abc import Mapping, Sequence
@@ -42,54 +42,54 @@ from flcav.world.map.lanes import map_layers
 
 @dataclass(frozen=True)
 class Errors:
-    """Standard deviations of the errors of vehicles, and what the radio does to messages of all agents."""
+    """Standard deviations of the errors of vehicles, and latency and loss of the messages of all agents."""
 
     position_m: float = 0.0  # along x and along y, redrawn at each spin
-    constant_m: float = 0.0  # along x and along y, the same all along
+    constant_m: float = 0.0  # along x and along y, constant over a scene
     heading_deg: float = 0.0  # redrawn at each spin
     latency_s: float = 0.0  # delay of every message
     loss: float = 0.0  # probability that a message is lost
-    clock_s: float = 0.0  # offset of a vehicle's clock, the same all along
+    clock_s: float = 0.0  # offset of a vehicle's clock, constant over a scene
 
     @property
     def navigation(self) -> Navigation:
-        """Return what the navigation of a vehicle states of its accuracy: at least a centimetre and .05 degrees."""
+        """Return the accuracy that a vehicle's navigation states: at least a centimetre and .001 rad."""
         sigma_m = np.hypot(self.position_m, self.constant_m)
         return Navigation(max(float(sigma_m), 0.01), max(float(np.radians(self.heading_deg)), 0.001))
 
 
 def apply_errors(sightings: Sequence[Sighting], errors: Errors, rng: np.random.Generator) -> list[Sighting]:
-    """Return the sightings of a scene as they arrive: poses and clocks of vehicles off, some messages lost.
+    """Return the sightings of a scene that arrive, with errors in the poses and clocks of vehicles.
 
-    The same generator draws the same numbers whatever the errors' sizes, so that sizes can be compared.
+    A generator draws the same numbers for errors of all sizes, so that sizes can be compared.
     """
-    agents = sorted({each.agent for each in sightings})
+    agents = sorted({sighting.agent for sighting in sightings})
     constant = {agent: rng.standard_normal(3) for agent in agents}
     arrived = []
-    for each in sightings:
+    for sighting in sightings:
         drawn, lost = rng.standard_normal(3), rng.random() < errors.loss
         if lost:
             continue
-        if each.navigation is not None:
-            own = constant[each.agent]
-            dx, dy = errors.position_m * drawn[:2] + errors.constant_m * own[:2]
+        if sighting.navigation is not None:
+            fixed = constant[sighting.agent]
+            dx, dy = errors.position_m * drawn[:2] + errors.constant_m * fixed[:2]
             turned = pose(0, 0, 0, float(np.radians(errors.heading_deg) * drawn[2]))
-            off = each.world_from_agent @ turned
-            off[:2, 3] = each.world_from_agent[:2, 3] + (dx, dy)
-            clock_s = each.time_s + errors.clock_s * float(own[2])
-            each = replace(each, world_from_agent=off, time_s=clock_s, navigation=errors.navigation)
-        arrived.append(each)
+            off = sighting.world_from_agent @ turned
+            off[:2, 3] = sighting.world_from_agent[:2, 3] + (dx, dy)
+            clock_s = sighting.time_s + errors.clock_s * float(fixed[2])
+            sighting = replace(sighting, world_from_agent=off, time_s=clock_s, navigation=errors.navigation)
+        arrived.append(sighting)
     return arrived
 
 
-SCORE = 0.1  # lowest score of a detection that an agent tells of
-EXACT = Navigation(0.01, 0.001)
+SCORE = 0.1  # lowest score of a detection that an agent sends
+EXACT = Navigation(0.01, 0.001)  # [m], [rad]
 CAR = "Car"
 
 
 @dataclass(frozen=True)
 class Truth:
-    """Cars at one spin, world frame: those that the sensors could see, and neutral ones."""
+    """Cars at one spin, world frame: targets, which the sensors could find, and neutral ones."""
 
     targets: Boxes
     neutral: Boxes
@@ -97,7 +97,7 @@ class Truth:
 
 @dataclass(frozen=True)
 class SightedScene:
-    """The sightings of all agents in one scene, in the order of their spins, and the truth at each spin."""
+    """The sightings of all agents in one scene, in the order of their spins, and the ground truth at each spin."""
 
     sightings: tuple[Sighting, ...]
     spin: tuple[int, ...]  # of each sighting
@@ -108,45 +108,45 @@ class SightedScene:
 def read_scenes(data: Dataset, progress: Report = ignore_progress) -> dict[str, SightedScene]:
     """Return the scenes of a dataset by name: detections by the package's networks, posts segmented from sweeps.
 
-    Cars count as targets where one of the sensors has them in its network's range with five returns or more.
+    Cars are targets where they have five returns or more of a sensor, within the range of its network.
     """
     vehicles = resolve_network(OBJECTS, None)
     find, road = road_detector(data, SCORE), load_road_network().config
     rows: dict[str, list[tuple[int, Sighting]]] = {}
-    there: dict[tuple[str, int], dict[str, tuple[Boxes, bool]]] = {}
+    tracks: dict[tuple[str, int], dict[str, tuple[Boxes, bool]]] = {}
     times: dict[tuple[str, int], float] = {}
     for number, key in enumerate(data.keys):
         frame = data.frame(number)
         if kind_of(key.agent) == POLE:
             found = find(number)
             found = replace(found, label=np.full(len(found), CAR))
-            own = found.transform(inverse(frame.world_from_agent))
-            told = Sighting(key.agent, key.time_s, frame.world_from_agent, own)
+            cars = found.transform(inverse(frame.world_from_agent))
+            sighting = Sighting(key.agent, key.time_s, frame.world_from_agent, cars)
         else:
             lidar = choose_lidar(frame)
             agent_from_lidar = frame.agent_from_sensor[lidar]
             found = detect(vehicles, frame.lidar[lidar], score_threshold=SCORE)
             posts = segment_posts(transform_points(agent_from_lidar, frame.lidar[lidar][:, :3]), 0.0)
-            own = found[found.label == CAR].transform(agent_from_lidar)
-            told = Sighting(key.agent, key.time_s, frame.world_from_agent, own, posts, EXACT)
-        rows.setdefault(key.scene, []).append((key.index, told))
+            cars = found[found.label == CAR].transform(agent_from_lidar)
+            sighting = Sighting(key.agent, key.time_s, frame.world_from_agent, cars, posts, EXACT)
+        rows.setdefault(key.scene, []).append((key.index, sighting))
         times[key.scene, key.index] = key.time_s
-        seen = there.setdefault((key.scene, key.index), {})
+        seen = tracks.setdefault((key.scene, key.index), {})
         _add_truth(seen, frame, road if kind_of(key.agent) == POLE else vehicles.config)
         progress(number + 1, len(data), "")
     return {
         scene: SightedScene(
-            tuple(told for _, told in own),
-            tuple(spin for spin, _ in own),
-            {spin: _truth(seen) for (name, spin), seen in there.items() if name == scene},
+            tuple(sighting for _, sighting in sightings),
+            tuple(spin for spin, _ in sightings),
+            {spin: _truth(seen) for (name, spin), seen in tracks.items() if name == scene},
             {spin: time_s for (name, spin), time_s in times.items() if name == scene},
         )
-        for scene, own in rows.items()
+        for scene, sightings in rows.items()
     }
 
 
 def _add_truth(seen: dict[str, tuple[Boxes, bool]], frame: Frame, config: SecondConfig) -> None:
-    """Add the cars of a frame by track, world frame, each with whether some agent so far could find it."""
+    """Add the cars of a frame to `seen`, by track, world frame; True for those that some agent so far could find."""
     truth = ground_truth(frame, config)
     for row in np.flatnonzero((truth.boxes.label == CAR) | truth.lookalike):
         track = str(frame.annotations.track[row])
@@ -174,7 +174,7 @@ RECIPE = {
     "poles": "all",
     "vehicle_rig": "kitti_lidar",
 }
-WINDOW_S = 1.5  # of the spins that are averaged
+WINDOW_S = 1.5  # time before a spin whose sightings are averaged
 SPINS = (3, 7, 11)  # at which labels are evaluated
 NAIVE, WEIGHTED, GRAPH = "naive", "weighted by uncertainty", "pose graph"
 ARMS = (NAIVE, WEIGHTED, GRAPH)
@@ -189,7 +189,7 @@ KNOBS: Mapping[str, Mapping[float, Errors]] = {
     "clock offset [s]": {size: Errors(clock_s=size) for size in (0.0, 0.2, 0.4)},
 }
 JOINT = Errors(position_m=0.5, heading_deg=2.0)
-CORRECTED: Mapping[str, Errors] = {  # errors whose rest after the pose graph is measured
+CORRECTED: Mapping[str, Errors] = {  # errors of which the residuals after the pose graph are measured
     BOTH: JOINT,
     "position .5 m, constant": Errors(constant_m=0.5),
     "clock .2 s": Errors(clock_s=0.2),
@@ -212,9 +212,9 @@ class Point:
 
 @dataclass(frozen=True)
 class Snapped:
-    """Labels without errors of poses before and after their headings are snapped to the map."""
+    """Labels at exact poses, before and after their headings are snapped to the map."""
 
-    matched: int  # labels of cars
+    matched: int  # labels that match a car
     heading_deg: tuple[float, float]  # mean error of their heading, before and after
     reversed_: tuple[int, int]  # labels that face the wrong way, before and after
     ap50: tuple[float, float]
@@ -222,7 +222,7 @@ class Snapped:
 
 @dataclass(frozen=True)
 class Residual:
-    """Mean absolute errors of vehicles over their sightings."""
+    """Mean absolute errors of the poses and times of vehicles' sightings."""
 
     position_cm: float
     heading_deg: float
@@ -238,17 +238,17 @@ class RoadAverageResult(Record):
     joint: Mapping[str, Point]  # at `JOINT`, by arm
     clean: Mapping[str, float]  # without errors, by arm
     snapped: Snapped
-    residuals: Mapping[str, tuple[Residual, Residual]]  # of `CORRECTED` as stated and after the pose graph
+    residuals: Mapping[str, tuple[Residual, Residual]]  # by name in `CORRECTED`: as stated, and after the pose graph
     provenance: Provenance
 
     @property
     def won_back(self) -> float:
-        """Return the share of what naive averaging loses at `JOINT` that the pose graph wins back."""
+        """Return the share of naive averaging's loss at `JOINT` that the pose graph wins back."""
         lost = self.clean[NAIVE] - self.joint[NAIVE].mean
         return (self.joint[GRAPH].mean - self.joint[NAIVE].mean) / lost
 
     def sentences(self) -> list[str]:
-        """Return the main figures in words."""
+        """Return the main numbers as sentences."""
         clean = ", ".join(f"{arm} {self.clean[arm]:.3f}" for arm in ARMS)
         joint = ", ".join(f"{arm} {self.joint[arm].mean:.3f}" for arm in ARMS)
         return [
@@ -257,7 +257,7 @@ class RoadAverageResult(Record):
         ]
 
     def pictures(self) -> dict[str, bytes]:
-        """Return the chart of all knobs as PNG, by file name."""
+        """Return the chart of all errors and sizes as a PNG, by file name."""
         panels = {
             knob: {arm: [(p.size, p.mean, min(p.ap50), max(p.ap50)) for p in self.knobs[knob][arm]] for arm in ARMS}
             for knob in KNOBS
@@ -266,7 +266,7 @@ class RoadAverageResult(Record):
 
 
 def evaluate_road_average(out: Path, progress: Report = ignore_progress) -> tuple[RoadAverageResult, dict[str, bytes]]:
-    """Record scenes into `out`, detect in all frames; return AP50 of the averaged labels under each error, pictures."""
+    """Record scenes into `out`, and detect in all frames; return the results, and PNG files by name."""
     record(EmbeddedSource(parse_config(Recipe, RECIPE, "road-average")), out / "data")
     data = Dataset.open(out / "data")
     town = data.town()
@@ -294,10 +294,10 @@ def evaluate_road_average(out: Path, progress: Report = ignore_progress) -> tupl
 def fuse(sightings: list[Sighting], posts: np.ndarray, at_s: float, arm: str) -> RoadAverage:
     """Return the road average at `at_s` by one of `ARMS` from the sightings of a window."""
     if arm == NAIVE:
-        sightings = [replace(each, navigation=None) for each in sightings]
+        sightings = [replace(sighting, navigation=None) for sighting in sightings]
     elif arm == GRAPH:
         sightings = correct_poses(sightings, posts, at_s)
-    return average_boxes([report_boxes(each) for each in sightings], at_s)
+    return average_boxes([report_boxes(sighting) for sighting in sightings], at_s)
 
 
 def _point(
@@ -315,7 +315,7 @@ def _precision(scenes: Mapping[str, SightedScene], errors: Errors, arm: str, pos
         for spin in SPINS:
             at_s = scene.time_s[spin]
             late_s = at_s - errors.latency_s
-            slack_s = 3 * errors.clock_s  # messages of the spins before bear other times where clocks are off
+            slack_s = 3 * errors.clock_s  # time stamps have the errors of the clocks
             window = [s for s in arrived if at_s - WINDOW_S - slack_s - 1e-6 <= s.time_s <= late_s + slack_s + 1e-6]
             found.append(fuse(window, posts, at_s, arm).boxes)
             targets.append(scene.truth[spin].targets)
@@ -324,7 +324,7 @@ def _precision(scenes: Mapping[str, SightedScene], errors: Errors, arm: str, pos
 
 
 def _correct(scenes: Mapping[str, SightedScene], errors: Errors, posts: np.ndarray) -> tuple[Residual, Residual]:
-    """Return the errors of vehicles, of which none is a loss, as stated and after the pose graph."""
+    """Return the residuals of vehicles as stated and after the pose graph; `errors` loses no messages."""
     true: list[Sighting] = []
     stated: list[Sighting] = []
     corrected: list[Sighting] = []
@@ -340,9 +340,9 @@ def _correct(scenes: Mapping[str, SightedScene], errors: Errors, posts: np.ndarr
     return measure_residual(true, stated), measure_residual(true, corrected)
 
 
-def measure_residual(true: Sequence[Sighting], told: Sequence[Sighting]) -> Residual:
-    """Return the mean absolute errors of the poses and times of vehicles, in `told` as compared with `true`."""
-    pairs = [(a, b) for a, b in zip(true, told, strict=True) if a.navigation is not None]
+def measure_residual(true: Sequence[Sighting], stated: Sequence[Sighting]) -> Residual:
+    """Return the mean absolute errors of the poses and times of vehicles as `stated`, against `true`."""
+    pairs = [(a, b) for a, b in zip(true, stated, strict=True) if a.navigation is not None]
     off_m = [np.linalg.norm((b.world_from_agent - a.world_from_agent)[:2, 3]) for a, b in pairs]
     turned = [abs(yaw_of(inverse(a.world_from_agent) @ b.world_from_agent)) for a, b in pairs]
     late_s = [abs(b.time_s - a.time_s) for a, b in pairs]
@@ -356,19 +356,19 @@ def _snap(scenes: Mapping[str, SightedScene], context: MapContext) -> Snapped:
         for spin in SPINS:
             at_s = scene.time_s[spin]
             window = [s for s in scene.sightings if at_s - WINDOW_S - 1e-6 <= s.time_s <= at_s + 1e-6]
-            average = average_boxes([report_boxes(each) for each in window], at_s)
+            average = average_boxes([report_boxes(sighting) for sighting in window], at_s)
             after = snap_to_map(average.boxes, average.velocity, context)
             truth = scene.truth[spin]
             target = assign_targets(average.boxes, truth.targets, 0.5, "bev")
             hit = target >= 0
             yaw = truth.targets.yaw[target[hit]]
-            off.append([np.abs(wrap_angle(each.yaw[hit] - yaw)) for each in (average.boxes, after)])
-            for own, boxes in zip(labels, (average.boxes, after), strict=True):
-                own.append(boxes)
+            off.append([np.abs(wrap_angle(boxes.yaw[hit] - yaw)) for boxes in (average.boxes, after)])
+            for boxes_of, boxes in zip(labels, (average.boxes, after), strict=True):
+                boxes_of.append(boxes)
             targets.append(truth.targets)
             neutral.append(truth.neutral)
     errors = np.degrees(np.concatenate(off, axis=1))
-    first, second = (average_precision(match(own, targets, neutral, 0.5, "bev")) for own in labels)
+    first, second = (average_precision(match(boxes, targets, neutral, 0.5, "bev")) for boxes in labels)
     mean, turned = errors.mean(axis=1), (errors > 90).sum(axis=1)
     return Snapped(errors.shape[1], (float(mean[0]), float(mean[1])), (int(turned[0]), int(turned[1])), (first, second))
 
@@ -407,9 +407,9 @@ def _residuals(residuals: Mapping[str, tuple[Residual, Residual]]) -> str:
     rows = [
         [
             name,
-            *(f"{each.position_cm:.1f}" for each in pair),
-            *(f"{each.heading_deg:.2f}" for each in pair),
-            *(f"{each.clock_ms:.0f}" for each in pair),
+            *(f"{residual.position_cm:.1f}" for residual in pair),
+            *(f"{residual.heading_deg:.2f}" for residual in pair),
+            *(f"{residual.clock_ms:.0f}" for residual in pair),
         ]
         for name, pair in residuals.items()
     ]

@@ -1,4 +1,7 @@
-"""The trained road detector in towns that it was not trained in, at the threshold fixed in those it was."""
+"""Recall and precision of the road detector in towns that it was not trained in.
+
+The score threshold of its labels was fixed on scenes of the towns in which it was trained.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -56,15 +59,19 @@ Views = Mapping[Spin, Mapping[int, RoadView]]
 
 @dataclass(frozen=True)
 class RoadLabels:
-    """Numbers of labels by single poles; those of the ideal detector are `beyond`, `missed`, `coarse` and `exact`."""
+    """Numbers of labels that vehicles get from single poles, by the road detector and by an ideal one.
 
-    sweeps: int  # of vehicles, counted for each pole that is near
-    beyond: int  # labels of the ideal detector outside the field of the trained one
-    missed: int  # inside, without a box of the trained one at the bird's-eye IoU `FOUND`
+    `beyond`, `missed`, `coarse` and `exact` are the labels of the ideal detector, `other` and `false` some of the
+    trained one.
+    """
+
+    sweeps: int  # of vehicles, once for each pole within `NEAR_M`
+    beyond: int  # outside the field of the trained detector
+    missed: int  # inside it, without a box of the trained detector at the bird's-eye IoU `FOUND`
     coarse: int  # found, at a 3D IoU below `EXACT`
     exact: int  # found, at a 3D IoU of `EXACT` or more
-    other: int  # labels of the trained detector on objects that the ideal one does not label, at `FOUND`
-    false: int  # and on none, parts of trucks and buses included
+    other: int  # on objects that the ideal detector does not label
+    false: int  # on no object at the bird's-eye IoU `FOUND`, parts of trucks and buses included
 
     @property
     def ideal(self) -> int:
@@ -73,7 +80,7 @@ class RoadLabels:
 
 
 def measure_road_labels(folder: Path) -> RoadLabels:
-    """Record vehicles and poles into `folder`; return the labels that each pole alone gives the vehicles near it."""
+    """Record vehicles and poles into `folder`; return the numbers of labels that vehicles get from each pole alone."""
     record(EmbeddedSource(parse_config(Recipe, dict(RECIPE), "labels")), folder)
     data = Dataset.open(folder)
     grouped = group_frames(data, folder.name)
@@ -86,32 +93,35 @@ def measure_road_labels(folder: Path) -> RoadLabels:
 
 
 def count_labels(split: Frames, frames: Sequence[int], pole: int, config: SecondConfig) -> tuple[int, ...]:
-    """Return the fields of `RoadLabels` of the sensor on a pole, for vehicles' frames of a split and their network."""
+    """Return the fields of `RoadLabels` for the sensor on a pole and vehicles' frames of a split.
+
+    `config`: of the vehicles' network, whose range bounds the labels.
+    """
     spins = {_spin(split, i) for i in frames}
-    trained, ideal = (road_views(split, [pole], own, spins) for own in (True, False))
+    trained, ideal = (road_views(split, [pole], is_trained, spins) for is_trained in (True, False))
     field = _keep_field(split, ideal)
     beyond = missed = coarse = exact = other = false = 0
     for i in frames:
-        every, inside, told = (_label(split, i, views, config) for views in (ideal, field, trained))
-        graded = grade_labels(inside, told)
-        beyond += len(every) - len(inside)
+        ideal_labels, in_field, found = (_label(split, i, views, config) for views in (ideal, field, trained))
+        graded = grade_labels(in_field, found)
+        beyond += len(ideal_labels) - len(in_field)
         missed, coarse, exact = missed + graded[0], coarse + graded[1], exact + graded[2]
-        rest = _find_others(told, every)
+        rest = _find_others(found, ideal_labels)
         wrong = _find_others(rest, _list_objects(split, i, config))
         other, false = other + len(rest) - len(wrong), false + len(wrong)
     return len(frames), beyond, missed, coarse, exact, other, false
 
 
-def grade_labels(ideal: Boxes, told: Boxes) -> tuple[int, int, int]:
-    """Return how many of the `ideal` labels `told` misses, and finds coarsely and exactly; both in one frame."""
-    found = int((assign_targets(_sure(told), ideal, FOUND, "bev") >= 0).sum())
-    exact = int((assign_targets(_sure(told), ideal, EXACT) >= 0).sum())
+def grade_labels(ideal: Boxes, labels: Boxes) -> tuple[int, int, int]:
+    """Return how many of the `ideal` labels are missed, coarse and exact in `labels`; boxes are in one frame."""
+    found = int((assign_targets(_sure(labels), ideal, FOUND, "bev") >= 0).sum())
+    exact = int((assign_targets(_sure(labels), ideal, EXACT) >= 0).sum())
     return len(ideal) - found, found - exact, exact
 
 
-def _find_others(told: Boxes, known: Boxes) -> Boxes:
-    """Return the boxes that find none of the `known`."""
-    return told[assign_targets(_sure(told), known, FOUND, "bev") < 0]
+def _find_others(boxes: Boxes, known: Boxes) -> Boxes:
+    """Return the `boxes` that match none of the `known` ones."""
+    return boxes[assign_targets(_sure(boxes), known, FOUND, "bev") < 0]
 
 
 def _list_objects(split: Frames, i: int, config: SecondConfig) -> Boxes:
@@ -123,6 +133,7 @@ def _list_objects(split: Frames, i: int, config: SecondConfig) -> Boxes:
 
 
 def _sure(boxes: Boxes) -> Boxes:
+    """Return the boxes with scores of 1."""
     return replace(boxes, score=np.ones(len(boxes)))
 
 
@@ -131,18 +142,20 @@ def _spin(split: Frames, i: int) -> Spin:
 
 
 def _label(split: Frames, i: int, views: Views, config: SecondConfig) -> Boxes:
-    """Return the labels by road sensors alone of a vehicle's frame, in its network's frame and range."""
-    frame, told = split.data.frame(i), [*views.get(_spin(split, i), {}).values()]
-    sample = label_sample(frame, Boxes.empty(), told, config, choose_lidar(frame), DatasetGround(split.data).relief)
+    """Return a vehicle's labels by road sensors alone, in its network's frame and range."""
+    frame, views_here = split.data.frame(i), [*views.get(_spin(split, i), {}).values()]
+    sample = label_sample(
+        frame, Boxes.empty(), views_here, config, choose_lidar(frame), DatasetGround(split.data).relief
+    )
     return sample.boxes[in_range(sample.boxes, config)]
 
 
 def _keep_field(split: Frames, views: Views) -> Views:
-    """Return the views with those boxes alone that lie in the field of the trained road detector."""
+    """Return the views with only those boxes that lie in the field of the trained road detector."""
     config = load_road_network().config
     kept: dict[Spin, dict[int, RoadView]] = {}
-    for spin, own in views.items():
-        for pole, view in own.items():
+    for spin, by_pole in views.items():
+        for pole, view in by_pole.items():
             (number,) = (i for i in split.poles[pole] if _spin(split, i) == spin)
             frame = split.data.frame(number)
             boxes = view.boxes.transform(inverse(frame.world_from_sensor(choose_lidar(frame))))
@@ -150,12 +163,11 @@ def _keep_field(split: Frames, views: Views) -> Views:
     return kept
 
 
-OVERLAP = 0.5  # bird's-eye IoU of a car that was found
+OVERLAP = 0.5  # least bird's-eye IoU with a detection for a car to count as found
 WITHIN_M = 30.0  # horizontal distance of a car from the pole
-LEAST_PRECISION = (
-    0.98  # on the validation towns, by which the threshold was fixed: three points above the aim elsewhere
-)
-BINS_M = tuple(range(0, 41, 5))  # of distance, for the recall of each
+# Precision on the validation towns by which the threshold was fixed: three points above the aim in other towns.
+LEAST_PRECISION = 0.98
+BINS_M = tuple(range(0, 41, 5))  # limits of the bins of distance for recall
 SHARED = {"cavs": 0, "poles": "all", "every_s": 6.0, "spins_per_scene": 2}
 VALIDATION: Mapping[str, Mapping[str, Any]] = {
     "suburb": {"seed": 7202, "scenes": 8},
@@ -177,7 +189,7 @@ class TownScore:
     town: str
     seen: bool  # whether the detector was trained in this town, on other scenes
     frames: int
-    cars: int  # within `WITHIN_M` and with `MIN_RETURNS` of that pole
+    cars: int  # within `WITHIN_M` of a pole and with `MIN_RETURNS` of its sensor
     recall: Estimate  # intervals over scenes
     detections: int  # within `WITHIN_M`, true or false
     precision: Estimate
@@ -191,23 +203,23 @@ class RoadDetectorResult(Record):
     threshold: float  # lowest score of a label, see `flcav.fusion.road`
     fitted: float  # lowest threshold with `LEAST_PRECISION` on the validation towns, as computed here
     towns: tuple[TownScore, ...]
-    labels: RoadLabels  # that vehicles get
+    labels: RoadLabels
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return the scores in words, a sentence per town."""
+        """Return a sentence with the scores of each town."""
         return [
-            f"{each.town}{' (trained there)' if each.seen else ''}: {each.cars} cars within {WITHIN_M:g} m, recall "
-            f"{each.recall.describe()}, precision {each.precision.describe()}"
-            for each in self.towns
+            f"{score.town}{' (trained there)' if score.seen else ''}: {score.cars} cars within {WITHIN_M:g} m, recall "
+            f"{score.recall.describe()}, precision {score.precision.describe()}"
+            for score in self.towns
         ]
 
     def pictures(self) -> dict[str, bytes]:
-        """Return the picture of recall against distance as PNG, by file name."""
+        """Return the chart of recall against distance as a PNG, by file name."""
         lines = {
-            each.town: [(found / cars if cars else None) for cars, found in each.by_distance] for each in self.towns
+            score.town: [(found / cars if cars else None) for cars, found in score.by_distance] for score in self.towns
         }
-        unseen = [each.town for each in self.towns if not each.seen]
+        unseen = [score.town for score in self.towns if not score.seen]
         return {"recall.png": style.png(draw_recall(BINS_M, lines, unseen, WITHIN_M))}
 
 
@@ -225,7 +237,7 @@ class _Frames:
 def evaluate_road_detector(
     out: Path, progress: Report = ignore_progress
 ) -> tuple[RoadDetectorResult, dict[str, bytes]]:
-    """Record roadside frames of validation and test towns into `out`; return the detector's scores, and pictures."""
+    """Record roadside frames of all towns into `out`; return the detector's scores, and PNG files by name."""
     towns = {**VALIDATION, **TESTS}
     import_map(IMPORTED, out / "towns")
     frames: dict[str, _Frames] = {}
@@ -239,7 +251,7 @@ def evaluate_road_detector(
     results = RoadDetectorResult(
         threshold=THRESHOLD,
         fitted=fit_threshold([frames[town] for town in VALIDATION]),
-        towns=tuple(score_town(town, town in VALIDATION, each) for town, each in frames.items()),
+        towns=tuple(score_town(town, town in VALIDATION, frames_of_town) for town, frames_of_town in frames.items()),
         labels=measure_road_labels(out / "labels"),
         provenance=provenance(),
     )
@@ -247,7 +259,7 @@ def evaluate_road_detector(
 
 
 def detect_frames(data: Dataset, lowest: float = 0.1) -> _Frames:
-    """Return detections of score `lowest` or more and ground truth of all frames of poles.
+    """Return detections of score `lowest` or more, and the ground truth, in all frames of poles.
 
     Cars within `WITHIN_M` of the pole with `MIN_RETURNS` are targets; other cars, trucks and buses are neutral.
     """
@@ -255,23 +267,23 @@ def detect_frames(data: Dataset, lowest: float = 0.1) -> _Frames:
     for number, key in enumerate(data.keys):
         if kind_of(key.agent) != POLE:
             continue
-        truth, place = data.frame(number).annotations, data.world_from_agent(number)[:2, 3]
-        near = np.linalg.norm(truth.boxes.center[:, :2] - place, axis=1) <= WITHIN_M
+        truth, position = data.frame(number).annotations, data.world_from_agent(number)[:2, 3]
+        near = np.linalg.norm(truth.boxes.center[:, :2] - position, axis=1) <= WITHIN_M
         car = np.isin(truth.boxes.label, CARS)
         target = car & near & (truth.returns >= MIN_RETURNS)
         rows.scene.append(key.scene)
         rows.found.append(find(number))
         rows.targets.append(truth.boxes[target])
         rows.neutral.append(truth.boxes[(car & ~target) | np.isin(truth.boxes.label, list(LOOKALIKE))])
-        rows.place.append(place)
+        rows.place.append(position)
     return rows
 
 
 def fit_threshold(towns: Sequence[_Frames]) -> float:
-    """Return the lowest score with a precision of `LEAST_PRECISION` among detections within `WITHIN_M`; else 1."""
-    found = [near for each in towns for near in _near(each, 0.0)]
-    targets = [boxes for each in towns for boxes in each.targets]
-    matches = match(found, targets, [boxes for each in towns for boxes in each.neutral], OVERLAP, "bev")
+    """Return the lowest score at which detections within `WITHIN_M` have `LEAST_PRECISION`; 1 where none has."""
+    found = [near for frames in towns for near in _near(frames, 0.0)]
+    targets = [boxes for frames in towns for boxes in frames.targets]
+    matches = match(found, targets, [boxes for frames in towns for boxes in frames.neutral], OVERLAP, "bev")
     precision = np.cumsum(matches.hit) / np.arange(1, len(matches.hit) + 1)
     good = np.flatnonzero(precision >= LEAST_PRECISION)
     return float(matches.score[good[-1]]) if len(good) else 1.0
@@ -279,12 +291,12 @@ def fit_threshold(towns: Sequence[_Frames]) -> float:
 
 def score_town(town: str, seen: bool, frames: _Frames, threshold: float = THRESHOLD) -> TownScore:
     """Return recall and precision at the threshold, with intervals over scenes."""
-    every = _above(frames, threshold)
-    matches = match(every, frames.targets, frames.neutral, OVERLAP, "bev")
-    hits = np.bincount(matches.frame[matches.hit], minlength=len(every))
+    detections = _above(frames, threshold)
+    matches = match(detections, frames.targets, frames.neutral, OVERLAP, "bev")
+    hits = np.bincount(matches.frame[matches.hit], minlength=len(detections))
     near = match(_near(frames, threshold), frames.targets, frames.neutral, OVERLAP, "bev")
-    right = np.bincount(near.frame[near.hit], minlength=len(every))
-    told = np.bincount(near.frame, minlength=len(every))
+    right = np.bincount(near.frame[near.hit], minlength=len(detections))
+    counts_near = np.bincount(near.frame, minlength=len(detections))
     cars = np.array([len(boxes) for boxes in frames.targets])
 
     def share(above: NDArray[np.int64], below: NDArray[np.int64], name: str) -> Estimate:
@@ -299,17 +311,17 @@ def score_town(town: str, seen: bool, frames: _Frames, threshold: float = THRESH
     return TownScore(
         town=town,
         seen=seen,
-        frames=len(every),
+        frames=len(detections),
         cars=int(cars.sum()),
         recall=share(hits, cars, "recall"),
-        detections=int(told.sum()),
-        precision=share(right, told, "precision"),
-        by_distance=_by_distance(frames, every),
+        detections=int(counts_near.sum()),
+        precision=share(right, counts_near, "precision"),
+        by_distance=_by_distance(frames, detections),
     )
 
 
 def _near(frames: _Frames, threshold: float) -> list[Boxes]:
-    """Return the detections of each frame with the threshold's score within `WITHIN_M` of the pole."""
+    """Return the detections of each frame that score `threshold` or more, within `WITHIN_M` of the pole."""
     return [
         boxes[np.linalg.norm(boxes.center[:, :2] - place, axis=1) <= WITHIN_M]
         for boxes, place in zip(_above(frames, threshold), frames.place, strict=True)
@@ -326,9 +338,9 @@ def _by_distance(frames: _Frames, found: Sequence[Boxes]) -> tuple[tuple[int, in
     for boxes, targets, place in zip(found, frames.targets, frames.place, strict=True):
         for low, high in pairwise(BINS_M):
             apart = np.linalg.norm(targets.center[:, :2] - place, axis=1)
-            own = targets[(apart >= low) & (apart < high)]
-            hits = match([boxes], [own], [Boxes.empty()], OVERLAP, "bev").hit.sum()
-            counts[:, BINS_M.index(low)] += len(own), hits
+            targets_in_bin = targets[(apart >= low) & (apart < high)]
+            hits = match([boxes], [targets_in_bin], [Boxes.empty()], OVERLAP, "bev").hit.sum()
+            counts[:, BINS_M.index(low)] += len(targets_in_bin), hits
     return tuple((int(cars), int(hits)) for cars, hits in counts.T)
 
 
@@ -336,23 +348,23 @@ def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
     """Return Markdown by name: towns, distances, labels."""
     towns = [
         [
-            f"{each.town}{' (trained there)' if each.seen else ''}",
-            each.frames,
-            each.cars,
-            each.recall.describe(),
-            each.detections,
-            each.precision.describe(),
+            f"{score.town}{' (trained there)' if score.seen else ''}",
+            score.frames,
+            score.cars,
+            score.recall.describe(),
+            score.detections,
+            score.precision.describe(),
         ]
-        for each in results.towns
+        for score in results.towns
     ]
     header = ("town", "frames", "cars", "recall", f"detections within {WITHIN_M:g} m", "precision")
     near = [(low, high) for low, high in pairwise(BINS_M) if high <= WITHIN_M]
     rows = [
         [
-            each.town,
-            *(f"{found / cars:.2f} of {cars}" if cars else "none" for cars, found in each.by_distance[: len(near)]),
+            score.town,
+            *(f"{found / cars:.2f} of {cars}" if cars else "none" for cars, found in score.by_distance[: len(near)]),
         ]
-        for each in results.towns
+        for score in results.towns
     ]
     return {
         "towns": format_table(header, towns),
@@ -362,7 +374,7 @@ def detector_tables(results: RoadDetectorResult) -> dict[str, str]:
 
 
 def _labels(labels: RoadLabels) -> str:
-    """Return what becomes of the ideal detector's labels with the trained one."""
+    """Return the table of `RoadLabels`."""
     parts = {
         "all": labels.ideal,
         "beyond the field of the trained detector": labels.beyond,

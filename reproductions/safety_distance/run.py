@@ -1,9 +1,9 @@
 """Safety distance: a margin by the calibrated uncertainty of perception, against a fixed one, in closed loop.
 
-The article names it as future work. A driver keeps a distance free around what it sees and expects: fixed, or a
-multiple of the standard deviation of predicted positions, which grows with the time ahead and is another for standing,
-driving and walking road users. Every setting drives the same scenarios and seeds with the same errors of perception
-(`driving.errors`), so that settings are paired.
+The article names it as future work. A driver keeps a margin free around the road users that it perceives and predicts.
+The margin is fixed, or a multiple of the standard deviation of predicted positions, which grows with the time ahead and
+differs between standing, driving and walking road users. Every setting drives the same scenarios and seeds with the
+same errors of perception (`driving.errors`), so that settings are paired.
 """
 
 from collections.abc import Mapping, Sequence
@@ -31,7 +31,7 @@ from flcav.storage.records import Record
 FIXED_M = (0.0, 0.4, 0.8, 1.2, 1.8)
 SIGMAS = (0.25, 0.5, 1.0, 2.0)
 SCENARIOS, SEEDS, LASTS_S = 16, 3, 12.0
-FIRST_SEED = 301  # drives with the first ones were looked at before forecasts were mended
+FIRST_SEED = 301  # drives with lower seeds were inspected while the forecasts were improved
 
 
 @dataclass(frozen=True)
@@ -40,19 +40,19 @@ class MarginResult:
 
     name: str
     uncertain: bool  # whether the margin is by uncertainty
-    size: float  # of the fixed margin [m], or the multiple of the standard deviation
-    faults: int  # collisions at fault
-    near_share: float  # of the time with less than 1.5 s to collision
-    hard_brakes: float  # a drive
+    size: float  # fixed margin [m], or multiple of the standard deviation
+    faults: int  # collisions at fault, in all drives
+    near_share: float  # share of the time with less than 1.5 s to collision
+    hard_brakes: float  # mean number per drive
     mean_speed: float  # [m/s]
     score: float
 
 
 @dataclass(frozen=True)
 class SafetyDistance(Record):
-    """The trade-off of fixed and uncertain margins; differences are of the pair nearest in mean speed."""
+    """Measures of margins that are fixed or by uncertainty, and differences of the pair nearest in mean speed."""
 
-    drives: int  # of each setting
+    drives: int  # per setting
     settings: tuple[MarginResult, ...]
     compared: tuple[str, str]  # the fixed margin, and the one by uncertainty
     differences: Mapping[str, Estimate]  # the second less the first, by field of a drive
@@ -60,14 +60,15 @@ class SafetyDistance(Record):
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return the trade-off in words."""
+        """Return the measures of each setting and the differences as sentences."""
         lines = [
-            f"{each.name}: {each.faults} collisions at fault in {self.drives} drives, {each.hard_brakes:.2f} hard "
-            f"brakes a drive, {each.near_share:.1%} of the time below 1.5 s to collision, {each.mean_speed:.2f} m/s"
-            for each in self.settings
+            f"{setting.name}: {setting.faults} collisions at fault in {self.drives} drives, {setting.hard_brakes:.2f} "
+            f"hard brakes a drive, {setting.near_share:.1%} of the time below 1.5 s to collision, "
+            f"{setting.mean_speed:.2f} m/s"
+            for setting in self.settings
         ]
-        told = ", ".join(f"{name} {gap.describe(sign=True)}" for name, gap in self.differences.items())
-        return [*lines, f"{self.compared[1]} less {self.compared[0]}: {told}"]
+        gaps = ", ".join(f"{name} {gap.describe(sign=True)}" for name, gap in self.differences.items())
+        return [*lines, f"{self.compared[1]} less {self.compared[0]}: {gaps}"]
 
     def picture(self) -> bytes:
         """Return the trade-off curve as a PNG."""
@@ -85,30 +86,30 @@ def compare_margins(
     progress: Report = ignore_progress,
     scenarios: int = SCENARIOS,
 ) -> SafetyDistance:
-    """Return the trade-off over the package's scenarios and `seeds` seeds; drives are kept in the folder `out`."""
+    """Return the results over the package's scenarios and `seeds` seeds; drives are saved in the folder `out`."""
     model = load_error_model()
     settings = list_settings()
     drawn = range(FIRST_SEED, FIRST_SEED + seeds)
     pairs = [(scenario, seed) for scenario in spread_scenarios(scenarios) for seed in drawn]
-    tasks = [DriveJob(*pair, loop=Loop(own, LASTS_S)) for own in settings.values() for pair in pairs]
+    tasks = [DriveJob(*pair, loop=Loop(driver, LASTS_S)) for driver in settings.values() for pair in pairs]
     drives = run_jobs(tasks, Sensed("model", model), jobs, progress, out / "drives.jsonl")
     by_name = {name: drives[i * len(pairs) : (i + 1) * len(pairs)] for i, name in enumerate(settings)}
     return summarise_margins(by_name, model)
 
 
 def list_settings() -> dict[str, DriverSettings]:
-    """Return the margins that are compared, by name: fixed ones, and multiples of the standard deviation."""
+    """Return the compared margins by name: fixed ones, and multiples of the standard deviation."""
     fixed = {f"fixed {size:g} m": DriverSettings(size) for size in FIXED_M}
     return fixed | {f"{size:g} sigma": DriverSettings(0.0, size) for size in SIGMAS}
 
 
 def summarise_margins(drives: Mapping[str, Sequence[DriveResult]], model: ErrorModel) -> SafetyDistance:
-    """Return the trade-off of the drives under each of `list_settings`, which are of the same scenarios and seeds."""
+    """Return the results from the drives under each of `list_settings`, all of the same scenarios and seeds."""
     settings = list_settings()
-    results = tuple(summarise(name, settings[name], own) for name, own in drives.items())
+    results = tuple(summarise(name, settings[name], of_setting) for name, of_setting in drives.items())
     compared = find_pair(results)
     first, second = (drives[name] for name in compared)
-    names = [own.scenario for own in first]
+    names = [drive.scenario for drive in first]
     fields = ("near_share", "hard_brakes", "mean_speed", "faults", "score")
     return SafetyDistance(
         drives=len(first),
@@ -124,13 +125,13 @@ def summarise(name: str, settings: DriverSettings, drives: Sequence[DriveResult]
     """Return the measures of one setting."""
 
     def mean(field: str) -> float:
-        return float(np.mean([getattr(own, field) for own in drives]))
+        return float(np.mean([getattr(drive, field) for drive in drives]))
 
     return MarginResult(
         name=name,
         uncertain=settings.sigmas > 0,
         size=settings.sigmas or settings.margin_m,
-        faults=sum(own.faults for own in drives),
+        faults=sum(drive.faults for drive in drives),
         near_share=mean("near_share"),
         hard_brakes=mean("hard_brakes"),
         mean_speed=mean("mean_speed"),
@@ -149,14 +150,14 @@ def safety_tables(results: SafetyDistance) -> dict[str, str]:
     """Return Markdown by name: settings, differences."""
     rows = [
         [
-            each.name,
-            str(each.faults),
-            f"{each.hard_brakes:.2f}",
-            f"{100 * each.near_share:.1f} %",
-            f"{each.mean_speed:.2f}",
-            f"{each.score:.3f}",
+            setting.name,
+            str(setting.faults),
+            f"{setting.hard_brakes:.2f}",
+            f"{100 * setting.near_share:.1f} %",
+            f"{setting.mean_speed:.2f}",
+            f"{setting.score:.3f}",
         ]
-        for each in results.settings
+        for setting in results.settings
     ]
     columns = ("margin", "collisions at fault", "hard brakes a drive", "time below 1.5 s", "mean speed [m/s]", "score")
     gaps = [[name, gap.describe(sign=True)] for name, gap in results.differences.items()]
@@ -170,7 +171,7 @@ COLOURS = (style.MUTED, style.BLUE)
 
 @style.styled
 def draw_trade_off(lines: Mapping[str, Sequence[tuple[float, float, float, float]]]) -> Figure:
-    """Return three panels against mean speed; a point is (mean speed [m/s], share near, hard brakes, collisions)."""
+    """Return three panels against mean speed; `lines`: points (mean speed [m/s], near share, hard brakes, faults)."""
     figure = style.canvas(9.0, 3.0)
     panels = figure.subplots(1, len(PANELS))
     for number, (axes, title) in enumerate(zip(panels, PANELS)):

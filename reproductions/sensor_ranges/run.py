@@ -1,8 +1,8 @@
 """Ranges of roadside LiDARs: the distance within which the road detector finds cars in the sweeps of each model.
 
-All models hang on the same poles, of towns that the detector was not trained in, and see the same traffic. They are the
-package's roadside LiDAR with fewer and more channels, and models of vehicles mounted level. A sensor's cost stands for
-its price: that of its channels, relative to sixteen.
+All models are mounted on the same poles, in towns that the detector was not trained in, and see the same traffic. They
+are the package's roadside LiDAR with fewer and more channels, and models for vehicles, mounted level. The cost of a
+sensor, a stand-in for its price, is its number of channels divided by sixteen.
 """
 
 import csv
@@ -54,16 +54,16 @@ CHEAPEST = 16  # channels of a sensor of cost 1
 
 @dataclass(frozen=True)
 class LidarModel:
-    """A LiDAR model on the poles."""
+    """A LiDAR model, the cars found in its sweeps, and its range."""
 
     name: str
     channels: int
-    found: tuple[int, ...]  # cars, in each interval of `EDGES_M`
-    range_m: float  # within which four of five cars are found; 0 where nowhere
+    found: tuple[int, ...]  # cars found, in each interval of `EDGES_M`
+    range_m: float  # distance within which four of five cars are found; 0 where nowhere
 
     @property
     def cost(self) -> float:
-        """Return the stand-in for its price."""
+        """Return the cost relative to a sensor of `CHEAPEST` channels."""
         return self.channels / CHEAPEST
 
 
@@ -71,37 +71,37 @@ class LidarModel:
 class SensorRanges(Record):
     """Recall of the road detector in the sweeps of each LiDAR model, by distance."""
 
-    sweeps: int  # of each model
-    cars: tuple[int, ...]  # that some model has returns of, in each interval of `EDGES_M`
+    sweeps: int  # per model
+    cars: tuple[int, ...]  # with enough returns of some model, in each interval of `EDGES_M`
     models: tuple[LidarModel, ...]
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return the ranges in words."""
+        """Return a sentence with the range of each model."""
         return [
-            f"{each.name}, {each.channels} channels: four of five cars are found within {each.range_m:g} m"
-            for each in self.models
+            f"{model.name}, {model.channels} channels: four of five cars are found within {model.range_m:g} m"
+            for model in self.models
         ]
 
     def sensors_csv(self) -> bytes:
-        """Return the table of sensors for `flcav place --sensors`: name, range_m, cost; without those of no range."""
+        """Return the CSV table for `flcav place --sensors`: name, range_m, cost; without models of range 0."""
         text = io.StringIO()
         rows = csv.writer(text, lineterminator="\n")
         rows.writerow(("name", "range_m", "cost"))
-        rows.writerows((each.name, f"{each.range_m:g}", f"{each.cost:g}") for each in self.models if each.range_m)
+        rows.writerows((model.name, f"{model.range_m:g}", f"{model.cost:g}") for model in self.models if model.range_m)
         return text.getvalue().encode()
 
     def picture(self) -> bytes:
-        """Return the picture of recall against distance as a PNG."""
+        """Return the chart of recall against distance as a PNG."""
         shares = {
-            each.name: [found / cars if cars else None for found, cars in zip(each.found, self.cars, strict=True)]
-            for each in self.models
+            model.name: [found / cars if cars else None for found, cars in zip(model.found, self.cars, strict=True)]
+            for model in self.models
         }
         return style.png(draw_ranges(EDGES_M, shares))
 
 
 def measure_ranges(out: Path, progress: Report = ignore_progress) -> tuple[SensorRanges, dict[str, bytes]]:
-    """Record all models on the poles of `TOWNS` into `out`; return their ranges, and files (picture, CSV) by name."""
+    """Record all models on the poles of `TOWNS` into `out`; return their ranges, and a PNG and a CSV by file name."""
     network = load_road_network()
     cars = np.zeros(len(EDGES_M) - 1, dtype=np.int64)
     found = {name: np.zeros_like(cars) for name in MODELS}
@@ -111,9 +111,9 @@ def measure_ranges(out: Path, progress: Report = ignore_progress) -> tuple[Senso
         data = Dataset.open(out / town)
         read = frame_reader(data, network.config.foreground)
         for number in range(len(data)):
-            frame, place = read(number), data.world_from_agent(number)[:2, 3]
+            frame, position = read(number), data.world_from_agent(number)[:2, 3]
             targets = list_cars(data, [(number, name) for name in MODELS])
-            apart = np.linalg.norm(targets.center[:, :2] - place, axis=1)
+            apart = np.linalg.norm(targets.center[:, :2] - position, axis=1)
             cars += np.histogram(apart, EDGES_M)[0]
             for name in MODELS:
                 boxes = detect(network, frame.lidar[name], score_threshold=THRESHOLD)
@@ -138,13 +138,13 @@ def range_tables(results: SensorRanges) -> dict[str, str]:
     """Return Markdown by name: ranges."""
     rows = [
         [
-            f"`{each.name}`",
-            each.channels,
-            *(f"{found / cars:.2f}" if cars else "" for found, cars in zip(each.found, results.cars, strict=True)),
-            f"{each.range_m:g}" if each.range_m else "none",
-            f"{each.cost:g}",
+            f"`{model.name}`",
+            model.channels,
+            *(f"{found / cars:.2f}" if cars else "" for found, cars in zip(model.found, results.cars, strict=True)),
+            f"{model.range_m:g}" if model.range_m else "none",
+            f"{model.cost:g}",
         ]
-        for each in results.models
+        for model in results.models
     ]
     header = (
         "share of cars found",

@@ -1,6 +1,6 @@
 """Statistics of LiDAR clouds: returns by range, intensities, the street ahead, and cars.
 
-Only points inside the view of a forward camera count, since KITTI's labels cover no others.
+Only points in the view of a forward camera count, since KITTI labels no others.
 """
 
 import itertools
@@ -29,17 +29,17 @@ Labelled = tuple[NDArray[np.float32], Boxes]  # points (N, 4) and cars of a fram
 
 @dataclass(frozen=True)
 class Street:
-    """Medians of the points of the street at some distance ahead."""
+    """Medians of the points of the street in one section ahead."""
 
-    ahead_m: str  # "near-far"
-    height_m: float  # sensor frame
+    ahead_m: str  # limits of the section, "near-far"
+    height_m: float  # median, sensor frame
     spread_m: float  # interquartile range of height
     intensity: float
 
 
 @dataclass(frozen=True)
 class SeenCar:
-    """A car with returns."""
+    """A labelled car with returns."""
 
     distance_m: float
     returns: int
@@ -84,10 +84,10 @@ def _ground(points: NDArray[np.float32]) -> tuple[Street, ...]:
     low = points[(np.abs(points[:, 1]) < ASIDE_M) & (points[:, 2] < LOW_M)]
     rows = []
     for near, far in itertools.pairwise(GROUND_M):
-        own = low[(low[:, 0] >= near) & (low[:, 0] < far)]
-        if len(own):
-            height, intensity = float(np.median(own[:, 2])), float(np.median(own[:, 3]))
-            spread = float(np.subtract(*np.quantile(own[:, 2], (0.75, 0.25))))
+        section = low[(low[:, 0] >= near) & (low[:, 0] < far)]
+        if len(section):
+            height, intensity = float(np.median(section[:, 2])), float(np.median(section[:, 3]))
+            spread = float(np.subtract(*np.quantile(section[:, 2], (0.75, 0.25))))
             rows.append(Street(f"{near}-{far}", height, spread, intensity))
     return tuple(rows)
 
@@ -96,11 +96,13 @@ def _cars(points: NDArray[np.float32], cars: Boxes) -> list[SeenCar]:
     """Return distance, returns, size and share of returns without intensity of each car with returns."""
     inside = points_in_boxes(points, cars)
     rows = []
-    for box, own in zip(cars.array(), inside, strict=True):
-        if own.any():
-            without = float((points[own, 3] < NO_INTENSITY).mean())
+    for box, is_inside in zip(cars.array(), inside, strict=True):
+        if is_inside.any():
+            without_intensity = float((points[is_inside, 3] < NO_INTENSITY).mean())
             length, width, height = box[3:6].round(2).tolist()
-            rows.append(SeenCar(float(np.hypot(*box[:2])), int(own.sum()), length, width, height, without))
+            rows.append(
+                SeenCar(float(np.hypot(*box[:2])), int(is_inside.sum()), length, width, height, without_intensity)
+            )
     return rows
 
 
@@ -113,7 +115,7 @@ COLOURS = (style.INK, style.BLUE, style.ORANGE)
 
 @dataclass(frozen=True)
 class CloudSeries:
-    """The series that are drawn of the clouds of one origin."""
+    """The series of the clouds of one origin, as drawn."""
 
     returns_per_range: Mapping[str, float]  # "near-far m" -> returns of a frame
     intensity_quantiles: Sequence[float]  # 5, 25, 50, 75 and 95 %

@@ -70,18 +70,18 @@ RIGS: dict[str, Any] = {
 }
 REAL = "KITTI"
 LIDAR = "velodyne"
-SHOWN = 0.3  # lowest score of the detections that are counted and listed by frame
+SHOWN = 0.3  # lowest score of detections that are counted, and listed by frame
 
 
 @dataclass(frozen=True)
 class RealScore:
-    """Detections of one class in real frames, matched at one limit of one kind of IoU."""
+    """Detections of one class in real frames, matched at one threshold of one kind of IoU."""
 
     label: Class
     kind: Kind
     iou: float
     targets: int
-    found: int  # with a score of `SHOWN` or more, as `false_positives`
+    found: int  # with a score of `SHOWN` or more, as those of `false_positives`
     false_positives: int
     ap: float | None  # None without targets
     low: Annotated[float | None, LEFT_OUT] = None  # 95 % interval of AP over sweeps; None of one sweep
@@ -93,12 +93,12 @@ class LabelledCar:
     """A labelled car of a real frame."""
 
     distance_m: float
-    found_at: tuple[float, ...]  # limits of IoU at which a detection matches it
+    found_at: tuple[float, ...]  # thresholds of IoU at which a detection matches it
 
 
 @dataclass(frozen=True)
 class FrameResult:
-    """Detections and misses in a real frame; KITTI's labels themselves are not copied."""
+    """Detections and cars in a real frame; the boxes of KITTI's labels are not copied."""
 
     frame: str
     boxes: tuple[ObjectFound, ...]
@@ -113,12 +113,12 @@ class SimToReal(Record):
     scores: tuple[RealScore, ...]
     frames: tuple[FrameResult, ...]
     provenance: Provenance
-    counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # found and invented, by distance
+    counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # true and false detections, by distance
 
 
 @dataclass(frozen=True)
 class RealSweep:
-    """A real sweep with what a network detects in it and what is labelled, LiDAR frame."""
+    """A real sweep with the detections of a network and the ground truth, LiDAR frame."""
 
     name: str
     points: NDArray[np.float32]  # (N, 4)
@@ -139,9 +139,9 @@ def run_sim_to_real(
 ) -> SimToReal:
     """Compare simulated clouds with those of the folder `real`, and evaluate `network` on its frames.
 
-    That is a folder in KITTI's layout, where detections outside the image do not count, or a dataset, such as an
-    imported one; `around`: in all directions. Simulated frames are recorded in `out` by `run_steps`. Raises
-    `InputError` where `real` is neither, and for a look around in KITTI, whose labels lie ahead.
+    `real` is a folder in KITTI's layout, where detections outside the image do not count, or a dataset, such as an
+    imported one. With `around`, the network detects in all directions. Simulated frames are recorded in `out` by
+    `run_steps`. Raises `InputError` where `real` is neither, and for `around` with KITTI, whose labels lie ahead.
     """
     sweeps = [*read_sweeps(network, real, around)]
     steps = [
@@ -150,18 +150,18 @@ def run_sim_to_real(
     ]
     run_steps(steps, out, jobs=jobs, notify=notify, stale=stale, engine=engine)
     origin = REAL if is_kitti(real) else real.resolve().name
-    clouds = {origin: summarise_clouds((each.points, select_class(each.truth.targets, "Car")) for each in sweeps)}
+    clouds = {origin: summarise_clouds((sweep.points, select_class(sweep.truth.targets, "Car")) for sweep in sweeps)}
     for name, step in zip(RIGS, steps, strict=True):
         data = open_split(out / step.name)
         clouds[name] = summarise_clouds(labelled(data, number) for number in range(len(data)))
-    found, truths = [each.found for each in sweeps], [each.truth for each in sweeps]
+    found, truths = [sweep.found for sweep in sweeps], [sweep.truth for sweep in sweeps]
     counts = count_objects(found, truths, network.config.classes)
-    stories = tuple(map(tell_frame, sweeps))
-    return SimToReal(clouds, score_sweeps(network, sweeps), stories, provenance(RECIPE["seed"]), counts)
+    frames = tuple(map(tell_frame, sweeps))
+    return SimToReal(clouds, score_sweeps(network, sweeps), frames, provenance(RECIPE["seed"]), counts)
 
 
 def read_sweeps(network: Second, real: Path, around: bool = False) -> Iterator[RealSweep]:
-    """Yield the sweeps of a folder of `run_sim_to_real`, with the detections of `network`."""
+    """Yield the sweeps of the folder `real`, see `run_sim_to_real`, with the detections of `network`."""
     if is_kitti(real):
         if around:
             raise InputError(f"{real}: KITTI's labels lie ahead, in the image; leave --around out")
@@ -173,11 +173,11 @@ def read_sweeps(network: Second, real: Path, around: bool = False) -> Iterator[R
         return
     data = Dataset.open(real)
     data.check_labelled(OBJECTS.name)
-    looking = look_around(network) if around else network
+    detector = look_around(network) if around else network
     for number in data.select(agents={key.agent for key in data.keys if kind_of(key.agent) != POLE}):
         frame = data.frame(number)
-        (found,) = detect_in(looking, [frame], score_threshold=LOWEST_SCORE)
-        yield RealSweep(frame.key, frame.lidar[choose_lidar(frame)], found, asked_of(frame, looking.config))
+        (found,) = detect_in(detector, [frame], score_threshold=LOWEST_SCORE)
+        yield RealSweep(frame.key, frame.lidar[choose_lidar(frame)], found, asked_of(frame, detector.config))
 
 
 def labelled(data: Dataset, number: int) -> Labelled:
@@ -188,16 +188,17 @@ def labelled(data: Dataset, number: int) -> Labelled:
 
 
 def score_sweeps(network: Second, sweeps: Sequence[RealSweep]) -> tuple[RealScore, ...]:
-    """Return AP by class, kind and limit of IoU over real sweeps, with its interval over them."""
-    found, truths, classes = [each.found for each in sweeps], [each.truth for each in sweeps], network.config.classes
-    alone = [replace(truth, scene=str(number)) for number, truth in enumerate(truths)]  # intervals are over sweeps
+    """Return AP by class, kind of IoU and threshold over real sweeps, with intervals over them."""
+    found, truths = [sweep.found for sweep in sweeps], [sweep.truth for sweep in sweeps]
+    classes = network.config.classes
+    alone = [replace(truth, scene=str(number)) for number, truth in enumerate(truths)]  # every sweep is a scene
     scores = []
     for row in score_detections(found, alone, classes):
-        own, targets, neutral = (
+        detections, targets, neutral = (
             [select_class(boxes, row.label) for boxes in side]
             for side in (found, [truth.targets for truth in truths], [truth.neutral for truth in truths])
         )
-        matches = match(own, targets, neutral, row.iou, row.kind)
+        matches = match(detections, targets, neutral, row.iou, row.kind)
         counted = matches.hit[matches.score >= SHOWN]
         hits, wrong = int(counted.sum()), int((~counted).sum())
         scores.append(RealScore(row.label, row.kind, row.iou, row.targets, hits, wrong, row.ap, row.low, row.high))
@@ -212,7 +213,7 @@ def draw_clouds(results: SimToReal) -> bytes:
 def draw_frame(real: Path, story: FrameResult) -> bytes | None:
     """Return a PNG of one frame of the results: cloud from above and image, with labelled cars and detections.
 
-    None of a frame of KITTI without an image, and of other data.
+    Return None for a frame of KITTI without an image, and for other data.
     """
     if not is_kitti(real):
         return None
@@ -235,7 +236,7 @@ def _series(numbers: CloudNumbers) -> CloudSeries:
 
 
 def tell_frame(sweep: RealSweep) -> FrameResult:
-    """Return the sweep's detections, and each labelled car's distance and the limits of IoU it was found at."""
+    """Return the sweep's detections, and the distance of each labelled car with the IoU thresholds that find it."""
     found, cars = sweep.found, select_class(sweep.truth.targets, "Car")
     score = found.score if found.score is not None else np.ones(len(found))
     found = found[score >= SHOWN]
@@ -285,11 +286,11 @@ def _clouds(clouds: Mapping[str, CloudNumbers]) -> list[list[str]]:
         rows.append([f"intensity, {share}th percentile", *(f"{c.intensity_quantiles[place]:.2f}" for c in columns)])
     rows.append(["returns without intensity", *(f"{c.without_intensity:.0%}" for c in columns)])
     for ahead_m in (street.ahead_m for street in columns[0].ground):
-        own = [next((street for street in c.ground if street.ahead_m == ahead_m), None) for c in columns]
+        sections = [next((street for street in c.ground if street.ahead_m == ahead_m), None) for c in columns]
         for what, values in (
-            ("height", [street and street.height_m for street in own]),
-            ("interquartile range of height", [street and street.spread_m for street in own]),
-            ("intensity", [street and street.intensity for street in own]),
+            ("height", [street and street.height_m for street in sections]),
+            ("interquartile range of height", [street and street.spread_m for street in sections]),
+            ("intensity", [street and street.intensity for street in sections]),
         ):
             cells = ["" if value is None else f"{value:.2f}" for value in values]
             rows.append([f"street {ahead_m} m ahead, {what}", *cells])
@@ -317,7 +318,7 @@ def _run(out: Path, options: Options) -> Outcome[SimToReal]:
 
 
 def describe_scores(results: SimToReal) -> list[str]:
-    """Return what the detector found in real frames in words."""
+    """Return the scores of the detector in real frames as sentences."""
     scores = [
         f"{row.label} {row.kind} at IoU {row.iou}: {row.found} of {row.targets} found, {row.false_positives} false, "
         f"AP {row.ap:.3f} {interval_words(row.low, row.high)}"

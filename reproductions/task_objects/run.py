@@ -16,11 +16,11 @@ from flcav.report.charts.studies import Bar, precisions
 from flcav.statistics.verdicts import Claim, describe_aims
 from flcav.storage.markdown import format_bullets, format_table
 
-WANTED = {  # aims, for cars on other scenes of the training towns: least value, claim
+WANTED = {  # aims for cars on other scenes of the training towns, by number: least value, claim
     "Car AP 3d at 0.5": (0.85, "Car AP3D@0.5 of 0.85"),
     "Car right headings": (0.9, "90 % of the cars found at 3D IoU 0.5 within 90 degrees of their heading"),
 }
-EFFECT = 0.05  # deviation from an aim that the study is to tell
+EFFECT = 0.05  # deviation from an aim that the study should detect
 HEADINGS = ("AOS3D at 0.5", "right headings")  # of objects found at 3D IoU 0.5
 MEASURES = (("3d", 0.5), ("3d", 0.7), ("bev", 0.5), ("bev", 0.7))
 
@@ -72,9 +72,9 @@ def _slices(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
     for test in results.summary:
         tested = [[row for row in one.slices if row.label == "Car"] for one in results.tested(test)]
         for by, name in dict.fromkeys((row.by, row.slice) for one in tested for row in one):
-            own = [[row for row in one if (row.by, row.slice) == (by, name)] for one in tested]
-            targets = list_counts([one[0].targets if one else 0 for one in own])
-            rows.append([test, f"{by} {name}", targets, *_measures(own)])
+            by_seed = [[row for row in one if (row.by, row.slice) == (by, name)] for one in tested]
+            targets = list_counts([one[0].targets if one else 0 for one in by_seed])
+            rows.append([test, f"{by} {name}", targets, *_measures(by_seed)])
     return rows
 
 
@@ -88,7 +88,7 @@ def _tracks(results: StudyResult[ObjectsEvaluation]) -> list[list[str]]:
 
 
 def _measures(seeds: Sequence[Sequence[Score | BreakdownRow]]) -> list[str]:
-    """Return the mean AP over seeds of each of `MEASURES`; `seeds`: rows of each seed."""
+    """Return the mean AP over seeds for each of `MEASURES`; `seeds`: rows of each seed."""
     return [_mean(row.ap for rows in seeds for row in rows if (row.kind, row.iou) == measure) for measure in MEASURES]
 
 
@@ -98,7 +98,7 @@ def _mean(values: Iterable[float | None]) -> str:
 
 
 def add_tracks(found: ObjectsEvaluation, network: Second, data: Dataset) -> ObjectsEvaluation:
-    """Return the evaluation completed by that of the network's tracks (MOTA, AMOTA)."""
+    """Return the evaluation with that of the network's tracks (MOTA, AMOTA)."""
     return replace(found, tracks=evaluate_tracks(network, data))
 
 
@@ -113,7 +113,7 @@ def _draw(results: StudyResult[ObjectsEvaluation]) -> bytes:
             for name, row in (*classes, *slices):
                 if (row.kind, row.iou) == ("3d", 0.5) and row.ap is not None:
                     rows.setdefault(name, []).append(row)
-        panels[test] = [_bar(name, own) for name, own in rows.items()]
+        panels[test] = [_bar(name, scores) for name, scores in rows.items()]
     return style.png(precisions(panels))
 
 

@@ -1,4 +1,4 @@
-"""Study of the object task in streets that are drawn at random: `task_objects` with other training recordings."""
+"""Study of the object task trained in streets that are drawn at random; otherwise as `task_objects`."""
 
 from flcav.experiments.study import make_experiment
 from flcav.reproductions.task_objects.run import STREETS, tables

@@ -13,7 +13,7 @@ from flcav.statistics.verdicts import Claim, describe_aims
 from flcav.storage.markdown import format_bullets, format_table
 
 WANTED = 0.75  # aim: least mAP50 on other scenes
-EFFECT = 0.05  # deviation from an aim that the study is to tell
+EFFECT = 0.05  # deviation from an aim that the study should detect
 
 
 def tables(results: StudyResult[SignsEvaluation]) -> dict[str, str]:
@@ -53,9 +53,12 @@ def _rows(tests: Sequence[Sequence[Sequence[ClassPrecision | SizePrecision]]]) -
     for number, named in enumerate(tests[0][0]):
         row = [named.name]
         for seeds in tests:
-            own = [rows[number] for rows in seeds]
-            known = [value for each in own if (value := _precision(each)) is not None]
-            row += [list_counts([each.targets for each in own]), f"{sum(known) / len(known):.3f}" if known else ""]
+            by_seed = [rows[number] for rows in seeds]
+            known = [value for score in by_seed if (value := _precision(score)) is not None]
+            row += [
+                list_counts([score.targets for score in by_seed]),
+                f"{sum(known) / len(known):.3f}" if known else "",
+            ]
         rows.append(row)
     return rows
 
@@ -70,9 +73,9 @@ def _draw(results: StudyResult[SignsEvaluation]) -> bytes:
     for test, means in results.summary.items():
         tested = results.tested(test)
         counts: dict[str, list[int]] = {}
-        for row in (row for each in tested for row in (*each.classes, *each.sizes)):
+        for row in (row for evaluation in tested for row in (*evaluation.classes, *evaluation.sizes)):
             counts.setdefault(row.name, []).append(row.targets)
-        targets = {name: round(np.mean(own)) for name, own in counts.items()}
+        targets = {name: round(np.mean(counts_of_class)) for name, counts_of_class in counts.items()}
         numbers = [result.numbers() for result in tested]
         panels[test] = [
             Bar(name, means[name].mean, tuple(row[name] for row in numbers), targets.get(name))

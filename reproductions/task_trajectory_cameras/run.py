@@ -1,4 +1,4 @@
-"""Study of the trajectory task on pictures of cameras: `task_trajectory` with them in place of rasters."""
+"""Study of the trajectory task on camera pictures instead of rasters; otherwise as `task_trajectory`."""
 
 from flcav.experiments.study import make_experiment
 from flcav.reproductions.task_trajectory.run import CAMERAS, tables

@@ -16,7 +16,7 @@ from flcav.statistics.verdicts import Claim, describe_aims
 from flcav.storage.markdown import format_bullets, format_table
 
 WANTED = 0.95  # aim: least accuracy
-EFFECT = 0.02  # deviation from an aim that the study is to tell
+EFFECT = 0.02  # deviation from an aim that the study should detect
 
 
 def tables(results: StudyResult[Classification]) -> dict[str, str]:
@@ -43,17 +43,17 @@ def _accuracy(results: StudyResult[Classification]) -> str:
     for test, numbers in results.summary.items():
         tested = results.tested(test)
         for name, mean in numbers.items():
-            each = [found if name == "accuracy" else found.nearest or found for found in tested]
-            over_scenes = ", ".join(_with_interval(one).describe() for one in each)
+            tests = [found if name == "accuracy" else found.nearest or found for found in tested]
+            over_scenes = ", ".join(_with_interval(one).describe() for one in tests)
             what = "within the regions" if name == "accuracy" else "everywhere, nearest class"
-            counts = (list_counts([one.pictures for one in each]), list_counts([one.scenes for one in each]))
+            counts = (list_counts([one.pictures for one in tests]), list_counts([one.scenes for one in tests]))
             rows.append([test, what, *counts, mean.describe(), over_scenes])
     header = ("test", "pictures", "number", "scenes", "accuracy, over seeds", "each seed, over its scenes")
     return format_table(header, rows)
 
 
 def _with_interval(found: Classification) -> Estimate:
-    """Return the accuracy with its interval over scenes; of 0 and 1, where no drawn scenes differ, Wilson's."""
+    """Return the accuracy with its interval over scenes: Wilson's where all scenes are alike, as at 0 and 1."""
     if found.low == found.high and found.low is not None:
         return score_interval(found.accuracy, found.scenes)
     return Estimate(found.accuracy, found.low, found.high)
@@ -83,13 +83,15 @@ def _seeds(results: StudyResult[Classification]) -> str:
 
 
 def add_nearest(found: Classification, network: Classifier, data: Dataset) -> Classification:
-    """Return the evaluation completed by that of all pictures, each labelled with the nearest class."""
+    """Return the evaluation with that of all pictures, each labelled with the nearest class."""
     return replace(found, nearest=evaluate_whole_space(network, data))
 
 
 def _draw(results: StudyResult[Classification]) -> bytes:
     """Return a PNG of the confusion matrix of each test, summed over seeds."""
-    shown = {name: [each.nearest or each for each in results.tested(name)] for name in results.summary}
+    shown = {
+        name: [evaluation.nearest or evaluation for evaluation in results.tested(name)] for name in results.summary
+    }
     counts = {name: np.sum([result.confusion for result in found], axis=0) for name, found in shown.items()}
     return style.png(confusions(counts, next(iter(shown.values()))[0].classes))
 

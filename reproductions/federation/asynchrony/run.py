@@ -1,9 +1,9 @@
-"""Asynchronous rounds against synchronous ones, with stragglers: at equal megabytes, and at equal seconds.
+"""Comparison of asynchronous and synchronous rounds with stragglers, at equal uplink and at equal time.
 
-Ten vehicles drive through all weathers, as in `federation/drives.py`, linked by radio to one unit on the
-pole with most traffic; three of them, drawn for each seed, train eight times as long. All ways to federate have the
-same first weights, links and stragglers, and are scored at the same megabytes of uplink, those of `ROUNDS` rounds of
-all, and at the same seconds, those in which FedAvg waits through these rounds.
+Ten vehicles drive through all weathers, as in `federation/drives.py`, linked by radio to one unit on the pole with the
+most traffic; three of them, drawn for each seed, train eight times as long. All methods have the same initial weights,
+links and stragglers. They are scored at equal megabytes of uplink, those of `ROUNDS` rounds with all vehicles, and at
+equal seconds, those of the same rounds of FedAvg.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,12 +53,12 @@ from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
 from flcav.world.map.census import measure_traffic_density
 
-PASSES = 20  # through the scenes, at most, of rounds that wait
+PASSES = 20  # greatest number of passes through the scenes in synchronous rounds
 
 
 @dataclass(frozen=True)
 class Rival:
-    """A way to federate: its strategy, and whether its rounds are those of fast vehicles alone."""
+    """A method to compare: its strategy, and whether slow vehicles are left out."""
 
     strategy: Strategy = FEDAVG
     leaves_slow: bool = False
@@ -66,56 +66,57 @@ class Rival:
 
 @dataclass(frozen=True)
 class Scheduled:
-    """The rounds of a federation by the clock."""
+    """The timed rounds of a federation."""
 
     end_s: tuple[float, ...]  # of each round
-    up_bytes: tuple[int, ...]  # of each round, what broke off included
+    up_bytes: tuple[int, ...]  # of each round, interrupted updates included
     outages: Mapping[tuple[int, str], Outage] = field(default_factory=dict)
     buffers: Buffers | None = None
 
     def last_within(self, seconds: float, up_bytes: float) -> int:
-        """Return the number of rounds that end within so many seconds, and with no more bytes."""
+        """Return the number of rounds that end within `seconds` [s] and `up_bytes` bytes of uplink."""
         sent = np.cumsum(self.up_bytes)
         within = (np.array(self.end_s) <= seconds + 1e-9) & (sent <= up_bytes)
         return int(np.argmin(within)) if not within.all() else len(within)
 
 
 def schedule_rounds(rival: Rival, fleet: Fleet, scenes: Sequence[RadioLinks], rounds: int) -> Scheduled:
-    """Return so many rounds of FedAvg, one after another, each of all vehicles that are asked and there."""
+    """Return consecutive rounds of FedAvg with all vehicles that are called and present."""
     links, _ = chain_links([*scenes] * PASSES)
-    asked = [client for client in fleet.clients if not (rival.leaves_slow and client in fleet.speeds)]
-    works = {fleet.work(client).client: fleet.work(client) for client in asked}
+    called = [client for client in fleet.clients if not (rival.leaves_slow and client in fleet.speeds)]
+    works = {fleet.work(client).client: fleet.work(client) for client in called}
     timed = simulate_rounds(links, [works] * rounds, NetworkSettings())
     return Scheduled(
-        tuple(each.end_s for each in timed),
-        tuple(sum(client.uploaded_bytes for client in each.clients) for each in timed),
+        tuple(round_.end_s for round_ in timed),
+        tuple(sum(client.uploaded_bytes for client in round_.clients) for round_ in timed),
         find_outages(fleet, timed),
     )
 
 
 def find_outages(fleet: Fleet, timed: Sequence[RoundTiming]) -> dict[tuple[int, str], Outage]:
-    """Return who is lost in rounds, or not there when one begins."""
-    found: dict[tuple[int, str], Outage] = {}
-    for each in timed:
-        clients = {f"{fleet.region}/{client.client}": client for client in each.clients}
+    """Return the outages by round and client: lost during a round, or absent at its start."""
+    outages: dict[tuple[int, str], Outage] = {}
+    for round_ in timed:
+        clients = {f"{fleet.region}/{client.client}": client for client in round_.clients}
         for name in fleet.clients:
             if name not in clients:
-                found[each.round, name] = Outage(AWAY)
+                outages[round_.round, name] = Outage(AWAY)
             elif clients[name].dropped:
-                found[each.round, name] = Outage(clients[name].dropped, clients[name].uploaded_bytes)
-    return found
+                outages[round_.round, name] = Outage(clients[name].dropped, clients[name].uploaded_bytes)
+    return outages
 
 
 def schedule_buffers(
     strategy: FedBuff, fleet: Fleet, scenes: Sequence[RadioLinks], seconds: float, up_bytes: int
 ) -> Scheduled:
-    """Return the buffers until both so many seconds are over and so many bytes are sent."""
-    own = BufferedFleet(fleet, scenes, {})
-    clock, timings = own.open_clock(strategy, NetworkSettings()), list[BufferTiming]()
+    """Return the buffers until `seconds` [s] are over and `up_bytes` bytes are sent, whichever is later."""
+    buffered = BufferedFleet(fleet, scenes, {})
+    clock = buffered.open_clock(strategy, NetworkSettings())
+    timings = list[BufferTiming]()
     while not timings or timings[-1].end_s <= seconds or sum(map(_sum_bytes, timings)) <= up_bytes:
         timings.append(clock.fill())
-    driven = own.read(Rules(), timings)
-    return Scheduled(tuple(each.end_s for each in timings), tuple(map(_sum_bytes, timings)), buffers=driven.buffers)
+    buffers = buffered.read(Rules(), timings).buffers
+    return Scheduled(tuple(timing.end_s for timing in timings), tuple(map(_sum_bytes, timings)), buffers=buffers)
 
 
 def _sum_bytes(timing: BufferTiming) -> int:
@@ -123,9 +124,9 @@ def _sum_bytes(timing: BufferTiming) -> int:
 
 
 ROUNDS, STEPS, LEARNING_RATE, TRAIN_S = 4, 5, 0.05, 1.0
-SCENES = 4  # that follow one another, and repeat
+SCENES = 4  # consecutive scenes, which repeat
 STRAGGLERS = Stragglers(share=0.3, slower=8)
-RARE = (6, 7)  # classes of weather that stragglers alone see, in the second setting
+RARE = (6, 7)  # classes of weather that only stragglers see, in the second setting
 WAITS = "FedAvg, waits for all"
 RIVALS: Mapping[str, Rival] = {
     WAITS: Rival(),
@@ -143,22 +144,22 @@ REGION = "ring"
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A federation of one seed: after each round the time, the uplink so far, and the accuracy on the test drives."""
+    """A federation with one seed: time, uplink and accuracy on the test drives after each round."""
 
-    seconds: tuple[float, ...]
-    up_mb: tuple[float, ...]
+    seconds: tuple[float, ...]  # [s]
+    up_mb: tuple[float, ...]  # cumulated [MB]
     accuracy: tuple[float, ...]
-    updates: int  # that were combined within the equal seconds
-    staleness: float  # of these, mean
+    updates: int  # number of updates combined within the equal seconds
+    staleness: float  # their mean
     at: Mapping[str, float]  # accuracy at the equal megabytes and at the equal seconds
     took: Mapping[str, float]  # seconds at the equal megabytes, megabytes at the equal seconds
 
 
 @dataclass(frozen=True)
 class AsynchronyResult(Record):
-    """Results by setting: trajectories by seed and rival, means over seeds, and differences to FedAvg that waits."""
+    """Results by setting: trajectories by seed and method, means over seeds, and differences to FedAvg with all."""
 
-    pictures: int  # of the test
+    pictures: int  # number in the test
     scenes: int
     stragglers: Mapping[str, tuple[str, ...]]  # by seed
     trajectories: Mapping[str, Mapping[str, Mapping[str, Trajectory]]]  # by setting, seed and rival
@@ -174,7 +175,7 @@ class AsynchronyResult(Record):
 def compare_asynchrony(
     out: Path, seeds: int, progress: Report = ignore_progress
 ) -> tuple[AsynchronyResult, dict[str, bytes]]:
-    """Record the drives into `out`, and federate by each setting, seed and rival; return numbers and a picture."""
+    """Record the drives to `out`, federate by each setting, seed and method, and return results and a picture."""
     drives = record_drives(out, progress)
     scenes = Dataset.open(out / "train")
     right: dict[tuple[str, str, str], list[NDArray[np.float64]]] = {}
@@ -187,11 +188,11 @@ def compare_asynchrony(
         scheduled = schedule_all(fleet, links)
         for setting in SETTINGS:
             clients = give_pictures(drives, fleet, setting)
-            own = found[setting].setdefault(str(seed), {})
+            by_rival = found[setting].setdefault(str(seed), {})
             for name, rival in RIVALS.items():
-                own[name], marks = follow(rival, scheduled[name], scheduled[WAITS], clients, drives, seed)
-                for measure, each in marks.items():
-                    right.setdefault((setting, measure, name), []).append(each)
+                by_rival[name], correct = follow(rival, scheduled[name], scheduled[WAITS], clients, drives, seed)
+                for measure, values in correct.items():
+                    right.setdefault((setting, measure, name), []).append(values)
                 done += 1
                 progress(done, total, f"seed {seed}, {setting}, {name}")
     results = summarise(drives, drawn, found, right)
@@ -199,7 +200,7 @@ def compare_asynchrony(
 
 
 def open_fleet(drives: Drives, seed: int) -> Fleet:
-    """Return the vehicles, some of which are slow."""
+    """Return the fleet, with stragglers drawn by `seed`."""
     size = update_bytes(draw_head(seed))
     slow = draw_stragglers(STRAGGLERS, [*drives.vehicles], seed, REGION)
     clients = tuple(f"{REGION}/{name}" for name in drives.vehicles)
@@ -207,9 +208,9 @@ def open_fleet(drives: Drives, seed: int) -> Fleet:
 
 
 def link_drives(data: Dataset, seed: int) -> list[RadioLinks]:
-    """Return the links of the first `SCENES` scenes to a unit on the pole with most traffic."""
+    """Return the radio links in the first `SCENES` scenes to a unit on the pole with the most traffic."""
     town = data.town()
-    assert town is not None  # of a recording by this package
+    assert town is not None  # since the package recorded it
     names = list(dict.fromkeys(key.scene for key in data.keys))[:SCENES]
     traces = [trace for name in names if (trace := data.trace(name)) is not None]
     pole = int(town.poles.id[int(np.argmax(measure_traffic_density(town.poles.position, traces, 40.0)))])
@@ -217,22 +218,24 @@ def link_drives(data: Dataset, seed: int) -> list[RadioLinks]:
 
 
 def schedule_all(fleet: Fleet, links: list[RadioLinks]) -> dict[str, Scheduled]:
-    """Return the rounds of every rival, for as long and as many bytes as FedAvg takes that waits."""
+    """Return the rounds of every method, up to the time and the bytes of FedAvg with all vehicles."""
     waits = schedule_rounds(RIVALS[WAITS], fleet, links, ROUNDS)
-    until_s, sent, found = waits.end_s[-1], sum(waits.up_bytes), {WAITS: waits}
+    until_s = waits.end_s[-1]
+    sent = sum(waits.up_bytes)
+    schedules = {WAITS: waits}
     for name, rival in RIVALS.items():
         if isinstance(rival.strategy, FedBuff):
-            found[name] = schedule_buffers(rival.strategy, fleet, links, until_s, sent)
+            schedules[name] = schedule_buffers(rival.strategy, fleet, links, until_s, sent)
         elif name != WAITS:
-            rounds, own = ROUNDS, waits
-            while own.end_s[-1] <= until_s or sum(own.up_bytes) <= sent:
-                own = schedule_rounds(rival, fleet, links, rounds := rounds + ROUNDS)
-            found[name] = own
-    return found
+            rounds, schedule = ROUNDS, waits
+            while schedule.end_s[-1] <= until_s or sum(schedule.up_bytes) <= sent:
+                schedule = schedule_rounds(rival, fleet, links, rounds := rounds + ROUNDS)
+            schedules[name] = schedule
+    return schedules
 
 
 def give_pictures(drives: Drives, fleet: Fleet, setting: str) -> dict[str, Trainable]:
-    """Return the vehicles as clients; where they are unlike, those that are not slow lack the pictures of `RARE`."""
+    """Return the vehicles as clients; in the setting `UNLIKE`, fast vehicles lack the pictures of `RARE`."""
     clients: dict[str, Trainable] = {}
     for name in fleet.clients:
         seen = drives.vehicles[name.removeprefix(f"{REGION}/")]
@@ -245,42 +248,42 @@ def give_pictures(drives: Drives, fleet: Fleet, setting: str) -> dict[str, Train
 
 
 def follow(
-    rival: Rival, own: Scheduled, waits: Scheduled, clients: Mapping[str, Trainable], drives: Drives, seed: int
+    rival: Rival, schedule: Scheduled, waits: Scheduled, clients: Mapping[str, Trainable], drives: Drives, seed: int
 ) -> tuple[Trajectory, dict[str, NDArray[np.float64]]]:
-    """Return a federation by its schedule, and which pictures (N,) are right at the equal megabytes and seconds."""
-    start, rounds = draw_head(seed), len(own.end_s)
+    """Run a federation by its schedule; return it, and the correct pictures (N,) at equal megabytes and seconds."""
+    start, rounds = draw_head(seed), len(schedule.end_s)
     reached: list[Weights] = [start]
     book = Ledger(LinkMegabytes(1e6, 0.0))
     federate(
         clients,
         start,
         Schedule(rounds, STEPS, LEARNING_RATE, LEARNING_RATE, seed),
-        Account(book, "edge", WEATHER.name, "wireless", own.outages),
+        Account(book, "edge", WEATHER.name, "wireless", schedule.outages),
         strategy=rival.strategy,
-        buffers=own.buffers,
+        buffers=schedule.buffers,
         on_round=lambda round_, weights, loss: reached.append(weights),
     )
     right = [find_right(weights, drives.test) for weights in reached]
     sent = np.cumsum([sum(e.bytes for e in book if (e.direction, e.round) == ("up", n + 1)) for n in range(rounds)])
     ends = {
-        MEGABYTES: own.last_within(np.inf, sum(waits.up_bytes)),
-        SECONDS: own.last_within(waits.end_s[-1], np.inf),
+        MEGABYTES: schedule.last_within(np.inf, sum(waits.up_bytes)),
+        SECONDS: schedule.last_within(waits.end_s[-1], np.inf),
     }
     stale = [0] * (len(clients) * ends[SECONDS])
-    if own.buffers is not None:
-        counted = enumerate(own.buffers.rounds[: ends[SECONDS]])
-        stale = [number - version for number, each in counted for version in each.versions.values()]
-    elif own.outages:
-        stale = stale[: len(stale) - sum(number <= ends[SECONDS] for number, _ in own.outages)]
+    if schedule.buffers is not None:
+        counted = enumerate(schedule.buffers.rounds[: ends[SECONDS]])
+        stale = [number - version for number, buffer in counted for version in buffer.versions.values()]
+    elif schedule.outages:
+        stale = stale[: len(stale) - sum(number <= ends[SECONDS] for number, _ in schedule.outages)]
     trajectory = Trajectory(
-        seconds=(0.0, *(round(each, 3) for each in own.end_s)),
+        seconds=(0.0, *(round(end_s, 3) for end_s in schedule.end_s)),
         up_mb=(0.0, *np.round(sent / BYTES_PER_MB, 4).tolist()),
-        accuracy=tuple(round(float(each.mean()), 5) for each in right),
+        accuracy=tuple(round(float(correct.mean()), 5) for correct in right),
         updates=len(stale),
         staleness=float(np.mean(stale)) if stale else 0.0,
         at={measure: float(right[end].mean()) for measure, end in ends.items()},
         took={
-            MEGABYTES: own.end_s[ends[MEGABYTES] - 1] if ends[MEGABYTES] else 0.0,
+            MEGABYTES: schedule.end_s[ends[MEGABYTES] - 1] if ends[MEGABYTES] else 0.0,
             SECONDS: float(sent[ends[SECONDS] - 1]) / BYTES_PER_MB if ends[SECONDS] else 0.0,
         },
     )
@@ -293,7 +296,7 @@ def summarise(
     found: Mapping[str, Mapping[str, Mapping[str, Trajectory]]],
     right: Mapping[tuple[str, str, str], list[NDArray[np.float64]]],
 ) -> AsynchronyResult:
-    """Return the means over seeds, which share the test's scenes."""
+    """Return the means over seeds; these share the scenes of the test."""
 
     def difference(setting: str, measure: str, name: str) -> MeanOverSeeds:
         pairs = zip(right[setting, measure, name], right[setting, measure, WAITS], strict=True)
@@ -322,12 +325,11 @@ def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
     for setting in SETTINGS:
         of_setting = results.accuracy[setting]
         for rival in RIVALS:
-            own = [seed[rival] for seed in results.trajectories[setting].values()]
+            by_seed = [seed[rival] for seed in results.trajectories[setting].values()]
             means = [of_setting[measure][rival].describe() for measure in MEASURES]
-            took = [f"{np.mean([each.took[measure] for each in own]):.2f}" for measure in (MEGABYTES, SECONDS)]
-            updates, stale = (
-                float(np.mean(each)) for each in zip(*((t.updates, t.staleness) for t in own), strict=True)
-            )
+            took = [f"{np.mean([one.took[measure] for one in by_seed]):.2f}" for measure in (MEGABYTES, SECONDS)]
+            updates = float(np.mean([one.updates for one in by_seed]))
+            stale = float(np.mean([one.staleness for one in by_seed]))
             rest = [means[0], took[0], means[1], took[1], f"{updates:.0f}", f"{stale:.2f}"]
             accuracy.append([setting, rival, *rest])
             for measure in MEASURES if rival != WAITS else ():
@@ -350,7 +352,7 @@ COLOURS = (style.INK, style.POINT, style.BLUE, style.GREEN, style.VERMILLION)
 
 
 class Reached(Protocol):
-    """A federation's accuracy after each round, by its clock [s], from the first weights on."""
+    """Accuracy of a federation after each round, from the initial weights on, with the time [s]."""
 
     @property
     def seconds(self) -> Sequence[float]:
@@ -369,7 +371,7 @@ def draw_trajectories(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], 
     figure = style.canvas(7.2, 3.4)
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for panel, (setting, seeds) in zip(panels, found.items(), strict=True):
-        until = min(each.seconds[-1] for own in seeds.values() for each in own.values())
+        until = min(reached.seconds[-1] for by_name in seeds.values() for reached in by_name.values())
         grid = np.linspace(0.0, until, 200)
         for name, colour in zip(names, COLOURS, strict=False):
             rows = [_hold(seeds[seed][name], grid) for seed in seeds]
@@ -380,10 +382,10 @@ def draw_trajectories(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], 
     return figure
 
 
-def _hold(own: Reached, grid: np.ndarray) -> np.ndarray:
-    """Return the accuracy at each time: that of the last round that is over."""
-    last = np.searchsorted(own.seconds, grid, side="right") - 1
-    return np.asarray(own.accuracy)[last]
+def _hold(reached: Reached, grid: np.ndarray) -> np.ndarray:
+    """Return the accuracy at the times `grid` [s]: that after the last completed round."""
+    last = np.searchsorted(reached.seconds, grid, side="right") - 1
+    return np.asarray(reached.accuracy)[last]
 
 
 def _run(out: Path, options: Options) -> Outcome[AsynchronyResult]:

@@ -1,11 +1,10 @@
-"""Comparison of exchanges, the arms of a recipe: accuracy, bytes, seconds and epsilon of each.
+"""Comparison of exchanges in federated learning, by arms of a recipe: accuracy, bytes, seconds and epsilon.
 
-The recipes are recipes/runs/exchange.yaml, of the weather, and exchange_objects.yaml, which has some of its arms.
+The recipes are recipes/runs/exchange.yaml, for the weather task, and exchange_objects.yaml, with some of its arms.
 
 All arms of a seed have the same recordings, the same stage I and the same rounds. They differ in the form of the
-updates, in who takes part, in what regions keep for themselves, or in what stays private. The first arm sends whole
-weights (FedAvg). Every other one is compared with it, paired over seeds, which have recordings of their own; the
-verdicts are corrected together.
+updates, client selection, personalisation of regions, or privacy. The first arm sends whole weights (FedAvg). All
+others are compared with it, paired over seeds, which have different recordings; the verdicts are corrected together.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -42,7 +41,7 @@ from flcav.storage.markdown import format_table
 from flcav.storage.records import LEFT_OUT, Record
 
 NONE, NO_CLOUD, WHOLE = "no federation", "no cloud round", "whole weights (FedAvg)"
-ARMS: Mapping[str, Mapping[str, str]] = {  # by what they are about: name in the tables -> arm
+ARMS: Mapping[str, Mapping[str, str]] = {  # by topic: name in the tables -> arm
     "compared with": {NONE: PRETRAIN, WHOLE: MAIN},
     "what the cloud does": {NO_CLOUD: EDGE, "learning rate begun anew": "restarted"},
     "what is sent": {
@@ -81,14 +80,14 @@ PLACES = (OWN, OTHERS, UNSEEN)
 class ExchangeArm:
     """Results of one arm in one seed; megabytes are those of stages II and III, 1 MB = 10^6 bytes."""
 
-    accuracy: Mapping[str, float]  # the task's measure by those of `PLACES` that its networks were tested in
+    accuracy: Mapping[str, float]  # the task's measure by tested place of `PLACES`
     wireless_up_mb: float
     wireless_down_mb: float
     wireline_up_mb: float
     wireline_down_mb: float
-    clients: float  # whose updates are combined in a round of vehicles, mean
-    seconds: float | None  # of a round on the radio, mean; None: nothing is sent, or no vehicle gets through
-    epsilon: float | None  # of a vehicle's whole data after all rounds; None: without noise
+    clients: float  # mean number of updates combined in a round of vehicles
+    seconds: float | None  # mean duration of a round over the radio; None: nothing is sent or arrives
+    epsilon: float | None  # of a vehicle's whole data after all rounds; None without noise
 
 
 @dataclass(frozen=True)
@@ -110,27 +109,28 @@ class ExchangeResult(Record):
 
     @property
     def places(self) -> tuple[str, ...]:
-        """Return those of `PLACES` that networks were tested in."""
+        """Return the tested places, in the order of `PLACES`."""
         return tuple(place for place in PLACES if place in self.accuracy[WHOLE])
 
     @property
     def groups(self) -> Mapping[str, tuple[str, ...]]:
-        """Return the names of the compared arms by what they are about."""
-        found = {group: tuple(name for name in arms if name in self.accuracy) for group, arms in ARMS.items()}
-        return {group: names for group, names in found.items() if names}
+        """Return the names of the compared arms by topic."""
+        present = {group: tuple(name for name in arms if name in self.accuracy) for group, arms in ARMS.items()}
+        return {group: names for group, names in present.items() if names}
 
     def sentences(self) -> list[str]:
         """Return accuracy, uplink and the verdict on the difference to whole weights of each arm, in words."""
-        judged, told = judge_differences(self), []
+        judged = judge_differences(self)
+        sentences = []
         for name in self.accuracy:
             mean = self.accuracy[name][OWN]
             sent = float(np.mean([seed[name].wireless_up_mb for seed in self.seeds.values()]))
             words = f"{name}: {self.measure} in the own region {mean.describe()}, wireless uplink {sent:.2f} MB"
             if name in judged:
-                found = self.differences[name][OWN].describe(sign=True)
-                words += f", difference {found}, {judged[name].describe()}"
-            told.append(words)
-        return told
+                difference = self.differences[name][OWN].describe(sign=True)
+                words += f", difference {difference}, {judged[name].describe()}"
+            sentences.append(words)
+        return sentences
 
 
 def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[Path]) -> ExchangeResult:
@@ -140,8 +140,8 @@ def compare_exchanges(recipe: RunRecipe, runs: Sequence[Run], folders: Sequence[
     """
     seeds = {str(run.recipe.seed): measure_seed(run, folder) for run, folder in zip(runs, folders, strict=True)}
     stages = {str(run.recipe.seed): run.arms[MAIN].stages for run in runs}
-    rounds = {seed: [each for stage in own for each in stage.records or ()] for seed, own in stages.items()}
-    divergence = {seed: found for seed, own in rounds.items() if (found := span_divergence(own)) is not None}
+    rounds = {seed: [round_ for stage in run for round_ in stage.records or ()] for seed, run in stages.items()}
+    divergence = {seed: span for seed, of_seed in rounds.items() if (span := span_divergence(of_seed)) is not None}
     return replace(summarise(recipe, seeds), divergence=divergence or None)
 
 
@@ -152,9 +152,9 @@ def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]])
         return [seed[name].accuracy[place] for seed in seeds.values()]
 
     def differences(name: str, place: str) -> list[float]:
-        """Return the paired differences, rounded so that equal counts of right answers differ by 0."""
+        """Return the paired differences, rounded so that equal counts of correct answers differ by exactly 0."""
         pairs = zip(values(name, place), values(WHOLE, place), strict=True)
-        return [round(own - whole, 9) for own, whole in pairs]
+        return [round(value - whole, 9) for value, whole in pairs]
 
     arms = next(iter(seeds.values()))
     return ExchangeResult(
@@ -174,7 +174,7 @@ def summarise(recipe: RunRecipe, seeds: Mapping[str, Mapping[str, ExchangeArm]])
 
 
 def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
-    """Return the numbers of every arm of one seed's run."""
+    """Return the results of all arms in one seed's run."""
     (task,) = run.recipe.tasks
     plan = run.arms[MAIN].plan.tasks[task]
     rounds = plan.edge_rounds + plan.cloud_rounds * run.recipe.federation.edge_rounds_per_cloud_round
@@ -187,15 +187,15 @@ def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
         whole = Ledger.load(folder / "ledgers" / f"{arm}.parquet")
         book = Ledger(whole.budget, [entry for entry in whole.entries if entry.stage in stages])
         kept = [stage for stage in run.arms[arm].stages if stage.stage in stages]
-        records = [each for stage in kept for each in stage.records or ()]
-        spent = [each.epsilon for each in records if each.epsilon is not None]
+        records = [record for stage in kept for record in stage.records or ()]
+        spent = [record.epsilon for record in records if record.epsilon is not None]
         found[name] = ExchangeArm(
             accuracy=measure_places(run, arm, stages[-1]),
             wireless_up_mb=book.used_mb("wireless", direction="up"),
             wireless_down_mb=book.used_mb("wireless", direction="down"),
             wireline_up_mb=book.used_mb("wireline", direction="up"),
             wireline_down_mb=book.used_mb("wireline", direction="down"),
-            clients=float(np.mean([len(each.clients) for each in records if each.server != CLOUD])),
+            clients=float(np.mean([len(record.clients) for record in records if record.server != CLOUD])),
             seconds=mean_round_s(book.entries, links, plan.edge_rounds),
             epsilon=max(spent) if spent else None,
         )
@@ -203,22 +203,22 @@ def measure_seed(run: Run, folder: Path) -> dict[str, ExchangeArm]:
 
 
 def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
-    """Return the accuracy of what each federating region has after a stage: at home, in others, in the unseen one.
+    """Return the accuracy of the federating regions' networks after a stage, by place.
 
-    It is by the task's measure, of the region's own model where it keeps one, and else of the model for all. Others are
-    the regions of pretraining and the other federating ones, averaged over both. In the unseen region, where there is
-    one, it is the model for all. After stage II each region's network is tested at home alone.
+    It is the task's measure of the regional model, if there is one, or else of the common model. In `OWN` networks are
+    tested in their region; `OTHERS` averages over the regions of pretraining and the other federating ones; `UNSEEN` is
+    the common model's, if there is an unseen region. After stage II networks are only tested in their region.
     """
     (task,), home, unseen = run.recipe.tasks, run.recipe.with_role("federate"), run.recipe.with_role("unseen")
     known = [name for name in run.recipe.regions if name not in unseen]
     kept = {
-        (each.model, each.region): each.estimate.mean
-        for each in (run.arms[arm].regional or () if stage == CLOUD else ())
+        (test.model, test.region): test.estimate.mean
+        for test in (run.arms[arm].regional or () if stage == CLOUD else ())
     }
 
     def accuracy(model: str, region: str) -> float:
-        own = kept.get((model, region))
-        return run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean if own is None else own
+        regional = kept.get((model, region))
+        return run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean if regional is None else regional
 
     if stage == EDGE:
         return {OWN: float(np.mean([accuracy(region, region) for region in home]))}
@@ -231,11 +231,11 @@ def measure_places(run: Run, arm: str, stage: str) -> dict[str, float]:
 
 def judge_differences(results: ExchangeResult) -> dict[str, Judged]:
     """Return the verdicts on the differences in the own region, corrected together."""
-    return judge_means({name: each[OWN] for name, each in results.differences.items()})
+    return judge_means({name: places[OWN] for name, places in results.differences.items()})
 
 
 def draw_results(results: ExchangeResult) -> bytes:
-    """Return the figure of accuracy beside the bytes of the wireless uplink as a PNG."""
+    """Return the figure of accuracies and wireless uplink as a PNG."""
 
     def sent(name: str) -> float:
         return float(np.mean([seed[name].wireless_up_mb for seed in results.seeds.values()]))
@@ -249,26 +249,26 @@ def draw_results(results: ExchangeResult) -> bytes:
 
 
 def link_regions(recipe: RunRecipe, task: str, work: Path, rounds: int) -> dict[str, list[RadioLinks]]:
-    """Return by federating region the radio links in the scenes of its first `rounds` rounds.
+    """Return the radio links in the scenes of the first `rounds` rounds, by federating region.
 
-    `work`: the folder of the run's steps. Raises `InputError` as `link_scenes`.
+    `work` is the folder of the run's steps. Raises `InputError` as `link_scenes`.
     """
     names = name_steps(recipe)
-    found = {}
+    links = {}
     for region in recipe.with_role("federate"):
         split = Frames.open(work / names.recording(region, EDGE, task))
         placed = Placed.load(work / names.place(MAIN, region))
-        found[region] = link_scenes(split, placed, NetworkSettings(), rounds, recipe.seed)
-    return found
+        links[region] = link_scenes(split, placed, NetworkSettings(), rounds, recipe.seed)
+    return links
 
 
 def mean_round_s(
     entries: Iterable[LedgerEntry], links: Mapping[str, Sequence[RadioLinks]], edge_rounds: int
 ) -> float | None:
-    """Return the mean time [s] of the rounds of stages II and III in all regions; None where no vehicle gets through.
+    """Return the mean duration [s] of the rounds of stages II and III in all regions; None where no update arrives.
 
-    A round lasts until the last message of its vehicles has arrived. Vehicles that the radio loses do not count. In
-    stage III the scenes go on after those of the `edge_rounds` rounds of stage II.
+    A round lasts until the last message of its vehicles has arrived; vehicles lost by the radio do not count. The
+    scenes of stage III follow those of the `edge_rounds` rounds of stage II.
     """
     rounds: dict[tuple[str, str, int], list[LedgerEntry]] = {}
     for entry in entries:
@@ -301,16 +301,20 @@ WORDS = {HELD: "higher", NOT_HELD: "lower", UNDECIDED: UNDECIDED}  # of the clai
 
 def tables(results: ExchangeResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, costs, differences, cloud; the last is empty where it was not measured."""
-    found = {"accuracy": _accuracy(results), "costs": _costs(results), "differences": _differences(results)}
-    return found | {"cloud": _cloud(results)}
+    return {
+        "accuracy": _accuracy(results),
+        "costs": _costs(results),
+        "differences": _differences(results),
+        "cloud": _cloud(results),
+    }
 
 
 def _accuracy(results: ExchangeResult) -> str:
-    def tell(name: str, place: str) -> str:
+    def describe(name: str, place: str) -> str:
         return results.accuracy[name][place].describe() if place in results.accuracy[name] else ""
 
     rows = [
-        [group, name, *(tell(name, place) for place in results.places)]
+        [group, name, *(describe(name, place) for place in results.places)]
         for group, names in results.groups.items()
         for name in names
     ]
@@ -324,12 +328,12 @@ def _costs(results: ExchangeResult) -> str:
         return f"{np.mean(known):.{digits}f}" if known else ""
 
     numbers: tuple[tuple[Callable[[ExchangeArm], float | None], int], ...] = (
-        (lambda each: each.wireless_up_mb, 3),
-        (lambda each: each.wireless_down_mb, 2),
-        (lambda each: each.wireline_up_mb, 3),
-        (lambda each: each.wireline_down_mb, 2),
-        (lambda each: each.clients, 1),
-        (lambda each: each.seconds, 2),
+        (lambda arm: arm.wireless_up_mb, 3),
+        (lambda arm: arm.wireless_down_mb, 2),
+        (lambda arm: arm.wireline_up_mb, 3),
+        (lambda arm: arm.wireline_down_mb, 2),
+        (lambda arm: arm.clients, 1),
+        (lambda arm: arm.seconds, 2),
     )
     rows = []
     for names in results.groups.values():
@@ -343,12 +347,13 @@ def _costs(results: ExchangeResult) -> str:
 
 
 def _differences(results: ExchangeResult) -> str:
-    judged, rows = judge_differences(results), []
-    for name in (each for names in results.groups.values() for each in names if each in results.differences):
+    judged = judge_differences(results)
+    rows = []
+    for name in (arm for names in results.groups.values() for arm in names if arm in results.differences):
         one, places = judged[name], results.differences[name]
         shown = [place for place in (OWN, UNSEEN) if place in results.places]
-        told = [places[place].describe(sign=True) if place in places else "" for place in shown]
-        rows.append([name, told[0], one.p_cell, WORDS[one.verdict], one.takes_cell, *told[1:]])
+        cells = [places[place].describe(sign=True) if place in places else "" for place in shown]
+        rows.append([name, cells[0], one.p_cell, WORDS[one.verdict], one.takes_cell, *cells[1:]])
     header = (
         "arm",
         f"{results.measure} - that of whole weights, {OWN}",
@@ -361,7 +366,7 @@ def _differences(results: ExchangeResult) -> str:
 
 
 def _cloud(results: ExchangeResult) -> str:
-    """Return the divergence of the regions in each seed beside what the cloud rounds gain in the own region."""
+    """Return the divergence of the regions in each seed, and the gain of cloud rounds in the own region."""
     if not results.divergence:
         return ""
     seeds = {seed: results.seeds[seed] for seed in results.divergence}
@@ -383,20 +388,20 @@ ROW, GAP = 0.235, 0.6  # height of a row [inch], and between two groups [rows]
 
 @dataclass(frozen=True)
 class Mark:
-    """An arm: its group, megabytes sent upwards by wireless, and accuracy in the own and in the unseen region."""
+    """Values of an arm in the figure: wireless uplink, and accuracy in the own and in the unseen region."""
 
     group: str
     name: str
     up_mb: float  # 0: nothing is sent
     own: MeanOverSeeds
-    unseen: MeanOverSeeds | None  # None: there is no such region
+    unseen: MeanOverSeeds | None  # None without an unseen region
 
 
 @style.styled
 def draw_exchanges(marks: Sequence[Mark], measure: str) -> Figure:
-    """Return the figure of a row per arm: its `measure`, with 95 % intervals over seeds, and the uplink on a log axis.
+    """Return a figure with a row per arm: its `measure` with 95 % intervals over seeds, and uplink on a log axis.
 
-    A line across the accuracies marks the first arm that sends something, which the others are compared with.
+    A line marks the accuracy of the first arm that sends something, with which the others are compared.
     """
     groups = list(dict.fromkeys(mark.group for mark in marks))
     rows = [place + GAP * groups.index(mark.group) for place, mark in enumerate(marks)]
@@ -443,7 +448,7 @@ def _draw_interval(axes: Axes, row: float, mean: MeanOverSeeds, colour: str, fil
 
 
 def run_exchange(name: str, out: Path, options: Options) -> Outcome[ExchangeResult]:
-    """Run or finish the comparison of the recipe `runs/NAME`."""
+    """Run or resume the comparison of the recipe `runs/NAME`."""
     recipe = options.load(name, shrink_recipe)
     runs = options.run_seeds(recipe, out)
     results = compare_exchanges(recipe, runs, [out / f"seed{run.recipe.seed}" for run in runs])

@@ -1,4 +1,4 @@
-"""What vehicles exchange, of SECOND: `federation/exchange` with the recipe of detectors."""
+"""Comparison of exchanges for the object detector SECOND: `federation/exchange` with another recipe."""
 
 from functools import partial
 

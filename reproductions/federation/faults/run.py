@@ -1,8 +1,8 @@
 """Byzantine clients: three of ten vehicles send wrong updates, under four strategies.
 
-Lies: the change of the weights with its sign turned and multiplied by 4 (Li et al., "RSA", AAAI 2019); the change
+Attacks: the change of the weights with its sign flipped and multiplied by 4 (Li et al., "RSA", AAAI 2019); the change
 multiplied by the number of clients, as in model replacement (Bagdasaryan et al., "How To Backdoor Federated Learning",
-AISTATS 2020), or by more; and a training on wrong labels, l for L - 1 - l of L classes (Fang et al., "Local Model
+AISTATS 2020), or by more; and training on flipped labels, l for L - 1 - l of L classes (Fang et al., "Local Model
 Poisoning Attacks", USENIX Security 2020).
 """
 
@@ -43,7 +43,7 @@ from flcav.storage.records import Record
 
 BYZANTINE, ROUNDS, STEPS, LEARNING_RATE = 3, 10, 5, 0.05
 HONEST, LABELS = "none", "label flip"
-FACTORS = {"sign flip, -4": -4.0, "scaled, 10": 10.0, "scaled, 100": 100.0}  # of the change of the weights, by lie
+FACTORS = {"sign flip, -4": -4.0, "scaled, 10": 10.0, "scaled, 100": 100.0}  # on the change of the weights, by attack
 LIES = (HONEST, *FACTORS, LABELS)
 STRATEGIES: Mapping[str, Strategy] = {
     "FedAvg": FEDAVG,
@@ -61,13 +61,13 @@ class Liar:
     factor: float
 
     def train(self, weights: Weights, *, steps: int, learning_rate: float, seed: int) -> LocalUpdate:
-        """Return start + factor (trained - start) of all that is learned."""
-        found = self.client.train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
-        sent = dict(found.weights)
+        """Return start + factor (trained - start) for the learned arrays; raises as the client does."""
+        update = self.client.train(weights, steps=steps, learning_rate=learning_rate, seed=seed)
+        sent = dict(update.weights)
         for name in learned_names(weights):
             start = weights[name]
-            sent[name] = (start + self.factor * (found.weights[name] - start)).astype(start.dtype)
-        return LocalUpdate(sent, found.samples, found.loss)
+            sent[name] = (start + self.factor * (update.weights[name] - start)).astype(start.dtype)
+        return LocalUpdate(sent, update.samples, update.loss)
 
 
 @dataclass(frozen=True)
@@ -75,23 +75,23 @@ class FaultsSeed:
     """Accuracy in one seed."""
 
     seed: int
-    byzantine: tuple[str, ...]  # names of the vehicles that lie
-    accuracy: Mapping[str, Mapping[str, float]]  # by lie and strategy
+    byzantine: tuple[str, ...]  # names of the Byzantine vehicles
+    accuracy: Mapping[str, Mapping[str, float]]  # by attack and strategy
 
 
 @dataclass(frozen=True)
 class FaultsResult(Record):
-    """Accuracy on held-out drives after the federation, by lie and strategy: by seed, and means over seeds."""
+    """Accuracy on held-out drives after the federation, by attack and strategy: by seed, and means over seeds."""
 
-    pictures: int  # of the test
+    pictures: int  # number in the test
     scenes: int
     seeds: tuple[FaultsSeed, ...]
-    accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by lie and strategy
-    gained: Mapping[str, Mapping[str, MeanOverSeeds]]  # over FedAvg, by lie and strategy
+    accuracy: Mapping[str, Mapping[str, MeanOverSeeds]]  # by attack and strategy
+    gained: Mapping[str, Mapping[str, MeanOverSeeds]]  # over FedAvg, by attack and strategy
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return the accuracies in words, a sentence per lie."""
+        """Return the accuracies in words, a sentence per attack."""
         return [
             f"{lie}: " + ", ".join(f"{name} {mean.describe()}" for name, mean in row.items())
             for lie, row in self.accuracy.items()
@@ -99,7 +99,7 @@ class FaultsResult(Record):
 
 
 def repeat_faults(out: Path, seeds: int, progress: Report = ignore_progress) -> tuple[FaultsResult, dict[str, bytes]]:
-    """Record the drives into `out`, and federate once for each seed, lie and strategy; return numbers, no pictures."""
+    """Record the drives to `out`, federate for each seed, attack and strategy, and return results without pictures."""
     drives = record_drives(out, progress)
     right: dict[tuple[str, str], list[NDArray[np.bool_]]] = {}
     liars = []
@@ -122,7 +122,7 @@ def choose_liars(drives: Drives, seed: int) -> tuple[str, ...]:
 
 
 def make_clients(drives: Drives, liars: tuple[str, ...], lie: str) -> dict[str, Trainable]:
-    """Return the vehicles as clients, some of which lie."""
+    """Return the vehicles as clients, with the Byzantine ones under an attack."""
     clients: dict[str, Trainable] = {}
     for name, pictures in drives.vehicles.items():
         false = lie == LABELS and name in liars
@@ -133,7 +133,7 @@ def make_clients(drives: Drives, liars: tuple[str, ...], lie: str) -> dict[str, 
 def run_federation(
     drives: Drives, start: Weights, liars: tuple[str, ...], lie: str, strategy: Strategy, seed: int
 ) -> Weights:
-    """Return the weights after the federation; where they grew until nobody could train, those of the last round."""
+    """Return the weights after the federation; if training diverged, those of the last completed round."""
     account = Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", WEATHER.name, "wireless")
     reached: list[Weights] = [start]
     with contextlib.suppress(ClientFailed):
@@ -154,10 +154,10 @@ def summarise(
     liars: list[tuple[str, ...]],
     right: Mapping[tuple[str, str], list[NDArray[np.bool_]]],
 ) -> FaultsResult:
-    """Return the means over seeds, which share the test's scenes."""
+    """Return the means over seeds; these share the scenes of the test."""
     scenes = drives.test.scenes
 
-    floats = {key: [each.astype(float) for each in values] for key, values in right.items()}
+    floats = {key: [correct.astype(float) for correct in values] for key, values in right.items()}
     rows = tuple(
         FaultsSeed(
             number + 1,

@@ -1,8 +1,9 @@
-"""Groups on request against a fixed roster: accuracy by megabytes of uplink, at equal megabytes and after the plan.
+"""Groups on request compared with a fixed roster: accuracy by uplink, at equal megabytes and after the whole plan.
 
-Ten vehicles drive with a network that knows six of eight weathers. In one setting all of them meet the other two, in
-the other three do. A group is called as in stage II of a run (`flcav.runs.extras.groups.choosing`): who errs asks, all
-offer, the lead chooses by their data, and the group dissolves when its loss on held-back pictures has levelled off.
+Ten vehicles drive with a network that was trained on six of eight weathers. In one setting all of them meet the other
+two, in the other only three do. A group is formed as in stage II of a run (`flcav.runs.extras.groups.choosing`):
+vehicles with large losses request it, all vehicles offer their data, the lead chooses members by these offers, and the
+group dissolves when its loss on held-back pictures has levelled off.
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,24 +60,24 @@ UP: Any = {"stage": EDGE, "task": WEATHER.name, "link": "wireless", "direction":
 
 @dataclass(frozen=True)
 class Trajectory:
-    """A federation of one seed: the uplink so far, and the accuracy on the test drives, from before the first round."""
+    """A federation with one seed: uplink and accuracy on the test drives, before the first and after each round."""
 
-    up_mb: tuple[float, ...]
+    up_mb: tuple[float, ...]  # cumulated [MB]
     accuracy: tuple[float, ...]
-    members: tuple[str, ...]  # of each round, or of whom they are drawn
-    asked: tuple[str, ...] = ()  # of a group
+    members: tuple[str, ...]  # of all rounds, or those from which clients are drawn
+    asked: tuple[str, ...] = ()  # vehicles that requested the group
     at: Mapping[str, float] | None = None  # accuracy by `MEASURES`
-    gain_per_mb: Mapping[str, float] | None = None  # of accuracy since pretraining, by `MEASURES`
-    until_mb: float | None = None  # uplink until `TARGET`, at most that of the roster's whole plan
+    gain_per_mb: Mapping[str, float] | None = None  # gain in accuracy since pretraining per MB, by `MEASURES`
+    until_mb: float | None = None  # uplink until `TARGET` [MB], at most that of the roster's whole plan
 
 
 @dataclass(frozen=True)
 class GroupsResult(Record):
-    """Results by setting: trajectories by seed and rival, means over seeds, and differences to the fixed roster."""
+    """Results by setting: trajectories by seed and method, means over seeds, and differences to the fixed roster."""
 
-    pictures: int  # of the test
+    pictures: int  # number in the test
     scenes: int
-    meet: Mapping[str, tuple[str, ...]]  # by seed, the vehicles that meet the new weathers where three do
+    meet: Mapping[str, tuple[str, ...]]  # by seed, the vehicles that meet the new weathers if only three do
     trajectories: Mapping[str, Mapping[str, Mapping[str, Trajectory]]]  # by setting, seed and rival
     accuracy: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # by setting, measure and rival
     gains: Mapping[str, Mapping[str, Mapping[str, MeanOverSeeds]]]  # per megabyte
@@ -91,22 +92,22 @@ class GroupsResult(Record):
 
 @dataclass(frozen=True)
 class Followed:
-    """A federation's network, uplink [bytes] and vehicles after each round, from before the first."""
+    """Course of a federation: its weights and uplink before the first and after each round, and its vehicles."""
 
     weights: tuple[Weights, ...]
-    up_bytes: tuple[int, ...]
+    up_bytes: tuple[int, ...]  # cumulated
     members: tuple[str, ...]
-    asked: tuple[str, ...] = ()
+    asked: tuple[str, ...] = ()  # vehicles that requested the group
 
     def last_within(self, up_bytes: int) -> int:
-        """Return the last round with which no more bytes are sent."""
+        """Return the last round until which at most `up_bytes` bytes are sent."""
         return int(np.flatnonzero(np.array(self.up_bytes) <= up_bytes)[-1])
 
 
 def compare_groups(
     out: Path, seeds: int, progress: Report = ignore_progress, *, first: int = 1
 ) -> tuple[GroupsResult, dict[str, bytes]]:
-    """Record the drives into `out`, and federate by each setting, seed and rival; return numbers and a picture."""
+    """Record the drives to `out`, federate by each setting, seed and method, and return results and a picture."""
     drives = record_drives(out, progress)
     right: dict[tuple[str, str, str], list[NDArray[np.float64]]] = {}
     found: dict[str, dict[str, dict[str, Trajectory]]] = {setting: {} for setting in SETTINGS}
@@ -119,8 +120,8 @@ def compare_groups(
                 meet[str(seed)] = fleet.meet
             followed = {GROUP: call(fleet, seed), ROSTER: keep(fleet, seed), DRAWN: draw(fleet, seed)}
             found[setting][str(seed)], marks = score(followed, drives)
-            for key, each in marks.items():
-                right.setdefault((setting, *key), []).append(each)
+            for key, correct in marks.items():
+                right.setdefault((setting, *key), []).append(correct)
             done += 1
             progress(done, total, f"seed {seed}, {setting}")
     results = summarise(drives, meet, found, right)
@@ -128,27 +129,28 @@ def compare_groups(
 
 
 def keep(fleet: Fleet, seed: int) -> Followed:
-    """Return the rounds of all vehicles, with all of their pictures."""
+    """Return the rounds of the fixed roster: all vehicles, with all of their pictures."""
     return follow(fleet, seed, Ledger(LinkMegabytes(1e6, 0.0)), [*fleet.whole])
 
 
 def draw(fleet: Fleet, seed: int) -> Followed:
-    """Return rounds of as many vehicles as a group has at most, drawn for each, with all of their pictures."""
+    """Return rounds with as many vehicles as the largest group, drawn for each round, with all of their pictures."""
     rules = Rules(selection=Selection(rule="uniform", clients=REQUESTS.most))
     return follow(fleet, seed, Ledger(LinkMegabytes(1e6, 0.0)), [*fleet.whole], rules)
 
 
 def call(fleet: Fleet, seed: int) -> Followed:
-    """Return the rounds of the group that those vehicles call whose loss on held-back pictures is above the limit."""
-    book, limit = Ledger(LinkMegabytes(1e6, 0.0)), REQUESTS.excess * fleet.loss
-    losses = {name: float(measure_losses(fleet.start, own).mean()) for name, own in fleet.held.items()}
+    """Return the rounds of a group; vehicles with a loss on held-back pictures above the limit request it."""
+    book = Ledger(LinkMegabytes(1e6, 0.0))
+    limit = REQUESTS.excess * fleet.loss
+    losses = {name: float(measure_losses(fleet.start, held).mean()) for name, held in fleet.held.items()}
     asked = sorted((name for name, loss in losses.items() if loss > limit), key=lambda name: -losses[name])
     if not asked:
         return Followed((fleet.start,), (0,), ())
     for name in asked:
         about = {"position": np.zeros(3, np.float32), "loss": np.array([losses[name]], np.float32)}
         send_message(book, pack_arrays(about), client=name, **UP)
-    offers = {name: make_offer(own, fleet.start, seed) for name, own in fleet.train.items()}
+    offers = {name: make_offer(pictures, fleet.start, seed) for name, pictures in fleet.train.items()}
     for name, offer in offers.items():
         send_message(book, offer.message(), client=name, **UP)
     chosen = choose_members(REQUESTS, asked, weigh_offers(offers), {})
@@ -158,17 +160,18 @@ def call(fleet: Fleet, seed: int) -> Followed:
 def follow(
     fleet: Fleet, seed: int, book: Ledger, members: Sequence[str], rules: Rules = EVERYBODY, asked: Sequence[str] = ()
 ) -> Followed:
-    """Return the rounds of the `members`; a group, of which some `asked`, dissolves when its loss has levelled off."""
-    kept, told = [fleet.start], pack_arrays({"loss": np.zeros(1, np.float32)})
+    """Return the rounds of the `members`; a group, requested by `asked`, dissolves when its loss has levelled off."""
+    kept = [fleet.start]
+    report = pack_arrays({"loss": np.zeros(1, np.float32)})
     held = [fleet.held[name] for name in members]
-    losses = [float(np.mean([measure_losses(fleet.start, own).mean() for own in held]))]
+    losses = [float(np.mean([measure_losses(fleet.start, pictures).mean() for pictures in held]))]
 
     def after(number: int, weights: Weights, _loss: float | None) -> None:
         kept.append(weights)
         if asked:
-            losses.append(float(np.mean([measure_losses(weights, own).mean() for own in held])))
+            losses.append(float(np.mean([measure_losses(weights, pictures).mean() for pictures in held])))
             for name in members:
-                send_message(book, told, client=name, round_=number, **UP)
+                send_message(book, report, client=name, round_=number, **UP)
             if has_levelled(losses, REQUESTS):
                 raise RoundsOver
 
@@ -189,20 +192,20 @@ def follow(
 def score(
     followed: Mapping[str, Followed], drives: Drives
 ) -> tuple[dict[str, Trajectory], dict[tuple[str, str], NDArray[np.float64]]]:
-    """Return the trajectories by rival, and which test pictures (N,) are right, by measure and rival."""
+    """Return the trajectories by method, and the correct test pictures (N,) by measure and method."""
     found: dict[str, Trajectory] = {}
     marks: dict[tuple[str, str], NDArray[np.float64]] = {}
     group_bytes, most_mb = followed[GROUP].up_bytes[-1], followed[ROSTER].up_bytes[-1] / BYTES_PER_MB
-    for name, own in followed.items():
-        right = [find_right(weights, drives.test).astype(float) for weights in own.weights]
-        mb = [each / BYTES_PER_MB for each in own.up_bytes]
-        ends = {MEGABYTES: own.last_within(group_bytes), WHOLE: len(right) - 1}
+    for name, course in followed.items():
+        right = [find_right(weights, drives.test).astype(float) for weights in course.weights]
+        mb = [sent / BYTES_PER_MB for sent in course.up_bytes]
+        ends = {MEGABYTES: course.last_within(group_bytes), WHOLE: len(right) - 1}
         at = {measure: float(right[end].mean()) for measure, end in ends.items()}
         gain = {m: (at[m] - float(right[0].mean())) / mb[end] if end else 0.0 for m, end in ends.items()}
-        accuracy = tuple(round(float(each.mean()), 5) for each in right)
-        until = next((sent for sent, each in zip(mb, accuracy, strict=True) if each >= TARGET), most_mb)
+        accuracy = tuple(round(float(correct.mean()), 5) for correct in right)
+        until = next((sent for sent, value in zip(mb, accuracy, strict=True) if value >= TARGET), most_mb)
         reached = (at, gain, round(min(until, most_mb), 4))
-        found[name] = Trajectory(tuple(np.round(mb, 4).tolist()), accuracy, own.members, own.asked, *reached)
+        found[name] = Trajectory(tuple(np.round(mb, 4).tolist()), accuracy, course.members, course.asked, *reached)
         marks |= {(measure, name): right[end] for measure, end in ends.items()}
     return found, marks
 
@@ -213,11 +216,11 @@ def summarise(
     found: Mapping[str, Mapping[str, Mapping[str, Trajectory]]],
     right: Mapping[tuple[str, str, str], list[NDArray[np.float64]]],
 ) -> GroupsResult:
-    """Return the means over seeds, which share the test's scenes."""
+    """Return the means over seeds; these share the scenes of the test."""
 
     def gain(setting: str, measure: str, rival: str) -> MeanOverSeeds:
-        own = [seed[rival].gain_per_mb for seed in found[setting].values()]
-        return mean_over_seeds([each[measure] for each in own if each is not None])
+        gains = [seed[rival].gain_per_mb for seed in found[setting].values()]
+        return mean_over_seeds([by_measure[measure] for by_measure in gains if by_measure is not None])
 
     def difference(setting: str, measure: str, rival: str) -> MeanOverSeeds:
         pairs = zip(right[setting, measure, rival], right[setting, measure, ROSTER], strict=True)
@@ -252,25 +255,26 @@ def summarise(
 
 def groups_tables(results: GroupsResult) -> dict[str, str]:
     """Return Markdown by name: accuracy, groups, differences."""
-    accuracy, groups = list[list[str]](), list[list[str]]()
+    accuracy = list[list[str]]()
+    groups = list[list[str]]()
     claims: dict[tuple[str, ...], MeanOverSeeds] = {}
     for setting in SETTINGS:
         seeds = results.trajectories[setting]
         for rival in RIVALS:
-            own = [seed[rival] for seed in seeds.values()]
+            by_seed = [seed[rival] for seed in seeds.values()]
             means = [results.accuracy[setting][measure][rival].describe() for measure in MEASURES]
             gain = results.gains[setting][WHOLE][rival].describe()
-            rounds = np.mean([len(each.up_mb) - 1 for each in own])
-            sent = np.mean([each.up_mb[-1] for each in own])
+            rounds = np.mean([len(one.up_mb) - 1 for one in by_seed])
+            sent = np.mean([one.up_mb[-1] for one in by_seed])
             until = results.until_mb[setting][rival].describe()
             accuracy.append([setting, rival, *means, f"{rounds:.1f}", f"{sent:.2f}", gain, until])
             for measure in (*MEASURES, UNTIL) if rival != ROSTER else ():
                 claims[setting, measure, rival] = results.differences[setting][measure][rival]
-        for seed, rivals in sorted(seeds.items(), key=lambda each: int(each[0])):
+        for seed, rivals in sorted(seeds.items(), key=lambda item: int(item[0])):
             group = rivals[RIVALS[1]]
-            told = (", ".join(group.asked), ", ".join(group.members))
+            names = (", ".join(group.asked), ", ".join(group.members))
             met = ", ".join(results.meet[seed]) if setting == SETTINGS[0] else "all"
-            groups.append([setting, seed, met, *told, str(len(group.up_mb) - 1), f"{group.up_mb[0] * 1000:.1f}"])
+            groups.append([setting, seed, met, *names, str(len(group.up_mb) - 1), f"{group.up_mb[0] * 1000:.1f}"])
     heads = (
         f"vehicles, {len(results.meet)} seeds",
         "rounds",
@@ -294,7 +298,7 @@ COLOURS = (style.INK, style.BLUE, style.ORANGE)
 
 
 class Reached(Protocol):
-    """A federation's accuracy after each round, by what its vehicles have sent [MB], from before the first."""
+    """Accuracy of a federation before the first and after each round, with the cumulated uplink [MB]."""
 
     @property
     def up_mb(self) -> Sequence[float]:
@@ -317,8 +321,9 @@ def draw_by_megabytes(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], 
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for panel, (setting, seeds) in zip(panels, found.items(), strict=True):
         for name, colour in zip(names, COLOURS, strict=False):
-            for number, own in enumerate(seeds.values()):
-                mb, accuracy = np.asarray(own[name].up_mb), np.asarray(own[name].accuracy)
+            for number, by_name in enumerate(seeds.values()):
+                mb = np.asarray(by_name[name].up_mb)
+                accuracy = np.asarray(by_name[name].accuracy)
                 panel.plot(mb, accuracy, color=colour, linewidth=0.9, alpha=0.8, label=None if number else name)
                 panel.plot(mb[-1:], accuracy[-1:], "o", color=colour, markersize=3)
         panel.set(xlabel="uplink of the vehicles [MB]", title=setting)

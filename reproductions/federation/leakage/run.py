@@ -1,7 +1,7 @@
-"""Leakage against noise: accuracy of a federation, and what its server can tell about the vehicles' pictures.
+"""Leakage by amount of noise: accuracy of a federation, and attacks of its server on the privacy of vehicles' pictures.
 
-The server is curious and sees each update, so that noise is added by the vehicles themselves; or it sees masked updates
-and their sum alone.
+The server is honest but curious. It sees every update, with local noise of the vehicles, or only masked updates and
+their sum.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -51,29 +51,30 @@ from flcav.storage.records import Record
 
 
 def invert(start: Weights, sent: Weights) -> Vector:
-    """Return the input of layer F6 (120,) that explains the change of its weights and biases best.
+    """Return the least-squares estimate of the input of layer F6 (120,) from the change of its weights and biases.
 
-    x = sum_i b_i W_i / sum_i b_i^2 over rows W_i and biases b_i of the change; zeros where no bias changed.
+    x = sum_i b_i W_i / sum_i b_i^2 over rows W_i and biases b_i of the change; zeros if no bias changed.
     """
+    # The gradient of a fully connected layer for one sample is W_i = b_i x: every row of the change reveals the input.
     rows = np.asarray(sent[f"{HIDDEN}.weight"], np.float64) - start[f"{HIDDEN}.weight"]
     biases = np.asarray(sent[f"{HIDDEN}.bias"], np.float64) - start[f"{HIDDEN}.bias"]
     return (biases @ rows / max(float(biases @ biases), 1e-30)).astype(np.float32)
 
 
 def name_nearest(found: Vector, known: Vector) -> int:
-    """Return which of the known inputs (N, 120) has the largest cosine similarity with the one that was found."""
+    """Return the index of the known input (N, 120) with the largest cosine similarity to `found` (120,)."""
     return int(np.argmax(known @ found / np.maximum(np.linalg.norm(known, axis=1), 1e-12)))
 
 
 def membership_auc(members: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return the chance that a member has a lower loss than another picture, ties counted half."""
+    """Return the AUC of membership inference by loss: the probability that a member's loss is lower than another's."""
     less = members[:, None] < others[None]
     same = members[:, None] == others[None]
     return float(less.mean() + same.mean() / 2)
 
 
 def membership_advantage(members: NDArray[np.float64], others: NDArray[np.float64]) -> float:
-    """Return the shares of members and of others with a loss up to the members' mean, one less the other."""
+    """Return the membership advantage: the share of members less that of others with a loss up to the members' mean."""
     limit = members.mean()
     return float((members <= limit).mean() - (others <= limit).mean())
 
@@ -81,66 +82,66 @@ def membership_advantage(members: NDArray[np.float64], others: NDArray[np.float6
 NOISES = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1, 0.3, 1.0)  # standard deviation as a multiple of the clipping norm
 CLIP, DELTA = 1.0, 1e-5
 PICTURES, ROUNDS, STEPS, LEARNING_RATE = 16, 10, 20, 0.05  # pictures of each vehicle
-LONG_STEP = 1.0  # rate of the single step on one picture: longer than what clipping leaves of it
+LONG_STEP = 1.0  # rate of the single step on one picture: long enough to be clipped
 
 
 @dataclass(frozen=True)
 class Leaked:
-    """Accuracy and leakage of one seed, or the means over seeds by the name of each number."""
+    """Accuracy and leakage of one seed."""
 
     accuracy: float  # on held-out drives
-    membership_auc: float  # 0.5: members cannot be told from others
+    membership_auc: float  # 0.5: members cannot be distinguished from others
     membership_advantage: float
-    recognised_one: float  # share of vehicles whose picture the inversion of a step on one picture names
-    recognised_round: float  # share of vehicles of which the inversion of a whole update names a picture
+    recognised_one: float  # share of vehicles whose picture is recognised by inverting a step on one picture
+    recognised_round: float  # share of vehicles with a picture recognised by inverting a whole update
 
 
 @dataclass(frozen=True)
 class Attacked:
-    """A federation of one seed that was attacked."""
+    """Results of the attacks on a federation with one seed."""
 
-    by_update: Leaked  # by each vehicle's update
-    by_sum: Leaked  # by the mean of all
-    right: NDArray[np.bool_]  # (N,) whether the network at its end names the class of each picture of the test
+    by_update: Leaked  # from the vehicles' updates
+    by_sum: Leaked  # from the mean of all updates
+    right: NDArray[np.bool_]  # (N,) correct pictures of the test, by the final network
 
 
 @dataclass(frozen=True)
 class NoiseLevel:
-    """One amount of noise, or secure aggregation."""
+    """Results for one amount of noise, or for secure aggregation."""
 
     name: str
     epsilon: float | None  # of a vehicle's whole data after all rounds, at delta; None: unbounded
     seeds: tuple[Leaked, ...]
-    mean: Mapping[str, MeanOverSeeds]  # by name of the numbers
+    mean: Mapping[str, MeanOverSeeds]  # by field of `Leaked`
 
 
 @dataclass(frozen=True)
 class LeakageResult(Record):
     """Accuracy and leakage by amount of noise, and under secure aggregation."""
 
-    pictures: int  # that a picture is to be recognised among
+    pictures: int  # number of pictures among which one is recognised
     clip: float
     delta: float
     rounds: int
-    levels: tuple[NoiseLevel, ...]  # ascending noise
-    masked: NoiseLevel  # a single masked update
-    summed: NoiseLevel  # the sum of all updates, which secure aggregation shows
+    levels: tuple[NoiseLevel, ...]  # by ascending noise
+    masked: NoiseLevel  # attacks on masked updates
+    summed: NoiseLevel  # attacks on the sum, which secure aggregation reveals
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return a sentence per level, and one on what epsilon rests on."""
-        told = []
+        """Return a sentence per level, and one on the randomness that epsilon relies on."""
+        lines = []
         for level in (*self.levels, self.masked, self.summed):
             epsilon = "" if level.epsilon is None else f" (epsilon {level.epsilon:.3g})"
             numbers = ", ".join(f"{name} {mean.mean:.3f}" for name, mean in level.mean.items())
-            told.append(f"{level.name}{epsilon}: {numbers}")
-        return [*told, f"noise: {SEEDED}"]
+            lines.append(f"{level.name}{epsilon}: {numbers}")
+        return [*lines, f"noise: {SEEDED}"]
 
 
 def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) -> tuple[LeakageResult, dict[str, bytes]]:
-    """Record the drives into `out`, federate and attack; return the numbers, and the figure as PNG by file name."""
+    """Record the drives to `out`, federate and attack; return the results, and the figure as PNG by file name."""
     drives = record_drives(out, progress)
-    known = np.concatenate([each.features for each in drives.vehicles.values()])
+    known = np.concatenate([pictures.features for pictures in drives.vehicles.values()])
     names, levels, done = [*drives.vehicles], [], 0
     for noise in NOISES:
         privacy = Privacy(where="local", clip=CLIP, noise=noise, delta=DELTA, seeded=True) if noise else None
@@ -166,7 +167,7 @@ def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) ->
 
 
 def split_members(drives: Drives, seed: int) -> tuple[dict[str, Pictures], dict[str, Pictures]]:
-    """Return the pictures that each vehicle trains on, and as many others of the same drives that nobody sees."""
+    """Return the pictures that each vehicle trains on, and equally many of the same drives that are not used."""
     members, others = {}, {}
     for name, seen in drives.vehicles.items():
         order = stream(seed, "members", name).permutation(len(seen.labels))
@@ -181,65 +182,69 @@ def take(pictures: Pictures, places: Sequence[int] | NDArray[np.int64]) -> Pictu
 
 
 def attack(drives: Drives, known: Vector, rules: Rules, seed: int) -> Attacked:
-    """Return accuracy and leakage of a federation under these rules.
+    """Run a federation under `rules`, attack it, and return its accuracy and leakage.
 
-    known: (N, 120), the pictures that one is to be recognised among.
+    `known` (N, 120) are the features of the pictures among which one is recognised.
     """
     members, others = split_members(drives, seed)
     first = {name: take(pictures, [0]) for name, pictures in members.items()}
-    start, account = draw_head(seed), Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", WEATHER.name, "wireless")
+    start = draw_head(seed)
+    account = Account(Ledger(LinkMegabytes(1e6, 1e6)), "edge", WEATHER.name, "wireless")
     schedule = Schedule(ROUNDS, STEPS, LEARNING_RATE, LEARNING_RATE / 4, seed)
     vehicles = {name: Vehicle(pictures) for name, pictures in members.items()}
     single = {name: Vehicle(pictures, 1) for name, pictures in first.items()}
     final = federate(vehicles, start, schedule, account, rules=rules).weights
-    losses = [np.concatenate([measure_losses(final, each) for each in part.values()]) for part in (members, others)]
+    losses = [np.concatenate([measure_losses(final, seen) for seen in part.values()]) for part in (members, others)]
     right = find_right(final, drives.test)
-    told = (float(right.mean()), membership_auc(*losses), membership_advantage(*losses))
+    of_network = (float(right.mean()), membership_auc(*losses), membership_advantage(*losses))
     seen_one, mean_one = read_round(single, start, Schedule(1, 1, LONG_STEP, LONG_STEP, seed).work, rules)
     seen, mean = read_round(vehicles, start, schedule.work, rules)
 
-    def tell(sent_one: Mapping[str, Weights], sent: Mapping[str, Weights]) -> Leaked:
-        one, whole = share_recognised(start, sent_one, first, known), share_recognised(start, sent, members, known)
-        return Leaked(*told, one, whole)
+    def measure(sent_one: Mapping[str, Weights], sent: Mapping[str, Weights]) -> Leaked:
+        one = share_recognised(start, sent_one, first, known)
+        whole = share_recognised(start, sent, members, known)
+        return Leaked(*of_network, one, whole)
 
-    by_sum = tell(dict.fromkeys(members, mean_one), dict.fromkeys(members, mean))
-    return Attacked(tell(seen_one, seen), by_sum, right)
+    by_sum = measure(dict.fromkeys(members, mean_one), dict.fromkeys(members, mean))
+    return Attacked(measure(seen_one, seen), by_sum, right)
 
 
-def share_recognised(start: Weights, sent: Mapping[str, Weights], own: Mapping[str, Pictures], known: Vector) -> float:
-    """Return the share of vehicles of which the inversion of what was sent names one of its own pictures."""
+def share_recognised(
+    start: Weights, sent: Mapping[str, Weights], pictures: Mapping[str, Pictures], known: Vector
+) -> float:
+    """Return the share of vehicles for which the inversion of the sent weights recognises one of their pictures."""
     named = {name: known[name_nearest(invert(start, weights), known)] for name, weights in sent.items()}
-    return float(np.mean([(own[name].features == found).all(axis=1).any() for name, found in named.items()]))
+    return float(np.mean([(pictures[name].features == found).all(axis=1).any() for name, found in named.items()]))
 
 
 def make_level(
     test: Pictures, name: str, epsilon: float | None, seeds: Sequence[Attacked], *, by_sum: bool = False
 ) -> NoiseLevel:
-    """Return a level with the means over its seeds: of the accuracy over the scenes of `test`, too."""
-    leaked = tuple(each.by_sum if by_sum else each.by_update for each in seeds)
-    spread = {"accuracy": spread_over_scenes(test, [each.right.astype(float) for each in seeds])}
+    """Return a level with the means over its seeds; the interval of the accuracy also covers the scenes of `test`."""
+    leaked = tuple(attacked.by_sum if by_sum else attacked.by_update for attacked in seeds)
+    spread = {"accuracy": spread_over_scenes(test, [attacked.right.astype(float) for attacked in seeds])}
     means = {}
     for key in (field.name for field in fields(Leaked)):
-        values = [getattr(each, key) for each in leaked]
+        values = [getattr(one, key) for one in leaked]
         share = key != "membership_advantage"
         means[key] = mean_over_seeds(values, share=share, shared=spread.get(key, OWN_SCENES))
     return NoiseLevel(name, epsilon, leaked, means)
 
 
 COLOURS = (style.BLUE, style.VERMILLION, style.ORANGE, style.PURPLE)
-NAME_HEIGHT = 0.07  # of the axes: a line of text
+NAME_HEIGHT = 0.07  # height of a line of text, as a share of the axes
 
 
 @style.styled
 def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSeeds]]) -> Figure:
-    """Return the figure of shares in [0, 1], a line for each name; `levels` are the ticks' texts, noise and epsilon."""
+    """Return the chart of shares in [0, 1], a line per name; `levels` are the labels of ticks, noise and epsilon."""
     figure = style.canvas(8.6, 3.9)
     axes = figure.add_subplot()
     ends = style.keep_apart([line[0].mean for line in lines.values()], NAME_HEIGHT, 1.03)
     for (name, line), colour, end in zip(lines.items(), COLOURS, ends, strict=True):
-        axes.plot(range(len(levels)), [each.mean for each in line], "o-", color=colour, markersize=4)
-        for x, each in enumerate(line):
-            style.interval(axes, x, each, color=colour, linewidth=1)
+        axes.plot(range(len(levels)), [mean.mean for mean in line], "o-", color=colour, markersize=4)
+        for x, mean in enumerate(line):
+            style.interval(axes, x, mean, color=colour, linewidth=1)
         axes.annotate(name, (-0.15, end), color=colour, va="center", ha="right", fontsize=style.SMALL)
     axes.axhline(0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
     axes.set_xticks(range(len(levels)), levels)
@@ -252,7 +257,7 @@ def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSee
 
 
 class ReadGrid(LinkGrid):
-    """A grid whose server keeps the arrays of each client's last update as they were sent."""
+    """A grid whose server keeps the clients' last updates as they were sent."""
 
     def __init__(self, grid: Grid, names: Mapping[int, str]) -> None:
         self._grid, self.names = grid, names
@@ -269,10 +274,10 @@ class ReadGrid(LinkGrid):
 def read_round(
     clients: Mapping[str, Trainable], start: Weights, work: Callable[[int], LocalWork], rules: Rules
 ) -> tuple[dict[str, Weights], Weights]:
-    """Return what the server makes of each client's update in the first round, and the weights after it.
+    """Run the first round; return the weights that the server decodes from each update, and the weights after it.
 
-    work: of a round, counted from 1 (`Schedule.work`).
-    Of a masked update it takes the integers for a change of the weights.
+    `work` returns the local work of a round, counted from 1 (`Schedule.work`). The integers of a masked update are
+    decoded as a change of the weights.
     """
     secrets = {party: draw_secret() for party in rules.secret_parties([*clients]) if party in clients}
     with EmbeddedGrid(client_app(clients, FEDAVG, rules, secrets), [*clients]) as grid:
@@ -308,7 +313,7 @@ def leakage_tables(results: LeakageResult) -> dict[str, str]:
     return {
         "levels": format_table(("noise", "ε", *names.values()), levels),
         "secure": format_table(
-            ("what the server sees", *names.values()), [[name, *row(each)] for name, each in shown.items()]
+            ("what the server sees", *names.values()), [[name, *row(level)] for name, level in shown.items()]
         ),
     }
 

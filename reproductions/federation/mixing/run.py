@@ -1,14 +1,14 @@
-"""Robust rules under attack, with nearest-neighbour mixing and without, by share of attackers and unlikeness of data.
+"""Robust aggregation under attack, with and without nearest-neighbour mixing, by share of attackers and heterogeneity.
 
 Attackers collude, and know all honest updates of a round. *A little is enough*: all send the honest mean minus 1.5
 standard deviations of each coordinate (Baruch et al., NeurIPS 2019). *Inner product*: minus the honest mean change (Xie
-et al., UAI 2020). *Sign flip*: their own change times -4 (Li et al., AAAI 2019). *Label flip*: trained on l for L - 1 -
-l of L classes (Fang et al., USENIX Security 2020). *Noise*: the start with normal noise, ten times the length of the
-honest mean change.
+et al., UAI 2020). *Sign flip*: the attacker's change times -4 (Li et al., AAAI 2019). *Label flip*: trained on l for
+L - 1 - l of L classes (Fang et al., USENIX Security 2020). *Noise*: the start with Gaussian noise, ten times the norm
+of the honest mean change.
 
 Clients draw their classes from a Dirichlet distribution (Hsu et al., 2019): the smaller its concentration, the more
-unlike they are. All clients of a round train at once here, in one product of matrices a step, and no messages are sent;
-the updates are combined by the strategies themselves.
+heterogeneous their data. The clients of a round are trained together, by one matrix product per step and without
+messages; the updates are combined by the strategies of the package.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,13 +34,13 @@ from flcav.storage.records import Record
 
 CLIENTS, SAMPLES, TESTED, INPUTS, UNITS = 20, 64, 512, 16, 24
 ROUNDS, STEPS, BATCH, RATE = 25, 5, 16, 0.1
-SPREAD = 1.2  # standard deviation of a class about its centre, whose coordinates have that of 1
+SPREAD = 1.2  # standard deviation of a class about its centre; coordinates of centres have a standard deviation of 1
 ATTACKERS = (2, 4, 6, 8)  # of `CLIENTS`
 UNLIKENESS = {"alike": 1e6, "unlike": 1.0, "very unlike": 0.1}  # concentration of the Dirichlet distribution
 NONE, LITTLE, INNER, SIGN, LABEL, NOISE = "none", "a little", "inner product", "sign flip", "label flip", "noise"
 ATTACKS = (LITTLE, INNER, SIGN, LABEL, NOISE)
 DEVIATIONS, LENGTH = 1.5, 10.0
-WITHSTOOD = 0.05  # largest loss of accuracy against the plain mean without an attack
+WITHSTOOD = 0.05  # greatest loss of accuracy compared with the plain mean without an attack
 
 
 def make_rules(attackers: int) -> dict[str, Strategy]:
@@ -68,7 +68,7 @@ Floats = NDArray[np.floating]
 
 @dataclass(frozen=True)
 class Fleet:
-    """Samples of the clients of one seed, of which the first train on flipped labels where they attack so."""
+    """Samples of the clients of one seed; the first clients are the attackers."""
 
     features: Vector  # (clients, samples, inputs)
     labels: Labels  # (clients, samples)
@@ -76,7 +76,7 @@ class Fleet:
 
 
 def draw_fleet(unlikeness: str, seed: int) -> Fleet:
-    """Return samples about random centres of the classes; each client has its own shares of these."""
+    """Return samples of Gaussian classes about random centres; clients draw different shares of the classes."""
     rng = stream(seed, "clusters")
     centres = rng.normal(size=(CLASSES, INPUTS))
 
@@ -84,15 +84,16 @@ def draw_fleet(unlikeness: str, seed: int) -> Fleet:
         return (centres[labels] + SPREAD * rng.normal(size=(*labels.shape, INPUTS))).astype(np.float32)
 
     shares = rng.dirichlet(np.full(CLASSES, UNLIKENESS[unlikeness]), CLIENTS)
-    labels = np.stack([rng.choice(CLASSES, SAMPLES, p=own) for own in shares])
+    labels = np.stack([rng.choice(CLASSES, SAMPLES, p=share) for share in shares])
     tested = np.arange(TESTED) % CLASSES
     return Fleet(see(labels), labels, Pictures(see(tested), tested, ()))
 
 
 def draw_network(seed: int) -> dict[str, Vector]:
-    """Return the first weights of a network of one hidden layer, by He et al., 2015."""
+    """Return the initial weights of a network with one hidden layer, by He et al., 2015."""
     rng = stream(seed, "network")
-    first, second = rng.normal(size=(UNITS, INPUTS)), rng.normal(size=(CLASSES, UNITS))
+    first = rng.normal(size=(UNITS, INPUTS))
+    second = rng.normal(size=(CLASSES, UNITS))
     arrays = {
         f"{HIDDEN}.weight": first * np.sqrt(2 / INPUTS),
         f"{HIDDEN}.bias": np.zeros(UNITS),
@@ -105,48 +106,51 @@ def draw_network(seed: int) -> dict[str, Vector]:
 def train_clients(
     start: Weights, features: Vector, labels: Labels, rate: float, rng: np.random.Generator
 ) -> dict[str, Vector]:
-    """Return the clients' weights (clients, ...) after gradient steps on the cross entropy, each on its own batches."""
+    """Return the clients' weights (clients, ...) after gradient steps on the cross entropy of different batches."""
     clients = np.arange(len(labels))[:, None]
-    own = {name: np.repeat(array[None], len(labels), axis=0).astype(np.float32) for name, array in start.items()}
+    reached = {name: np.repeat(array[None], len(labels), axis=0).astype(np.float32) for name, array in start.items()}
     for _ in range(STEPS):
         places = rng.integers(labels.shape[1], size=(len(labels), BATCH))
         seen, targets = features[clients, places], np.eye(CLASSES, dtype=np.float32)[labels[clients, places]]
-        hidden = np.maximum(seen @ own[f"{HIDDEN}.weight"].transpose(0, 2, 1) + own[f"{HIDDEN}.bias"][:, None], 0)
-        logits = hidden @ own[f"{OUT}.weight"].transpose(0, 2, 1) + own[f"{OUT}.bias"][:, None]
+        hidden = np.maximum(
+            seen @ reached[f"{HIDDEN}.weight"].transpose(0, 2, 1) + reached[f"{HIDDEN}.bias"][:, None], 0
+        )
+        logits = hidden @ reached[f"{OUT}.weight"].transpose(0, 2, 1) + reached[f"{OUT}.bias"][:, None]
         powers = np.exp(logits - logits.max(axis=2, keepdims=True))
         at_output = (powers / powers.sum(axis=2, keepdims=True) - targets) / BATCH
-        at_hidden = (at_output @ own[f"{OUT}.weight"]) * (hidden > 0)
+        at_hidden = (at_output @ reached[f"{OUT}.weight"]) * (hidden > 0)
         slopes = {
             f"{HIDDEN}.weight": at_hidden.transpose(0, 2, 1) @ seen,
             f"{HIDDEN}.bias": at_hidden.sum(axis=1),
             f"{OUT}.weight": at_output.transpose(0, 2, 1) @ hidden,
             f"{OUT}.bias": at_output.sum(axis=1),
         }
-        own = {name: array - np.float32(rate) * slopes[name] for name, array in own.items()}
-    return own
+        reached = {name: array - np.float32(rate) * slopes[name] for name, array in reached.items()}
+    return reached
 
 
 def lie(attack: str, attackers: int, start: Floats, sent: Floats, rng: np.random.Generator) -> Floats:
-    """Return what the clients send (clients, coordinates), of whom the first attack; `sent` is what all have trained.
+    """Return the updates (clients, coordinates) under an attack by the first clients, from the trained ones, `sent`.
 
-    start: (coordinates,) that the round began with. Under `LABEL` attackers send what they have trained, as all do.
+    `start` (coordinates,) are the weights at the start of the round. Under `LABEL` attackers send what they trained.
     """
     honest = sent[attackers:].astype(np.float64)
-    change, found = honest.mean(axis=0) - start, sent.copy()
+    change = honest.mean(axis=0) - start
+    updates = sent.copy()
     if attack == LITTLE:
-        found[:attackers] = honest.mean(axis=0) - DEVIATIONS * honest.std(axis=0)
+        updates[:attackers] = honest.mean(axis=0) - DEVIATIONS * honest.std(axis=0)
     elif attack == INNER:
-        found[:attackers] = start - change
+        updates[:attackers] = start - change
     elif attack == SIGN:
-        found[:attackers] = start - 4 * (sent[:attackers] - start)
+        updates[:attackers] = start - 4 * (sent[:attackers] - start)
     elif attack == NOISE:
         size = LENGTH * np.linalg.norm(change) / np.sqrt(change.size)
-        found[:attackers] = start + size * rng.normal(size=(attackers, change.size))
-    return found
+        updates[:attackers] = start + size * rng.normal(size=(attackers, change.size))
+    return updates
 
 
 def run_rounds(fleet: Fleet, strategy: Strategy, attack: str, attackers: int, seed: int) -> dict[str, Vector]:
-    """Return the weights after the rounds under a strategy, of which the first `attackers` clients attack."""
+    """Return the weights after the rounds under a strategy, with the first `attackers` clients attacking."""
     labels = fleet.labels.copy()
     if attack == LABEL:
         labels[:attackers] = CLASSES - 1 - labels[:attackers]
@@ -164,23 +168,23 @@ def run_rounds(fleet: Fleet, strategy: Strategy, attack: str, attackers: int, se
             {name: part[i].reshape(array.shape) for part, (name, array) in zip(parts, reached.items(), strict=True)}
             for i in range(CLIENTS)
         ]
-        combined = strategy.combine(reached, [LocalUpdate(each, SAMPLES, 0.0) for each in sent])
+        combined = strategy.combine(reached, [LocalUpdate(weights, SAMPLES, 0.0) for weights in sent])
         reached = {name: np.asarray(array, np.float32) for name, array in combined.items()}
     return reached
 
 
 @dataclass(frozen=True)
 class Withstood(Record):
-    """Accuracy under one attack: by rule, means over seeds."""
+    """Accuracy under one attack by rule, as means over seeds."""
 
     unlikeness: str
-    attackers: int  # of `CLIENTS`
+    attackers: int  # number of `CLIENTS`
     attack: str
     accuracy: Mapping[str, MeanOverSeeds]
-    lost: Mapping[str, MeanOverSeeds]  # accuracy of the plain mean without an attack, minus that
+    lost: Mapping[str, MeanOverSeeds]  # loss of accuracy compared with the plain mean without an attack
 
     def withstands(self, rule: str) -> bool:
-        """Return whether a rule loses no more than `WITHSTOOD` in the mean over seeds."""
+        """Return whether the mean loss of accuracy over seeds is at most `WITHSTOOD`."""
         return self.lost[rule].mean <= WITHSTOOD
 
 
@@ -190,45 +194,45 @@ class WithstoodResult(Record):
 
     clients: int
     seeds: int
-    rows: tuple[Withstood, ...]  # those without an attack, too
+    rows: tuple[Withstood, ...]  # also without an attack
     provenance: Provenance
 
     def worst(self, unlikeness: str, attackers: int, rule: str) -> Withstood:
-        """Return the attack that costs a rule most."""
-        own = [each for each in self.attacked if (each.unlikeness, each.attackers) == (unlikeness, attackers)]
-        return max(own, key=lambda each: each.lost[rule].mean)
+        """Return the worst attack for a rule: that with the greatest loss of accuracy."""
+        rows = [row for row in self.attacked if (row.unlikeness, row.attackers) == (unlikeness, attackers)]
+        return max(rows, key=lambda row: row.lost[rule].mean)
 
     def rows_of(self, unlikeness: str, attack: str) -> list[Withstood]:
-        """Return the rows of an attack, one for each number of attackers."""
-        return [each for each in self.rows if (each.unlikeness, each.attack) == (unlikeness, attack)]
+        """Return the rows of an attack, by number of attackers."""
+        return [row for row in self.rows if (row.unlikeness, row.attack) == (unlikeness, attack)]
 
     @property
     def attacked(self) -> list[Withstood]:
         """Return the rows with an attack."""
-        return [each for each in self.rows if each.attack != NONE]
+        return [row for row in self.rows if row.attack != NONE]
 
     def count(self, rule: str) -> int:
-        """Return how many of the rows with an attack a rule withstands."""
-        return sum(each.withstands(rule) for each in self.attacked)
+        """Return the number of attacked rows that a rule withstands."""
+        return sum(row.withstands(rule) for row in self.attacked)
 
     def sentences(self) -> list[str]:
-        """Return what each rule withstands, a sentence per rule."""
+        """Return the number of attacks that each rule withstands, in words."""
         return [f"{rule}: withstands {self.count(rule)} of {len(self.attacked)}" for rule in RULES]
 
 
 def repeat_withstood(
     out: Path, seeds: int, progress: Report = ignore_progress
 ) -> tuple[WithstoodResult, dict[str, bytes]]:
-    """Run the rounds of all rules, attacks, shares and unlikeness for each seed; nothing is recorded into `out`."""
+    """Run the rounds for all rules, attacks, shares, heterogeneities and seeds; nothing is written to `out`."""
     cases = [(name, count, attack) for name in UNLIKENESS for count in ATTACKERS for attack in (NONE, *ATTACKS)]
     accuracy: dict[tuple[str, int, str], dict[str, list[float]]] = {}
     for done, (name, count, attack) in enumerate(cases):
-        found = accuracy[name, count, attack] = {rule: [] for rule in RULES}
+        by_rule = accuracy[name, count, attack] = {rule: [] for rule in RULES}
         for seed in range(1, seeds + 1):
             fleet = draw_fleet(name, seed)
             for rule, strategy in make_rules(count).items():
                 weights = run_rounds(fleet, strategy, attack, count, seed)
-                found[rule].append(float(find_right(weights, fleet.test).mean()))
+                by_rule[rule].append(float(find_right(weights, fleet.test).mean()))
         progress(done + 1, len(cases), f"{name}, {count} of {CLIENTS}, {attack}")
     result = summarise_withstood(accuracy, seeds)
     shares = [100 * count / CLIENTS for count in ATTACKERS]
@@ -239,18 +243,18 @@ def repeat_withstood(
 def summarise_withstood(
     accuracy: Mapping[tuple[str, int, str], Mapping[str, list[float]]], seeds: int
 ) -> WithstoodResult:
-    """Return the means over seeds; each has test samples of its own."""
+    """Return the means over seeds, which have different test samples."""
     rows = []
-    for (name, count, attack), found in accuracy.items():
+    for (name, count, attack), by_rule in accuracy.items():
         best = np.array(accuracy[name, count, NONE]["mean"])
-        means = {rule: mean_over_seeds(values, share=True) for rule, values in found.items()}
-        lost = {rule: mean_over_seeds((best - values).tolist()) for rule, values in found.items()}
+        means = {rule: mean_over_seeds(values, share=True) for rule, values in by_rule.items()}
+        lost = {rule: mean_over_seeds((best - values).tolist()) for rule, values in by_rule.items()}
         rows.append(Withstood(name, count, attack, means, lost))
     return WithstoodResult(CLIENTS, seeds, tuple(rows), provenance())
 
 
 def list_worst(result: WithstoodResult) -> dict[str, dict[str, list[float]]]:
-    """Return by unlikeness and rule the accuracy under the worst attack at each share of attackers."""
+    """Return the accuracies under the worst attack at each share of attackers, by heterogeneity and rule."""
     return {
         name: {rule: [result.worst(name, count, rule).accuracy[rule].mean for count in ATTACKERS] for rule in RULES}
         for name in UNLIKENESS
@@ -264,14 +268,14 @@ COLOURS = {
     "Krum": style.VERMILLION,
     "multi-Krum": style.GREEN,
 }
-MIXED = "mixing, "  # begins the names of rules after mixing
+MIXED = "mixing, "  # prefix of rules with mixing
 
 
 @style.styled
 def draw_withstood(
     shares: Sequence[float], lines: Mapping[str, Mapping[str, Sequence[float]]], best: Mapping[str, float]
 ) -> Figure:
-    """Return the figure; `lines`: by panel and rule the accuracy at each share, `best`: that without an attack."""
+    """Return the figure of accuracies at `shares` of attackers [%], by panel and rule; `best` are without an attack."""
     figure = style.canvas(9.0, 3.8)
     for number, (name, rules) in enumerate(lines.items(), 1):
         axes = figure.add_subplot(1, len(lines), number)
@@ -290,7 +294,7 @@ def draw_withstood(
     return figure
 
 
-THIRTY = 6  # attackers of 20, whom one table has in full
+THIRTY = 6  # number of attackers, of 20, that one table shows in full
 
 
 def withstood_tables(results: WithstoodResult) -> dict[str, str]:
@@ -299,13 +303,13 @@ def withstood_tables(results: WithstoodResult) -> dict[str, str]:
     for name in UNLIKENESS:
         for count in ATTACKERS:
             share = f"{100 * count // CLIENTS} %"
-            own = [each for each in results.attacked if (each.unlikeness, each.attackers) == (name, count)]
-            told = [", ".join(each.attack for each in own if not each.withstands(rule)) or "–" for rule in RULES]
-            failing.append([name, share, *told])
+            rows = [row for row in results.attacked if (row.unlikeness, row.attackers) == (name, count)]
+            names = [", ".join(row.attack for row in rows if not row.withstands(rule)) or "–" for rule in RULES]
+            failing.append([name, share, *names])
             hardest = [results.worst(name, count, rule).accuracy[rule].mean for rule in RULES]
             worst.append([name, share, *(f"{accuracy:.2f}" for accuracy in hardest)])
         for attack in (NONE, *ATTACKS):
-            (row,) = [each for each in results.rows_of(name, attack) if each.attackers == THIRTY]
+            (row,) = [one for one in results.rows_of(name, attack) if one.attackers == THIRTY]
             whole.append([name, attack, *(row.accuracy[rule].describe() for rule in RULES)])
     counts = ["all", "", *(f"{results.count(rule)} of {len(results.attacked)} withstood" for rule in RULES)]
     return {

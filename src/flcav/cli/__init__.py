@@ -1,1 +1,1 @@
-"""The command line: parse, call, print."""
+"""Command line of flcav: commands parse their arguments, call the library, and print."""

@@ -1,4 +1,4 @@
-"""`flcav carla serve`: our own towns for the clients of CARLA 0.9.16."""
+"""`flcav carla serve`: a server for clients of CARLA 0.9.16, without CARLA."""
 
 import ipaddress
 import logging
@@ -43,8 +43,8 @@ def serve(
     calls = Calls(Maps(maps), town, seed=seed, traffic=traffic, port=port, quality=quality)
     calls.episode.warm_up()
     name = calls.episode.served.name
-    told = "" if quality == Quality.HIGH else f"; colour images of {quality} quality"
-    serve_calls(calls, doors, lambda: echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}{told}"))
+    note = "" if quality == Quality.HIGH else f"; colour images of {quality} quality"
+    serve_calls(calls, doors, lambda: echo(f"{name}: ready for clients of CARLA {VERSION} at {host}:{port}{note}"))
 
 
 def _is_loopback(host: str) -> bool:

@@ -36,9 +36,9 @@ def record(
     check_writable(out)
     recipe = find_recipe(recipe)
     changes = {name: value for name, value in (("frames", frames), ("seed", seed)) if value is not None}
-    asked = load_recipe(recipe)
-    asked = parse_recipe(asked.model_dump() | changes, str(recipe))
-    source = open_source(asked, recipe.parent)
+    wanted = load_recipe(recipe)
+    wanted = parse_recipe(wanted.model_dump() | changes, str(recipe))
+    source = open_source(wanted, recipe.parent)
     with progress.show_progress(f"record {out}") as report:
         written = write(source, out, jobs=jobs, engine=engine, progress=report)
     manifest = read_manifest(out)
@@ -50,11 +50,11 @@ def record(
         f"{plural(counts.annotations, 'annotation')}, {plural(counts.points, 'point')}, "
         f"{plural(counts.images, 'image')}, {size_mb:.1f} MB"
     )
-    if asked.scenarios:
+    if wanted.scenarios:
         happened = [event.kind for scene in manifest.scenes for event in Trace.load(out / trace_path(scene)).events]
-        asked_for = counts.scenes * len(asked.scenarios)
-        each = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
-        echo(f"corner cases: {len(happened)} of {asked_for} found their moment ({each or 'none'})")
+        planned = counts.scenes * len(wanted.scenarios)
+        by_kind = ", ".join(f"{happened.count(kind)} {kind}" for kind in sorted(set(happened)))
+        echo(f"corner cases: {len(happened)} of {planned} found their moment ({by_kind or 'none'})")
 
 
 def validate(
@@ -147,19 +147,19 @@ def export(
     from flcav.dataset.store import Dataset
     from flcav.interface import progress
 
-    every = {
+    values = {
         "labels": labels,
         "validation": validation,
         "min_pixels": min_pixels,
         "min_points": min_points,
         "calibration": calibration,
     }
-    asked = {name: value for name, value in every.items() if value is not None}
-    options = parse_config(ExportOptions, asked, "export")
-    export_format(format)  # a wrong name is told before a wrong folder
+    given = {name: value for name, value in values.items() if value is not None}
+    checked = parse_config(ExportOptions, given, "export")
+    export_format(format)  # reports a wrong name before a wrong folder
     dataset = Dataset.open(folder)
     with progress.show_progress(f"export {out}") as report:
-        exported = write(dataset, format, out, options, progress=report)
+        exported = write(dataset, format, out, checked, progress=report)
     size_mb = sum(path.stat().st_size for path in out.rglob("*") if path.is_file()) / 1e6
     echo(f"{out}: exported {_format_counts(exported.counts)}, {size_mb:.1f} MB")
     for line in _format_left_out(exported.left_out):

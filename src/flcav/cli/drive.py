@@ -1,4 +1,4 @@
-"""`flcav drive`: closed-loop drives through scenarios, by what perception finds."""
+"""`flcav drive`: closed-loop drives through scenarios, on perception or ground truth."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -121,10 +121,10 @@ def drive(
             drives, films = (list(each) for each in zip(*film_jobs(tasks, sensed, jobs, report), strict=True))
     if out is not None:
         write_drives(out, sensed.line(), drives, films)
-    yield {"perception": sensed.line(), "drives": [own.as_json() for own in drives]}
+    yield {"perception": sensed.line(), "drives": [result.as_json() for result in drives]}
     yield sensed.line()
-    for own in drives:
-        yield own.line()
+    for result in drives:
+        yield result.line()
     yield describe_drives(drives)
     if out is not None:
         yield f"{out / 'report.html'}: measures with intervals, the drives, and their film"
@@ -138,5 +138,7 @@ def write_drives(out: Path, perceives: str, drives: "Sequence[DriveResult]", fil
 
     out.mkdir(parents=True, exist_ok=True)
     write_any_table(tabulate_drives(drives), out / "drives.csv")
-    write_json(out / "results.json", {"perception": perceives, "drives": [own.as_json() for own in drives]}, sort=False)
+    write_json(
+        out / "results.json", {"perception": perceives, "drives": [result.as_json() for result in drives]}, sort=False
+    )
     write_bytes(out / "report.html", drive_page(perceives, drives, films).encode())

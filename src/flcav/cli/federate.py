@@ -51,15 +51,15 @@ def federate(
 
     check_writable(out)
     found = find_recipe(recipe)
-    asked = load_run_recipe(found)
+    loaded = load_run_recipe(found)
     with live_steps("federate") as notify:
-        told = notify if wants_json() else _telling(notify)
+        watch = notify if wants_json() else _print_rounds(notify)
         how = {"beside": found.parent, "jobs": jobs, "runtime": runtime.value, "fleet": fleet, "stale": stale.value}
-        results = federate_regions(asked, out, arm=arm, notify=told, **how)
+        results = federate_regions(loaded, out, arm=arm, notify=watch, **how)
     times = measure_times(results, out)
     yield results.as_json() | times.as_json()
-    for each in results.federations:
-        yield f"{out / each.weights}: {_describe(each.result)}"
+    for federation in results.federations:
+        yield f"{out / federation.weights}: {_describe(federation.result)}"
     for task, seconds in times.train_s.items():
         yield f"{task}: train_s {seconds:.3g}, the median CPU time of a vehicle's training in a round [s]"
     if results.privacy is not None:
@@ -69,30 +69,31 @@ def federate(
 
 
 def _describe(result: "StageResult") -> str:
-    """Return a federation in words, with the vehicles that failed or were lost; on a network with its time."""
+    """Return a federation in words: rounds, vehicles, samples, time on a network, and failures."""
     from flcav.federation.state import describe_empty, describe_failures
 
-    told = f"{result.task} in {result.region}, {plural(result.rounds, 'round')}"
-    told += f", {plural(result.clients, 'vehicle')}, {plural(result.samples, 'sample')}"
+    text = f"{result.task} in {result.region}, {plural(result.rounds, 'round')}"
+    text += f", {plural(result.clients, 'vehicle')}, {plural(result.samples, 'sample')}"
     records = result.records or ()
     seconds = [record.seconds for record in records if record.seconds is not None]
-    told += f", {sum(seconds):.1f} s on the network" if seconds else ""
+    text += f", {sum(seconds):.1f} s on the network" if seconds else ""
     if result.kept is not None:
         weights = f"after round {result.kept}" if result.kept else "that it began with"
-        told += f", the training diverged: the weights are those {weights}"
-    rest = describe_empty([each.empty for each in records]), describe_failures([each.failed for each in records])
-    told = ", ".join([told, *filter(None, rest)])
-    return "; ".join([told, *result.describe_rows().values()])
+        text += f", the training diverged: the weights are those {weights}"
+    empty = describe_empty([record.empty for record in records])
+    failures = describe_failures([record.failed for record in records])
+    text = ", ".join([text, *filter(None, (empty, failures))])
+    return "; ".join([text, *result.describe_rows().values()])
 
 
-def _telling(notify: "Notify") -> "Notify":
+def _print_rounds(notify: "Notify") -> "Notify":
     """Return a `Notify` that also prints the rounds as they end."""
     from flcav.runs.edge_stage import tells_of_round
 
-    def tell(step: str, done: int, total: int, note: str) -> None:
+    def notify_and_print(step: str, done: int, total: int, note: str) -> None:
         of_round = tells_of_round(step, note)
         notify(step, done, total, "" if of_round else note)
         if of_round:
             echo(f"{step}, round {done} of {total}: {note}")
 
-    return tell
+    return notify_and_print

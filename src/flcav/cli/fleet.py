@@ -1,4 +1,4 @@
-"""`flcav fleet`: the authority of a fleet, and the fleet up and running."""
+"""`flcav fleet`: certificates and registry of a deployed fleet, and its processes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -132,26 +132,26 @@ def list_vehicles(
     registry = open_registry(folder)
     if audit:
         entries = registry.list_audit()
-        yield {"audit": [asdict(each) for each in entries]}
-        for each in entries:
-            told = f"{_date(each.time)} {each.action} {each.vehicle} {each.fingerprint[:16]} {each.reason}"
-            yield make_printable(told.rstrip(), 600)
+        yield {"audit": [asdict(entry) for entry in entries]}
+        for entry in entries:
+            line = f"{_date(entry.time)} {entry.action} {entry.vehicle} {entry.fingerprint[:16]} {entry.reason}"
+            yield make_printable(line.rstrip(), 600)
         return
-    found = registry.list_vehicles()
+    vehicles = registry.list_vehicles()
     rows = [
         {
-            "name": own.name,
-            "state": own.describe_state(),
-            "fingerprint": own.fingerprint,
-            "issued": own.issued,
-            "expires": own.expires,
-            "node": own.node,
+            "name": vehicle.name,
+            "state": vehicle.describe_state(),
+            "fingerprint": vehicle.fingerprint,
+            "issued": vehicle.issued,
+            "expires": vehicle.expires,
+            "node": vehicle.node,
         }
-        for own in found
+        for vehicle in vehicles
     ]
     yield {"vehicles": rows}
-    yield from map(_describe, found)
-    yield plural(len(found), "vehicle")
+    yield from map(_describe, vehicles)
+    yield plural(len(vehicles), "vehicle")
 
 
 @fleet.command()
@@ -173,20 +173,20 @@ def status(
     found = read_fleet_status(folder)
     yield found.as_json()
     yield "not up" if found.proxy is None else f"up at {found.proxy}, processes: {len(found.processes)}"
-    for own in found.vehicles:
-        there = "online" if own.online else "offline"
+    for vehicle in found.vehicles:
+        there = "online" if vehicle.online else "offline"
         yield (
-            f"{own.name}: {own.state}, {there}; {own.socket_up} bytes up and {own.socket_down} down crossed its "
-            f"sockets, {own.content_up} and {own.content_down} of them content"
+            f"{vehicle.name}: {vehicle.state}, {there}; {vehicle.socket_up} bytes up and {vehicle.socket_down} down "
+            f"crossed its sockets, {vehicle.content_up} and {vehicle.content_down} of them content"
         )
-        if own.release is not None:
-            yield f"    {own.release.describe()}"
+        if vehicle.release is not None:
+            yield f"    {vehicle.release.describe()}"
     if found.federation is not None:
         yield found.federation.describe()
-    for asked in found.requests:
-        yield asked.describe()
-    for each in found.refused:
-        yield f"refused: {each}"
+    for pending in found.requests:
+        yield pending.describe()
+    for refusal in found.refused:
+        yield f"refused: {refusal}"
     if found.free < LEAST_ROOM:
         yield f"{folder}: no room on its disk, {found.free} bytes are free"
 
@@ -237,7 +237,7 @@ def run_vehicle(folder: Path = typer.Argument(help="Folder of the vehicle, on th
 
 
 def _updater() -> dict[str, Callable[[Path], None]]:
-    """Return the process of a vehicle that follows releases; nothing without the extra that it needs."""
+    """Return the updater process of vehicles, which follows releases; empty without its optional dependency."""
     from importlib.util import find_spec
 
     if find_spec("tuf") is None:
@@ -250,13 +250,14 @@ def _updater() -> dict[str, Callable[[Path], None]]:
 def _describe_new(registry: "VehicleRegistry", certificate: bytes) -> str:
     from flcav.fleet.keys import fingerprint_of
 
-    own = registry.find(fingerprint_of(certificate))
-    assert own is not None
-    return _describe(own)
+    vehicle = registry.find(fingerprint_of(certificate))
+    assert vehicle is not None
+    return _describe(vehicle)
 
 
-def _describe(own: "RegisteredVehicle") -> str:
-    return f"{own.name} {own.describe_state()}, until {_date(own.expires)}, SHA-256 {own.fingerprint[:16]}"
+def _describe(vehicle: "RegisteredVehicle") -> str:
+    validity = f"{vehicle.describe_state()}, until {_date(vehicle.expires)}"
+    return f"{vehicle.name} {validity}, SHA-256 {vehicle.fingerprint[:16]}"
 
 
 def _date(seconds: int) -> str:

@@ -36,7 +36,7 @@ from flcav.config import InputError
 from flcav.interface.wording import describe_number, suggest
 
 INTERRUPTED = 130
-NO_FOLDER = (errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG)  # a path leads over a file, or a link to itself; no name
+NO_FOLDER = (errno.ENOTDIR, errno.ELOOP, errno.ENAMETOOLONG)  # bad paths: through a file or a link to itself, too long
 
 atexit.register(gc.freeze)  # searching all modules for garbage would take a second before the process ends
 
@@ -77,8 +77,10 @@ for name, group in {"towns": towns, "odd": odd, "carla": carla, "fleet": fleet, 
 
 
 def run(arguments: list[str] | None = None) -> None:
-    """Run the command line and exit with its code; only here are exceptions turned into exit codes."""
-    if arguments is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler:  # a process of its own
+    """Run the command line and exit with its code; exceptions become exit codes here only."""
+    if (
+        arguments is None and signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    ):  # not within another program
         signal.signal(signal.SIGINT, _interrupt)
     try:
         command = escape_markup(typer.main.get_command(app))
@@ -108,28 +110,29 @@ def run(arguments: list[str] | None = None) -> None:
 
 
 def _interrupt(*_: object) -> None:
-    """Handle the first Ctrl-C; what is pressed again while the command ends changes nothing."""
+    """Raise KeyboardInterrupt for the first Ctrl-C; later ones are ignored while the command ends."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     raise KeyboardInterrupt
 
 
 def _describe(error: click.ClickException) -> str:
-    """Return the message of a wrong call, which suggests a name once, and says how a number is written."""
+    """Return the message for a wrong call, with a suggestion for a misspelt name or a number with a unit."""
     if "Did you mean" in error.message:  # Typer has added what Click adds when it formats the message
         return error.message
     given = re.match(r"'(.*)' is not ", error.message)
     if not isinstance(error, click.BadParameter) or error.param is None or given is None:
         return error.format_message()
-    kind, told = error.param.type, error.format_message()
+    kind = error.param.type
+    message = error.format_message()
     if isinstance(kind, click.Choice):
-        return told.removesuffix(".") + suggest(given[1], map(str, kind.choices))
+        return message.removesuffix(".") + suggest(given[1], map(str, kind.choices))
     if isinstance(kind, click.types.FloatParamType):
-        said = describe_number(given[1], error.param.name or "")
-        return re.sub(r"is not a valid float( range)?\.", lambda _: said, told)
-    return told
+        advice = describe_number(given[1], error.param.name or "")
+        return re.sub(r"is not a valid float( range)?\.", lambda _: advice, message)
+    return message
 
 
 def _say(message: str) -> None:
-    """Print a message as one line on stderr; an empty one (after the help) is not printed."""
+    """Print a message as one line on stderr, unless it is empty, as after the help."""
     if line := one_line(message):
         print(f"flcav: {line}", file=sys.stderr)

@@ -1,4 +1,4 @@
-"""`flcav radio` and `flcav rounds`: rates of a recording's vehicles by radio, and federated rounds over it."""
+"""`flcav radio` and `flcav rounds`: radio rates of a recording's vehicles, and the clock of federated rounds."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -25,7 +25,7 @@ SEED = typer.Option(0, "--seed", min=0, help="Seed of shadowing and of the losse
 
 
 def read_radio_settings(path: Path | None) -> "NetworkSettings":
-    """Return the settings of a network in a YAML file, None: the defaults; raises `InputError` for measured rates."""
+    """Return the network settings in a YAML file, or the defaults for None; raises `InputError` for measured rates."""
     from flcav.config import InputError, read_config
     from flcav.network.clock.rounds import NetworkSettings
 

@@ -1,4 +1,4 @@
-"""Options that several commands share with their choices, checks of options, and the help: groups, examples, markup."""
+"""Options shared by several commands, their choices and checks, and the layout of the help."""
 
 import inspect
 import math
@@ -65,7 +65,7 @@ class Runtime(StrEnum):
 
 
 class Stale(StrEnum):
-    """Treatment of steps that were done by other code, see `flcav.runs.engine`."""
+    """Treatment of steps that were computed by other code, see `flcav.runs.engine`."""
 
     refuse = "refuse"
     redo = "redo"
@@ -103,21 +103,21 @@ STALE = typer.Option(
 
 
 def check_finite(parameter: click.Parameter, value: float | None) -> float | None:
-    """Callback of a number's option: return the value; raises `InputError` for nan, which passes any limits."""
+    """Return the value of a number's option (a callback); raises `InputError` for nan, which would pass any limit."""
     if value is not None and not math.isfinite(value):
         raise InputError(f"{parameter.opts[0]} {value}: a finite number is wanted")
     return value
 
 
 def check_all_finite(parameter: click.Parameter, values: list[float]) -> list[float]:
-    """Callback of a number's option that may be given several times: as `check_finite`, of each value."""
+    """Return the values of a repeatable number's option (a callback), checked as by `check_finite`."""
     for value in values:
         check_finite(parameter, value)
     return values
 
 
 def check_png(parameter: click.Parameter, value: Path | None) -> Path | None:
-    """Callback of a picture's option: return the path; raises `InputError` for one of another kind of file."""
+    """Return the path of a picture's option (a callback); raises `InputError` for other endings than .png."""
     if value is not None and value.suffix.lower() not in ("", ".png"):
         raise InputError(f"{parameter.opts[0]} {value}: a PNG picture is written; name it {value.with_suffix('.png')}")
     return value
@@ -132,7 +132,7 @@ def parse_axes(by: str) -> tuple[str, str]:
 
 
 def refuse_unused(what: str, *names: str) -> None:
-    """Raise `InputError` where an option of the parameters `names` was given, which has no effect on `what`."""
+    """Raise `InputError` if an option among the parameters `names` was given, since it has no effect on `what`."""
     context = click.get_current_context()
     for parameter in context.command.params:
         source = context.get_parameter_source(parameter.name or "")
@@ -143,7 +143,7 @@ def refuse_unused(what: str, *names: str) -> None:
 def escape_markup(command: click.Command) -> click.Command:
     """Escape Rich's markup in the help of a command, its parameters and its subcommands; return the command.
 
-    Typer would read "[m]" as a style. Lines of a paragraph are joined, to be wrapped at the width of the terminal.
+    Typer would read "[m]" as a style. Lines of a paragraph are joined, so that they wrap at the terminal's width.
     """
     for owner in (command, *command.params):
         text = inspect.cleandoc(getattr(owner, "help", None) or "")
@@ -153,11 +153,11 @@ def escape_markup(command: click.Command) -> click.Command:
     return command
 
 
-SHOWN = Path(__file__).with_name("commands.yaml")  # the groups of commands, with an example of each
+SHOWN = Path(__file__).with_name("commands.yaml")  # groups of commands, with examples
 
 
 def add_examples(app: click.Group) -> None:
-    """Put the commands of `app` into the groups of `SHOWN`, in their order, and an example below each one's options."""
+    """Arrange the commands of `app` in the groups of `SHOWN`, and add their examples below the options."""
     sections = yaml.safe_load(SHOWN.read_text(encoding="utf-8"))
     named = dict(_walk(app))
     listed: dict[str, click.Command] = {}
@@ -175,7 +175,7 @@ def add_examples(app: click.Group) -> None:
 
 
 def _walk(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:
-    """Yield each command by the words that call it."""
+    """Yield a command and its subcommands with the words that call them."""
     yield " ".join(words), command
-    for name, each in getattr(command, "commands", {}).items():
-        yield from _walk(each, (*words, name))
+    for name, subcommand in getattr(command, "commands", {}).items():
+        yield from _walk(subcommand, (*words, name))

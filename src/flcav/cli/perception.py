@@ -1,4 +1,4 @@
-"""`flcav train`, `evaluate`, `infer` and `errors`: networks on recorded frames, and what they get wrong in a town."""
+"""`flcav train`, `evaluate`, `infer` and `errors`: networks on recorded frames, and their errors in a town."""
 
 from collections import Counter
 from pathlib import Path
@@ -78,15 +78,15 @@ def train(
     with when_interrupted(kept):
         prepared = prepare_training(learner, request, out)
         if prepared.finished is not None:
-            train_prepared(prepared)  # its card may be missing
+            train_prepared(prepared)  # writes the card if it is missing
             echo(f"{out / WEIGHTS}: trained with these settings before, nothing to do")
             return
         echo("\n".join(prepared.lines()))
         with progress.show_progress(f"train {task}") as report:
             trained = train_prepared(prepared, report)
     card = trained.card
-    told = f"{out / WEIGHTS}: trained on {plural(card.samples, 'sample')}, {plural(card.learning.steps, 'step')}"
-    echo(f"{told}, mean loss of the last epoch {card.learning.loss:.3f}")
+    summary = f"{out / WEIGHTS}: trained on {plural(card.samples, 'sample')}, {plural(card.learning.steps, 'step')}"
+    echo(f"{summary}, mean loss of the last epoch {card.learning.loss:.3f}")
     if trained.evaluation is not None:
         echo("\n".join(["on the validation data:", *trained.evaluation.lines()]))
 
@@ -278,9 +278,9 @@ def errors(
         echo(found.chosen.sentence)
     echo(networks.origin_of(learned, weights))
     counts = Counter(error.kind for error in found)
-    told = ", ".join(f"{PLURALS.get(kind, kind)}: {count}" for kind, count in counts.items())
+    listed = ", ".join(f"{PLURALS.get(kind, kind)}: {count}" for kind, count in counts.items())
     lost = f"; {found.dropped} false positives that point at nothing in the town left out" if found.dropped else ""
-    echo(f"{out}: {told or 'no errors'}{lost}")
+    echo(f"{out}: {listed or 'no errors'}{lost}")
 
 
 def _draw_errors(town: "Town", found: "Registry") -> bytes:

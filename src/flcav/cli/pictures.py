@@ -62,9 +62,9 @@ def camera(
     if name is not None and name not in names[number]:
         raise InputError(f"{folder}: no camera '{name}' in {seen.key}; it has {', '.join(names[number])}")
     rows = arrange_cameras(seen, names[number] if name is None else [name])
-    shots = [[make_shot(seen, each) for each in row] for row in rows]
+    shots = [[make_shot(seen, shown) for shown in row] for row in rows]
     write_bytes(out, style.png(camera_sheet(f"{seen.key} · {seen.time_s:.1f} s", shots, boxes=boxes)))
-    echo(f"{out}: {seen.key}, {', '.join(each for row in rows for each in row)}")
+    echo(f"{out}: {seen.key}, {', '.join(shown for row in rows for shown in row)}")
 
 
 def view(

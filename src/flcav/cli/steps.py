@@ -17,7 +17,7 @@ EPSILON = "epsilon"  # in the notes of rounds with differential privacy
 
 @contextlib.contextmanager
 def live_steps(title: str) -> Iterator[Notify]:
-    """Yield a `Notify` that draws one bar per running step; without a terminal, one line per finished step."""
+    """Yield a `Notify` that draws a bar per running step, or prints a line per finished step without a terminal."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
@@ -32,15 +32,15 @@ def live_steps(title: str) -> Iterator[Notify]:
 
         def notify(step: str, done: int, total: int, note: str) -> None:
             nonlocal finished
-            if step == RIG:  # not of a step: what the run takes otherwise than it was recorded stays on the terminal
+            if step == RIG:  # no step: a difference between the run's rig and the recorded one, which stays visible
                 console.print(f"{title}: {note}", highlight=False)
                 return
             if step not in rows:
                 rows[step] = bars.add_task(f"  {step}", total=None, note="")
             bars.update(rows[step], completed=done, total=max(total, 1), note=note)
-            if EPSILON in note or FAILED in note:  # what a round cost, and whom it lost, stays on the terminal
-                told = f"{title}: {step}, round {done} of {total}: {note}"
-                console.print(told, highlight=False, soft_wrap=True)
+            if EPSILON in note or FAILED in note:  # privacy loss and failed clients of a round stay visible
+                line = f"{title}: {step}, round {done} of {total}: {note}"
+                console.print(line, highlight=False, soft_wrap=True)
             if DAMAGED in note:
                 console.print(f"{title}: {step}: {note}", highlight=False, markup=False, soft_wrap=True)
             if note in FINISHED:

@@ -1,4 +1,4 @@
-"""Reading users' tables (CSV or Parquet), with checks of columns and numbers."""
+"""Reader of users' tables (CSV or Parquet), with checks of columns and numbers."""
 
 import re
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f]")
 def read_input_table(path: Path, columns: Sequence[str], names: Sequence[str] = ()) -> pa.Table:
     """Return the CSV or Parquet table at `path`; raises `InputError` if it is no table, empty, or lacks a column.
 
-    names: columns that a CSV has as they are written, "007" not as 7; whole numbers without such zeros are numbers.
+    Columns in `names` of a CSV keep their spelling, such as "007", unless all their values are plain whole numbers.
     """
     table = read_parquet(path) if path.suffix.lower() == ".parquet" else _read_csv(path, names)
     for column in dict.fromkeys((*columns, *table.column_names)):
@@ -49,7 +49,7 @@ def _read_csv(path: Path, names: Sequence[str]) -> pa.Table:
 
 
 def numbers(table: pa.Table, columns: Sequence[str], path: Path) -> np.ndarray:
-    """Return the columns as finite floats (rows, columns); raises `InputError` naming row, column and value."""
+    """Return columns as an array of finite floats (rows, columns); raises `InputError` with row, column and value."""
     out = np.empty((table.num_rows, len(columns)))
     for i, column in enumerate(columns):
         for row, value in enumerate(table[column].to_pylist()):
@@ -60,6 +60,5 @@ def numbers(table: pa.Table, columns: Sequence[str], path: Path) -> np.ndarray:
             if not np.isfinite(out[row, i]):
                 if value is None or (isinstance(value, str) and not value.strip()):
                     raise InputError(f"{path}: row {row + 1}: {column} is empty, and must be a finite number")
-                told = shorten(value)
-                raise InputError(f"{path}: row {row + 1}: {column} = {told} is not a finite number")
+                raise InputError(f"{path}: row {row + 1}: {column} = {shorten(value)} is not a finite number")
     return out

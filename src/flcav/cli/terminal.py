@@ -19,8 +19,8 @@ from flcav.machine.locks import only_writer
 if TYPE_CHECKING:
     from rich.console import Console
 
-Answer = Iterator[Any]  # a JSON value, then lines: strings, tables, texts to be wrapped
-LONGEST = 1000  # characters of a message
+Answer = Iterator[Any]  # a JSON value, followed by lines: strings, or tables and texts of Rich
+LONGEST = 1000  # greatest length of a message
 AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 GOES_ON = "the same command goes on where it stopped"
 
@@ -31,29 +31,29 @@ def one_line(message: str) -> str:
 
 
 def echo(message: object = "", nl: bool = True, err: bool = False) -> None:
-    """Print a message on stdout or stderr, its invisible characters escaped.
+    """Print a message on stdout or stderr with its invisible characters escaped.
 
-    What commands print may come from files and from other machines, and must not rewrite what a terminal shows.
+    Text from files and other machines must not control the terminal, such as by escape sequences.
     """
     click.echo(escape_invisible(str(message), "\n\t"), nl=nl, err=err)
 
 
 def plain_console() -> "Console":
-    """Return a console on stdout without markup and emoji, since users' names may hold brackets and colons."""
+    """Return a console on stdout without markup and emoji, since users' names may have brackets and colons."""
     from rich.console import Console
 
     return Console(highlight=False, markup=False, emoji=False)
 
 
 def print_json(value: Json) -> None:
-    """Print one JSON object on stdout; numbers that JSON does not have, inf and nan, are null."""
+    """Print one JSON object on stdout, with null for inf and nan, which JSON does not have."""
     echo(json.dumps(_finite(value), allow_nan=False))
 
 
 def answer_json(command: Callable[..., Answer]) -> Callable[..., None]:
-    """Decorate a command that yields its answer as a JSON value, and then the lines of its answer, texts or Rich's.
+    """Decorate a command that yields its answer as a JSON value, followed by the lines of the answer in words.
 
-    It gets the option `--json`, by which the value is printed in place of the lines.
+    The command gets the option `--json`, which prints the value in place of the lines.
     """
 
     @functools.wraps(command)
@@ -76,25 +76,25 @@ def answer_json(command: Callable[..., Answer]) -> Callable[..., None]:
 
 
 def wants_json() -> bool:
-    """Return whether the command that runs was given `--json`."""
+    """Return whether the running command was given `--json`."""
     return bool(click.get_current_context().params.get("as_json"))
 
 
 def _finite(value: Json) -> Json:
     if isinstance(value, Mapping):
-        return {key: _finite(each) for key, each in value.items()}
+        return {key: _finite(item) for key, item in value.items()}
     if isinstance(value, Sequence) and not isinstance(value, str):
-        return [_finite(each) for each in value]
+        return [_finite(item) for item in value]
     return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Interrupted(Exception):
-    """Raised for Ctrl-C; the message says what is kept of the work."""
+    """Raised for Ctrl-C, with a message about the work that is kept."""
 
 
 @contextlib.contextmanager
 def when_interrupted(kept: Callable[[], str] = lambda: GOES_ON) -> Iterator[None]:
-    """Turn Ctrl-C within the context into `Interrupted` with the message of `kept`; Typer only sets an exit code."""
+    """Convert Ctrl-C within the context into `Interrupted` with the message of `kept`; Typer only sets an exit code."""
     try:
         yield
     except KeyboardInterrupt:
@@ -102,7 +102,7 @@ def when_interrupted(kept: Callable[[], str] = lambda: GOES_ON) -> Iterator[None
 
 
 def only_writer_of(option: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator of a command: while it runs, it holds the lock of the path that `option` has, if any."""
+    """Return a decorator of commands that holds the lock of the path given by `option`, if any, while they run."""
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
         @functools.wraps(command)

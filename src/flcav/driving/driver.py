@@ -1,14 +1,14 @@
-"""A driver: follows a route, keeps its distance, stops at red, and brakes for what is predicted to be in its way.
+"""Motion controller of the ego vehicle: follows a route, keeps its distance, stops at red, brakes for predicted paths.
 
-The corridor of the route tells where and when predicted footprints are in the way. Distances along it are from the
-vehicle's middle. A footprint is taken for `PARTS` points along each of its sides, which are nearer to each other than
-the corridor is wide for vehicles of up to 12 m.
+The corridor is the strip of the vehicle's width along its route. Predicted footprints of road users that overlap it
+are in the way. Distances along it are from the centre of the vehicle's box. A footprint is sampled at `PARTS` points on
+each of its long sides; they are closer to each other than the corridor is wide, for vehicles of up to 12 m.
 
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
-corridor at the time at which the vehicle would be there. Around vehicles that stand it looks for a way
-(`passing`), if its settings allow it. Where only more than `EMERGENCY_MPS2` avoids that, it brakes
-with all it has. Steering is pure pursuit (Coulter, CMU-RI-TR-92-01, 1992).
+corridor at the time at which the vehicle would be there. If its settings allow it, it passes standing vehicles
+(`passing`). Where more than `EMERGENCY_MPS2` is needed to avoid a collision, it brakes fully. Steering is pure pursuit
+(Coulter, CMU-RI-TR-92-01, 1992).
 """
 
 from collections.abc import Callable, Sequence
@@ -29,28 +29,29 @@ from flcav.world.dynamics.vehicle import BodyBlueprint
 from flcav.world.map.roads import Route
 
 PARTS = 6
-SPACING_M = 1.0  # of the points of the route that a place is compared with
-BEHIND_M = 6.0  # how far back, and
-AHEAD_M = 80.0  # ahead the corridor goes
+SPACING_M = 1.0  # between the points of the route that footprints are compared with
+BEHIND_M = 6.0  # length of the corridor behind the vehicle
+AHEAD_M = 80.0  # and ahead of it
 
 
 class Occupied(NamedTuple):
-    """The part of the corridor that each of N footprints covers at each of T times; empty where `low` > `high`."""
+    """Intervals of the corridor covered by N footprints at T times; empty where `low` > `high`."""
 
-    low: Array  # (N, T) nearest distance along the route [m], inf where it covers none
-    high: Array  # (N, T) farthest, -inf where it covers none
+    low: Array  # (N, T) near end [m] along the route from the vehicle's centre, inf where empty
+    high: Array  # (N, T) far end [m], -inf where empty
 
 
 def find_occupied(
     route: ReferenceLine, along: float, boxes: Boxes, path: Array, yaw: Array, half_width_m: float, margin_m: Array
 ) -> Occupied:
-    """Return what footprints cover of the corridor of a vehicle that is `along` the route [m].
+    """Return the intervals that footprints cover of the corridor of a vehicle which is `along` the route [m].
 
-    `boxes` give the sizes of N road users, `path` (N, T, 2) and `yaw` (N, T) their poses; `half_width_m` is that of
-    the vehicle, `margin_m` (N, T) what is kept free on all sides of each footprint.
+    `boxes` give the sizes of N road users, `path` (N, T, 2) [m] and `yaw` (N, T) [rad] their poses in the world frame;
+    `half_width_m` is half the vehicle's width [m], `margin_m` (N, T) the space kept free around each footprint [m].
     """
     n, times = yaw.shape
-    low, high = np.full((n, times), np.inf), np.full((n, times), -np.inf)
+    low = np.full((n, times), np.inf)
+    high = np.full((n, times), -np.inf)
     marks = np.arange(-BEHIND_M, AHEAD_M, SPACING_M)
     points = route.at(along + marks)
     heading, left = heading_vectors(points[:, 2]), left_vectors(points[:, 2])
@@ -69,7 +70,9 @@ def find_occupied(
     ahead = (gap * heading[nearest]).sum(axis=2)
     aside = (gap * left[nearest]).sum(axis=2)
     within = (np.abs(aside) <= half_width_m + margin_m[row, instant][:, None]) & (np.abs(ahead) <= 2 * SPACING_M)
-    sides = aside.min(axis=1) * aside.max(axis=1) < 0  # it reaches across the corridor's middle
+    # A footprint can block the corridor without a sampled point inside, such as a truck wider than the corridor. Then
+    # its points lie on both sides of the centre line.
+    sides = aside.min(axis=1) * aside.max(axis=1) < 0
     within |= (sides & ~within.any(axis=1))[:, None] & (np.abs(ahead) <= 2 * SPACING_M)
     at = marks[nearest] + ahead
     slack = margin_m[row, instant]
@@ -79,7 +82,7 @@ def find_occupied(
 
 
 def find_meeting(occupied: Occupied, at: Array, half_length_m: float) -> NDArray[np.bool_]:
-    """Return (N, T) whether a vehicle whose middle is `at` (T,) [m] along the corridor then touches each footprint."""
+    """Return whether (N, T) a vehicle touches each footprint, with its centre `at` (T,) [m] along the corridor."""
     return (occupied.low <= at + half_length_m) & (occupied.high >= at - half_length_m)
 
 
@@ -95,24 +98,26 @@ def _find_near(path: Array, points: Array, reach: Array) -> tuple[NDArray[np.int
     return row, instant
 
 
-GAIN_MPS2, EASE_MPS2 = 2.0, 2.5  # greatest acceleration, comfortable deceleration
-HEADWAY_S, STANDSTILL_M = 1.2, 2.0
+GAIN_MPS2 = 2.0  # greatest acceleration
+EASE_MPS2 = 2.5  # comfortable deceleration
+HEADWAY_S = 1.2
+STANDSTILL_M = 2.0  # gap to a standing leader
 EMERGENCY_MPS2 = 4.0  # from this need on all brakes are used
 ASIDE_MPS2 = 2.5  # greatest lateral acceleration in curves
-LINE_M = 4.0  # from the front to a stop line: a head beside it stays in the picture of a camera
-SAME_WAY = 0.7  # cosine between a road user's course and the route from which it is a leader
+LINE_M = 4.0  # from the front to a stop line: the signal head at the line stays in the camera's field of view
+SAME_WAY = 0.7  # cosine between a road user's course and the route above which it counts as a leader
 CURVES_M = np.arange(0.0, 45.0, 3.0)
 FARTHEST_GAP_M = 1e3
 
 
 @dataclass(frozen=True)
 class DriverSettings:
-    """Safety margins of a driver: a fixed distance, and a multiple of its perception's uncertainty."""
+    """Settings of a driver: its safety margins, fixed and by the uncertainty of perception, and whether it passes."""
 
-    margin_m: float = 0.4
-    sigmas: float = 0.0  # multiple of the standard deviation of predicted positions
-    most_m: float = 3.0  # the margin is never more
-    passes: Annotated[bool, WHERE_TRUE] = False  # looks for a way around vehicles that stand
+    margin_m: float = 0.4  # fixed part of the margin
+    sigmas: float = 0.0  # multiple of the standard deviation of predicted positions that is added to it
+    most_m: float = 3.0  # upper limit of the margin
+    passes: Annotated[bool, WHERE_TRUE] = False  # plans a path around standing vehicles
 
 
 DEFAULT = DriverSettings()
@@ -120,23 +125,23 @@ DEFAULT = DriverSettings()
 
 @dataclass(frozen=True)
 class EgoMotion:
-    """Pose and speed of the ego vehicle, by its own navigation."""
+    """Pose and speed of the ego vehicle in the world frame."""
 
-    x: float  # of the box's middle [m]
-    y: float
+    x: float  # of the box's centre [m]
+    y: float  # [m]
     yaw: float  # [rad]
-    speed: float  # [m/s]
-    along: float  # the route [m]
+    speed: float  # forward [m/s]
+    along: float  # distance along the route [m]
 
 
 @dataclass(frozen=True)
 class Decision:
-    """Controls of a driver, with the acceleration that they are for."""
+    """Controls of a driver at one step, with the acceleration that they aim at."""
 
     controls: Controls
-    acceleration: float  # that it wants [m/s^2]
-    emergency: bool
-    cause: int | str | None = None  # what it slows for: the row of `Seen`, or the light; None on a free road
+    acceleration: float  # target [m/s^2]
+    emergency: bool  # whether it brakes fully
+    cause: int | str | None = None  # of slowing down: a row of `Seen`, or the name of a light; None on a free road
 
 
 Need = tuple[float, int | str | None]  # an acceleration [m/s^2], and its cause as in `Decision`
@@ -150,7 +155,7 @@ def decide_controls(
     settings: DriverSettings = DEFAULT,
     lanes: BaseGeometry | None = None,
 ) -> Decision:
-    """Return the controls for the next tenth of a second; a way around is looked for in the area of the `lanes`."""
+    """Return the controls for the next step of 0.1 s; a path around standing vehicles has to stay within `lanes`."""
     wanted = find_speed(route, own, seen.speed_share)
     half = vehicle.size[0] / 2
     free = _follow(own.speed, wanted, FARTHEST_GAP_M, wanted)
@@ -179,7 +184,7 @@ def _least(needs: Sequence[Need]) -> Need:
 
 def _choose_line(
     route: Route,
-    own: EgoMotion,
+    ego: EgoMotion,
     seen: Seen,
     vehicle: BodyBlueprint,
     wanted: float,
@@ -188,36 +193,36 @@ def _choose_line(
     settings: DriverSettings,
     lanes: BaseGeometry | None,
 ) -> tuple[ReferenceLine, Need]:
-    """Return the route, or the line beside it on which the vehicle gets on best past who stands, and its need.
+    """Return the line to follow and its need: the route, or a line around a standing vehicle that blocks it.
 
-    `judge` returns the least need on a line with a margin (N, T) around the road users.
+    `judge` returns the lowest acceleration that is needed on a line, with a margin (N, T) [m] around road users.
     """
     here = judge(route, margin)
     standing = find_standing(seen.velocity, seen.boxes.label)
     if not settings.passes or lanes is None or not isinstance(here[1], int) or not standing[here[1]]:
         return route, here
-    free = min(_approach_speed(own.speed, wanted), 0.5)
+    free = min(_approach_speed(ego.speed, wanted), 0.5)
     if here[0] > free:
         return route, here
-    _, left = route.project(own.x, own.y, own.along)
-    ways: list[ReferenceLine] = [route, *list_lines(route, own.along, left, own.speed, vehicle.size[1], lanes)]
+    _, left = route.project(ego.x, ego.y, ego.along)
+    ways: list[ReferenceLine] = [route, *list_lines(route, ego.along, left, ego.speed, vehicle.size[1], lanes)]
     full = [here, *(judge(line, margin) for line in ways[1:])]
     for line, need in zip(ways, full):
         if need[0] > free:
             return line, need
     slim = np.where(standing[:, None], np.minimum(margin, SLIM_M), margin)
-    creeps = _approach_speed(own.speed, CREEPS_MPS)
+    creeps = _approach_speed(ego.speed, CREEPS_MPS)
     narrow = [judge(line, slim) for line in ways]
     best = max(range(len(ways)), key=lambda i: (min(narrow[i][0], creeps), full[i][0]))
     return ways[best], _least([narrow[best], (max(creeps, full[best][0]), full[best][1])])
 
 
 def find_speed(route: Route, own: EgoMotion, share: float) -> float:
-    """Return the speed [m/s] that limits, curves ahead and the weather allow."""
+    """Return the target speed [m/s] for limits and curves ahead; `share` is that of the limit driven in the weather."""
     ahead = own.along + CURVES_M
     turn = np.abs(np.diff(np.unwrap(route.at(np.append(ahead - 1.5, ahead[-1] + 1.5))[:, 2])))
     curve = np.sqrt(ASIDE_MPS2 / np.maximum(turn / np.diff(CURVES_M)[0], 1e-3))
-    limits = np.minimum(curve, [route.limit(float(each)) * share for each in ahead])
+    limits = np.minimum(curve, [route.limit(float(place)) * share for place in ahead])
     return float(np.sqrt(limits**2 + 2 * EASE_MPS2 * 0.8 * CURVES_M).min())
 
 
@@ -230,7 +235,7 @@ def _follow(speed: float, wanted: float, gap_m: float, ahead_mps: float) -> floa
 
 
 def _approach_speed(speed: float, wanted: float) -> float:
-    """Return the acceleration [m/s^2] on a free road: slower than comfortable braking where it is too fast.
+    """Return the acceleration [m/s^2] on a free road; above the wanted speed, it brakes at most comfortably.
 
     Above the wanted speed it is that of the improved model (Treiber and Kesting, Traffic Flow Dynamics, 2013, 11.3.7).
     """
@@ -240,57 +245,57 @@ def _approach_speed(speed: float, wanted: float) -> float:
 
 
 def _halt(speed: float, wanted: float, gap_m: float) -> float:
-    """Return the acceleration [m/s^2] with which to halt `gap_m` further on: none before it has to be comfortable."""
+    """Return the acceleration [m/s^2] for a stop after `gap_m` [m]; braking begins at the comfortable deceleration."""
     needed = speed**2 / (2 * max(gap_m, 0.1))
     if needed > EASE_MPS2:
         return -1.1 * needed
     return _follow(speed, wanted, gap_m + STANDSTILL_M, 0.0)
 
 
-def _stop_at_light(route: Route, own: EgoMotion, seen: Seen, half_m: float, wanted: float) -> Need:
-    """Return the acceleration for the next light: none at a yellow one that is too near to stop for."""
+def _stop_at_light(route: Route, ego: EgoMotion, seen: Seen, half_m: float, wanted: float) -> Need:
+    """Return the acceleration for the next closed light; a yellow light that is too near to stop at is passed."""
     for stop, link in route.stops:
-        gap = stop - LINE_M - own.along - half_m
+        gap = stop - LINE_M - ego.along - half_m
         if gap < -LINE_M + 0.5 or link not in seen.closed:
             continue
-        needed = own.speed**2 / (2 * max(gap, 0.1))
+        needed = ego.speed**2 / (2 * max(gap, 0.1))
         if needed > (EMERGENCY_MPS2 - 0.5 if link in seen.amber else 8.0):
             continue
-        return _halt(own.speed, wanted, gap), link
+        return _halt(ego.speed, wanted, gap), link
     return np.inf, None
 
 
 def _avoid(
-    route: ReferenceLine, own: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float
+    route: ReferenceLine, ego: EgoMotion, seen: Seen, occupied: Occupied, half_m: float, wanted: float
 ) -> list[Need]:
-    """Return the acceleration for each road user that is, or is going to be, in the way."""
+    """Return the acceleration for each road user in the corridor, now or on its predicted path."""
     present = np.isfinite(occupied.low).any(axis=1)
     if not present.any():
         return []
-    go = _cover(own.speed, wanted, GAIN_MPS2)
-    keep = own.speed * TIMES_S
+    go = _cover(ego.speed, wanted, GAIN_MPS2)
+    keep = ego.speed * TIMES_S
     meets = find_meeting(occupied, go, half_m) | find_meeting(occupied, keep, half_m)
     needs: list[Need] = []
     for row in np.flatnonzero(present).tolist():
         low = occupied.low[row]
         nearest = float(np.min(low))
-        place = own.along + (float(low[0]) if np.isfinite(low[0]) else nearest)
+        place = ego.along + (float(low[0]) if np.isfinite(low[0]) else nearest)
         along_mps = float(seen.velocity[row] @ heading_vectors(route.at(place)[2]))
         same_way = along_mps > SAME_WAY * float(np.hypot(*seen.velocity[row])) and along_mps > 0.5
         if np.isfinite(low[0]) and occupied.high[row, 0] > 0:  # now in the corridor, and not behind
             if occupied.low[row, 0] > -half_m:
-                needs.append((_follow(own.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)), row))
+                needs.append((_follow(ego.speed, wanted, float(low[0]) - half_m, max(along_mps, 0.0)), row))
             continue
         if not meets[row].any():
             continue
         first = int(np.argmax(meets[row]))
         if same_way:
             gap = float(low[first]) - along_mps * float(TIMES_S[first]) - half_m
-            needs.append((_follow(own.speed, wanted, max(gap, 1.0), along_mps), row))
+            needs.append((_follow(ego.speed, wanted, max(gap, 1.0), along_mps), row))
             continue
         gap = float(np.min(low[np.isfinite(low)])) - half_m
         if gap > 0:  # otherwise it is in the way already, and leaves it
-            needs.append((_halt(own.speed, wanted, gap - 1.0), row))
+            needs.append((_halt(ego.speed, wanted, gap - 1.0), row))
     return needs
 
 
@@ -301,9 +306,9 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: ReferenceLine, own: EgoMotion, vehicle: BodyBlueprint) -> float:
-    """Return the share of the greatest steering angle (pure pursuit)."""
-    aim_x, aim_y, _ = route.at(own.along + 3.5 + 0.35 * own.speed)
-    ahead, left = rotate(aim_x - own.x, aim_y - own.y, -own.yaw)
+def _steer(route: ReferenceLine, ego: EgoMotion, vehicle: BodyBlueprint) -> float:
+    """Return the steering by pure pursuit, as a share of the greatest angle in [-1, 1]; left is positive."""
+    aim_x, aim_y, _ = route.at(ego.along + 3.5 + 0.35 * ego.speed)
+    ahead, left = rotate(aim_x - ego.x, aim_y - ego.y, -ego.yaw)
     angle = np.arctan(2 * vehicle.wheelbase_m * left / (ahead**2 + left**2))
     return float(np.clip(angle / vehicle.steer_limit_rad, -1, 1))

@@ -1,11 +1,10 @@
-"""A statistical error model of the networks: perception of the same quality at a fraction of the computing time.
+"""Perception error model of the networks: perception of the same quality at a fraction of the computing time.
 
 A perception error model (Piazzoni et al., "Modeling perception errors towards robust decision making in autonomous
 vehicles", IJCAI 2020): road users in sight are detected with the measured probability for their class and distance,
-with Gaussian errors of the measured size; lights and weather are read with the measured probabilities. Detections are
-tracked, and forecast by the trajectory network, as those of the networks are. An actor stays detected or missed for
-`HELD_S`. False positives are measured (`error_measurement`), and not modelled: a single one is never reported by the
-tracker.
+with Gaussian errors of the measured standard deviation; lights and weather are read with the measured probabilities.
+Detections are tracked and forecast like those of the networks. An actor stays detected or missed for `HELD_S`. False
+positives are measured (`error_measurement`), but not modelled: the tracker does not report single ones.
 """
 
 from collections.abc import Mapping
@@ -44,21 +43,21 @@ EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
 CLASSES = ("Car", "Pedestrian", "Cyclist")
 SHIPPED = Path(__file__).parent / "shipped" / "errors.json"
 MODELLED = "the model of errors"
-HELD_S = 1.0
-LIGHTS_S = 0.5  # between two looks at lights
+HELD_S = 1.0  # for which an actor stays detected or missed
+LIGHTS_S = 0.5  # between two readings of the lights
 
 
 @dataclass(frozen=True)
 class ErrorModel(Record):
     """Error model of the perception networks, as measured."""
 
-    detected: Mapping[str, tuple[float, ...]]  # by class: share of those in sight, between `EDGES_M`
-    sd: Mapping[str, tuple[float, float, float]]  # by class: of x, y [m] along the ego vehicle's axes, and yaw [rad]
-    false_positives: float  # a frame
-    lights: tuple[float, float]  # share of the lights in the picture read right, and read wrong
-    weather: Mapping[str, Mapping[str, float]]  # by true class: shares of the classes that are named
-    spread_factor: float
-    growth: Mapping[str, tuple[float, ...]]  # of `PathSpread`
+    detected: Mapping[str, tuple[float, ...]]  # by class: recall of those in sight in each distance bin of `EDGES_M`
+    sd: Mapping[str, tuple[float, float, float]]  # by class: of x, y [m] in the ego frame, and yaw [rad]
+    false_positives: float  # per frame
+    lights: tuple[float, float]  # share of the lights in the picture that are read correctly, and wrongly
+    weather: Mapping[str, Mapping[str, float]]  # by true class: share of each predicted class
+    spread_factor: float  # `PathSpread.factor`
+    growth: Mapping[str, tuple[float, ...]]  # `PathSpread.growth` [m]
     seen: int  # road users in sight, over all frames
     frames: int
 
@@ -69,22 +68,23 @@ class ErrorModel(Record):
 
 
 def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], Boxes, Array]:
-    """Return rows and boxes (labels are detection classes) of the road users in field and sight; x, y (N, 2) [m].
+    """Return the road users in the detector's field and line of sight: rows of the trace, boxes, ego-frame positions.
 
-    These are along and to the left of the ego vehicle, which looks ahead.
+    Boxes are in the world frame, labelled with detection classes; positions (N, 2) [m] are ahead and to the left of the
+    ego vehicle.
     """
     rows = find_around(snapshot, float(np.hypot(*FIELD_M)))
     rows = rows[np.isin(snapshot.trace.category[rows], list(DETECTION_CLASS))]
     boxes, _, _ = read_actors(snapshot, rows)
-    own = snapshot.row(EGO)
-    at, yaw = snapshot.trace.position[0, own], float(snapshot.trace.yaw[0, own])
+    ego = snapshot.row(EGO)
+    at, yaw = snapshot.trace.position[0, ego], float(snapshot.trace.yaw[0, ego])
     x, y = rotate(boxes.center[:, 0] - at[0], boxes.center[:, 1] - at[1], -yaw)
     within = (x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])
     rows, boxes, local = rows[within], boxes[within], np.stack((x, y), axis=1)[within]
-    seen = share_seen(scene, at + np.array((0.0, 0.0, EYE_M)), boxes, own) > 0
-    labels = np.array([DETECTION_CLASS[each] for each in boxes.label[seen].tolist()], np.str_)
-    kept = boxes[seen]
-    return rows[seen], Boxes(kept.center, kept.size, kept.yaw, labels), local[seen]
+    visible = share_seen(scene, at + np.array((0.0, 0.0, EYE_M)), boxes, ego) > 0
+    labels = np.array([DETECTION_CLASS[label] for label in boxes.label[visible].tolist()], np.str_)
+    kept = boxes[visible]
+    return rows[visible], Boxes(kept.center, kept.size, kept.yaw, labels), local[visible]
 
 
 def load_error_model(path: Path | None = None) -> ErrorModel:
@@ -97,7 +97,7 @@ def load_error_model(path: Path | None = None) -> ErrorModel:
 
 
 class ModelledPerception:
-    """Perception with the errors of a model."""
+    """Simulated perception: the ground truth with the errors of an error model."""
 
     def __init__(self, model: ErrorModel, staged: StagedScenario, seed: int) -> None:
         self._model = model
@@ -118,16 +118,18 @@ class ModelledPerception:
         self._read_lights(snapshot)
         closed = frozenset(n for n, (_, letter) in self._read.items() if letter != "G")
         amber = frozenset(n for n, (_, letter) in self._read.items() if letter == "y")
-        told = self._following.step(self._detect(snapshot), snapshot.time_s, closed)
-        return Seen(told.boxes, told.velocity, told.path, told.yaw, told.spread, closed, amber, self._share, MODELLED)
+        tracks = self._following.step(self._detect(snapshot), snapshot.time_s, closed)
+        return Seen(
+            tracks.boxes, tracks.velocity, tracks.path, tracks.yaw, tracks.spread, closed, amber, self._share, MODELLED
+        )
 
     def _detect(self, snapshot: Snapshot) -> Boxes:
         rows, boxes, local = find_in_field(snapshot, self._scene)
         names = snapshot.trace.actor[rows].tolist()
         bins = np.digitize(np.hypot(*local.T), EDGES_M[1:-1])
         chance = np.array([self._model.detected[str(c)][b] for c, b in zip(boxes.label, bins)])
-        found = np.array([self._hold(name, snapshot.time_s) for name in names]) < chance
-        boxes = boxes[found] if len(rows) else boxes
+        hit = np.array([self._hold(name, snapshot.time_s) for name in names]) < chance
+        boxes = boxes[hit] if len(rows) else boxes
         sd = np.array([self._model.sd[str(c)] for c in boxes.label]).reshape(-1, 3)
         noise = self._random.normal(size=(len(boxes), 3)) * sd
         yaw = float(snapshot.trace.yaw[0, snapshot.row(EGO)])
@@ -137,7 +139,7 @@ class ModelledPerception:
         return Boxes(centre, boxes.size, boxes.yaw + noise[:, 2], boxes.label, np.full(len(boxes), 0.8), variance)
 
     def _hold(self, name: str, time_s: float) -> float:
-        """Return the number in [0, 1] by which an actor is found or not, drawn anew every `HELD_S`."""
+        """Return the uniform number in [0, 1] that decides whether an actor is detected, drawn anew every `HELD_S`."""
         since, drawn = self._held.get(name, (-np.inf, 0.0))
         if time_s - since >= HELD_S:
             since, drawn = time_s, float(self._random.uniform())
@@ -149,9 +151,9 @@ class ModelledPerception:
         if snapshot.time_s - self._looked_s < LIGHTS_S - 1e-6:
             return
         self._looked_s = snapshot.time_s
-        self._read = {n: each for n, each in self._read.items() if snapshot.time_s - each[0] <= 3.0}
-        own = snapshot.row(EGO)
-        at, yaw = snapshot.trace.position[0, own, :2], float(snapshot.trace.yaw[0, own])
+        self._read = {link: read for link, read in self._read.items() if snapshot.time_s - read[0] <= 3.0}
+        ego = snapshot.row(EGO)
+        at, yaw = snapshot.trace.position[0, ego, :2], float(snapshot.trace.yaw[0, ego])
         heads = slice(len(self._signals.link) - self._signals.walkers)
         sight = self._signals.position[heads, :2] - at
         ahead = sight @ heading_vectors(yaw)
@@ -169,7 +171,7 @@ class ModelledPerception:
 
 
 def sense_model(model: ErrorModel) -> Sensing:
-    """Return the constructor of a perception with the errors of a model, for `loop.drive`."""
+    """Return the constructor of a perception with the errors of a model, a `loop.Sensing`."""
 
     def sense(staged: StagedScenario, seed: int) -> Perception:
         return ModelledPerception(model, staged, seed)

@@ -1,4 +1,4 @@
-"""Parallel execution of many drives: each result is a file of its own, so that interrupted work can be resumed."""
+"""Parallel execution of many drives; results are kept in a file of JSON lines, so that the work can be resumed."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,11 +20,11 @@ from flcav.storage.records import WHERE_TRUE, Record, to_json
 
 @dataclass(frozen=True)
 class Sensed(Record):
-    """Choice of the perception that drives: the truth, the networks, or a model of their errors."""
+    """Choice of the perception in the loop: ground truth, the networks, or their error model."""
 
     kind: str  # "truth", "networks", "model"
     model: ErrorModel | None = None
-    unconfirmed: Annotated[bool, WHERE_TRUE] = False  # of networks: every track is believed, see `Confirmed`
+    unconfirmed: Annotated[bool, WHERE_TRUE] = False  # of networks: tracks need no confirmation, see `Confirmed`
 
     def make(self) -> Sensing:
         """Return the constructor of the perception; raises `ValueError` for a modelled perception without its model."""
@@ -37,7 +37,7 @@ class Sensed(Record):
         return sense_truth
 
     def line(self) -> str:
-        """Return what perceives, in words."""
+        """Return the perception in words."""
         if self.kind == "networks":
             return f"perception: the networks {', '.join(map(name_network, Networks._fields))}"
         return f"perception: {'a model of the errors of networks' if self.kind == 'model' else 'ground truth'}"
@@ -54,12 +54,12 @@ class DriveJob(Record):
     loop: Loop = LOOP
 
     def key(self, sensed: Sensed) -> str:
-        """Return the name of the drive in a file of kept ones: a hash of all that determines it."""
+        """Return the key of the drive in a file of kept results: a hash of everything that determines it."""
         return hash_request([to_json(self, DriveJob), to_json(sensed, Sensed)])
 
 
 def begin_worker() -> None:
-    """Begin a worker process, which needs nothing."""
+    """Initialise a worker process; drives need no shared state."""
 
 
 def run_job(job: DriveJob, sensed: Sensed) -> DriveResult:
@@ -67,8 +67,8 @@ def run_job(job: DriveJob, sensed: Sensed) -> DriveResult:
     whole = sensed.make()
 
     def sense(staged: StagedScenario, seed: int) -> Perception:
-        own = whole(staged, seed)
-        return own if job.task is None else Without(own, job.task, job.coupling)
+        complete = whole(staged, seed)
+        return complete if job.task is None else Without(complete, job.task, job.coupling)
 
     return drive_scenario(job.scenario, job.seed, sense, job.loop)
 
@@ -78,8 +78,8 @@ def film_job(job: DriveJob, sensed: Sensed) -> tuple[DriveResult, Film]:
     staged, camera = StagedScenario(job.scenario, job.seed), FilmCamera()
     try:
         perception = sensed.make()(staged, job.seed)
-        own = drive_staged(staged, job.seed, perception, job.loop, camera.watch)
-        return own, camera.develop(staged, job.seed)
+        drive = drive_staged(staged, job.seed, perception, job.loop, camera.watch)
+        return drive, camera.develop(staged, job.seed)
     finally:
         staged.world.close()
 
@@ -88,12 +88,12 @@ def film_jobs(
     jobs: Sequence[DriveJob], sensed: Sensed, processes: int = 1, progress: Report = ignore_progress
 ) -> list[tuple[DriveResult, Film]]:
     """Return the measures and films of drives in the order of the jobs, computed by parallel processes."""
-    found = []
+    films = []
     with process_pool(processes, begin_worker) as pool:
-        for done, each in enumerate(pool.map(film_job, jobs, [sensed] * len(jobs)), start=1):
-            found.append(each)
-            progress(done, len(jobs), each[0].scenario)
-    return found
+        for done, (drive, film) in enumerate(pool.map(film_job, jobs, [sensed] * len(jobs)), start=1):
+            films.append((drive, film))
+            progress(done, len(jobs), drive.scenario)
+    return films
 
 
 def run_jobs(
@@ -105,7 +105,7 @@ def run_jobs(
 ) -> list[DriveResult]:
     """Return the measures of drives in the order of the jobs, computed by parallel processes.
 
-    With `kept`, a file of JSON lines, drives that are in it are not driven again, and others are added to it.
+    With `kept`, a file of JSON lines, drives in the file are not run again, and new ones are added to it.
     """
     known = {key: DriveResult.from_json(held, str(kept)) for key, held in read_kept(kept, "drive").items()}
     keys = [job.key(sensed) for job in jobs]
@@ -113,8 +113,8 @@ def run_jobs(
     if missing:
         with process_pool(processes, begin_worker) as pool:
             drives = pool.map(run_job, missing.values(), [sensed] * len(missing))
-            for done, (key, own) in enumerate(zip(missing, drives), start=len(jobs) - len(missing) + 1):
-                known[key] = own
-                keep(kept, key, "drive", own.as_json())
-                progress(done, len(jobs), own.scenario)
+            for done, (key, drive) in enumerate(zip(missing, drives), start=len(jobs) - len(missing) + 1):
+                known[key] = drive
+                keep(kept, key, "drive", drive.as_json())
+                progress(done, len(jobs), drive.scenario)
     return [known[key] for key in keys]

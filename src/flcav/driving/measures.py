@@ -1,9 +1,9 @@
-"""Measures of a drive: time to collision, hard brakes, progress, standing, collisions, and the driving score.
+"""Measures of a drive: time to collision, hard braking, progress, standstill, collisions, and the driving score.
 
-A collision is at fault unless the ego vehicle stood, or was run into from behind by something faster (the duty of
-the one behind: Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving cars", 2017, rule 1). The
-driving score is progress times a factor for every infringement: those of nuPlan's closed-loop score for collisions at
-fault (Caesar et al., 2021), and of CARLA's leaderboard for red lights.
+A collision is at fault unless the ego vehicle stood, or was hit from behind by something faster (the follower keeps the
+distance: Shalev-Shwartz et al., "On a formal model of safe and scalable self-driving cars", 2017, rule 1). The driving
+score is progress times a factor for every infraction: those of nuPlan's closed-loop score for collisions at fault
+(Caesar et al., 2021), and of CARLA's leaderboard for red lights.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ from flcav.world.map.roads import Route
 from flcav.world.snapshot import Collision, Snapshot
 
 HARD_MPS2 = 4.0  # deceleration of a hard brake
-STANDS_MPS = 0.3
-STOOD_S = 1.0  # a shorter time is not worth a word
-FALSE_M = 3.0  # a box farther than this from everybody is a false one
-NEAR_S = 1.5  # time to collision below which a drive comes close
+STANDS_MPS = 0.3  # below it the vehicle stands
+STOOD_S = 1.0  # a shorter standstill is not reported
+FALSE_M = 3.0  # a box farther than this from every actor is a false positive
+NEAR_S = 1.5  # critical time to collision
 PENALTY: Mapping[str, float] = {"pedestrian": 0.0, "vehicle": 0.0, "obstacle": 0.5, "red light": 0.7}
 
 
@@ -34,7 +34,7 @@ class Hit(Record):
     time_s: float
     other: str
     kind: str  # a key of `PENALTY`
-    speed: float  # of the ego vehicle before [m/s]
+    speed: float  # of the ego vehicle before the collision [m/s]
     at_fault: bool
 
 
@@ -45,19 +45,19 @@ class DriveResult(Record):
     scenario: str
     seed: int
     time_s: float
-    progress: float  # share of what the speed limit allows in the time, 0 to 1
+    progress: float  # driven share of the distance that the speed limit allows in the time, 0 to 1
     mean_speed: float  # [m/s]
-    least_ttc_s: float  # least time to collision; the last of `TIMES_S` where none was less
+    least_ttc_s: float  # least time to collision, at most the last of `TIMES_S`
     near_share: float  # share of the time with a time to collision below `NEAR_S`
-    hard_brakes: int  # times that a deceleration of `HARD_MPS2` began
+    hard_brakes: int  # number of decelerations above `HARD_MPS2`
     red_lights: int  # stop lines passed at red
     hits: tuple[Hit, ...]
     score: float  # the driving score, 0 to 1: progress times all `penalties`
-    penalties: Mapping[str, float] = field(default_factory=dict)  # by infraction, of those that happened
-    stood_s: Mapping[str, float] = field(default_factory=dict)  # by what the vehicle stood before [s], longest first
+    penalties: Mapping[str, float] = field(default_factory=dict)  # factor of each infraction that happened
+    stood_s: Mapping[str, float] = field(default_factory=dict)  # standstill [s] by its cause, longest first
 
     def line(self) -> str:
-        """Return the measures in words, with everything that the score is made of."""
+        """Return the measures in words, with the score and its factors."""
         hits = "".join(f", {'hits' if hit.at_fault else 'is hit by'} {hit.other}" for hit in self.hits)
         reds = f", {plural(self.red_lights, 'red light')} passed" if self.red_lights else ""
         return (
@@ -73,7 +73,7 @@ class DriveResult(Record):
 
     @property
     def stood_in_all_s(self) -> float:
-        """Return how long the vehicle stood [s]."""
+        """Return the total time at standstill [s]."""
         return round(sum(self.stood_s.values()), 1)
 
     @property
@@ -83,7 +83,7 @@ class DriveResult(Record):
 
 
 def list_penalties(hits: Sequence[Hit], red_lights: int) -> dict[str, float]:
-    """Return the factor of each kind of infraction that happened: collisions at fault, and red lights passed."""
+    """Return the penalty factors by infraction: collisions at fault, and red lights passed."""
     kinds = [hit.kind for hit in hits if hit.at_fault] + ["red light"] * red_lights
     count = {kind: kinds.count(kind) for kind in PENALTY if kind in kinds}
     return {plural(number, kind): PENALTY[kind] ** number for kind, number in count.items()}
@@ -95,7 +95,7 @@ def score_drive(progress: float, hits: Sequence[Hit], red_lights: int) -> float:
 
 
 def describe_standing(stood_s: Mapping[str, float], time_s: float) -> str:
-    """Return how long a vehicle stood of a time [s], and before what, in words; "" for less than `STOOD_S`."""
+    """Return in words how long a vehicle stood within `time_s` [s], and the causes; "" for less than `STOOD_S`."""
     if sum(stood_s.values()) < STOOD_S:
         return ""
     before = ", ".join(f"{duration:.1f} s before {cause}" for cause, duration in stood_s.items())
@@ -103,9 +103,9 @@ def describe_standing(stood_s: Mapping[str, float], time_s: float) -> str:
 
 
 def name_cause(cause: int | str | None, seen: Seen, snapshot: Snapshot) -> str:
-    """Return in words what a driver slows for, see `Decision.cause`, and whether it is there by the true state.
+    """Return the cause of slowing down (`Decision.cause`) in words, checked against the true state of the world.
 
-    A box is a false one where nobody is within `FALSE_M`.
+    A box without an actor within `FALSE_M` is a false positive.
     """
     if cause is None:
         return "an open road"
@@ -122,25 +122,27 @@ def name_cause(cause: int | str | None, seen: Seen, snapshot: Snapshot) -> str:
 
 
 def describe_drives(drives: Sequence[DriveResult]) -> str:
-    """Return the infractions of all drives, and how long they stood, in words."""
-    faults, hits = sum(own.faults for own in drives), sum(len(own.hits) for own in drives)
-    reds, hard = sum(own.red_lights for own in drives), sum(own.hard_brakes for own in drives)
+    """Return the infractions and standstills of all drives in words."""
+    faults = sum(drive.faults for drive in drives)
+    hits = sum(len(drive.hits) for drive in drives)
+    reds = sum(drive.red_lights for drive in drives)
+    hard = sum(drive.hard_brakes for drive in drives)
     stood: dict[str, float] = {}
-    for own in drives:
-        for cause, duration in own.stood_s.items():
+    for drive in drives:
+        for cause, duration in drive.stood_s.items():
             stood[cause] = stood.get(cause, 0.0) + duration
-    longest = dict(sorted(stood.items(), key=lambda each: -each[1]))
+    longest = dict(sorted(stood.items(), key=lambda item: -item[1]))
     return (
         f"{plural(len(drives), 'drive')}: {plural(faults, 'collision')} at fault, {plural(hits - faults, 'other')}, "
         f"{plural(reds, 'red light')} passed, {plural(hard, 'hard brake')}"
-        f"{describe_standing(longest, sum(own.time_s for own in drives))}"
+        f"{describe_standing(longest, sum(drive.time_s for drive in drives))}"
     )
 
 
 def measure_ttc(route: Route, own: EgoMotion, truth: Seen, size: tuple[float, float]) -> float:
-    """Return the time to collision [s] by true states, if all keep their motion; the horizon if there is no collision.
+    """Return the time to collision [s] by the true states, if everybody keeps their motion; at most the horizon.
 
-    The ego vehicle, `size` its length and width [m], keeps its speed along the route.
+    The ego vehicle, of length and width `size` [m], keeps its speed along the route. `truth` has the paths of others.
     """
     if own.speed < STANDS_MPS:
         return float(TIMES_S[-1])
@@ -151,25 +153,26 @@ def measure_ttc(route: Route, own: EgoMotion, truth: Seen, size: tuple[float, fl
 
 
 def judge_collision(collision: Collision, before: Snapshot, categories: Mapping[str, str], time_s: float) -> Hit:
-    """Return the collision of the ego vehicle as a record; `before` is the snapshot of the step before it.
+    """Return the record of a collision of the ego vehicle at `time_s` [s]; `before` is the snapshot one step earlier.
 
-    `categories` are those of the actors by name; what has none is an obstacle.
+    `categories` has the category of each actor by name; a body without one is an obstacle.
     """
     other = collision.other if collision.name == EGO else collision.name
-    trace, own = before.trace, before.row(EGO)
-    yaw, speed = float(trace.yaw[0, own]), float(np.hypot(*trace.velocity[0, own, :2]))
+    trace, ego = before.trace, before.row(EGO)
+    yaw = float(trace.yaw[0, ego])
+    speed = float(np.hypot(*trace.velocity[0, ego, :2]))
     category = categories.get(other)
     kind = "obstacle" if category in (None, "prop") else "pedestrian" if category == "pedestrian" else "vehicle"
     struck = False
     rows = np.flatnonzero(trace.actor == other)
     if len(rows):
         ahead = heading_vectors(yaw)
-        length = trace.size[own, 0]
-        at = np.array(collision.point) - trace.position[0, own, :2]
+        length = trace.size[ego, 0]
+        at = np.array(collision.point) - trace.position[0, ego, :2]
         at_rear = (
             float(at @ ahead) < -length / 2 + 0.6
-            or float(trace.position[0, rows[0], :2] @ ahead) < float(trace.position[0, own, :2] @ ahead) - length / 2
+            or float(trace.position[0, rows[0], :2] @ ahead) < float(trace.position[0, ego, :2] @ ahead) - length / 2
         )
-        faster = float((trace.velocity[0, rows[0], :2] - trace.velocity[0, own, :2]) @ ahead) > 0
+        faster = float((trace.velocity[0, rows[0], :2] - trace.velocity[0, ego, :2]) @ ahead) > 0
         struck = at_rear and faster
     return Hit(time_s, other, kind, speed, not (speed < STANDS_MPS or struck))

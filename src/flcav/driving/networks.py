@@ -1,8 +1,8 @@
 """Perception by the networks of the package: LiDAR at 10 Hz and a camera at 2 Hz on the ego vehicle of a live world.
 
-`objects` finds road users in the sweep, which are tracked, and `trajectory` forecasts them; `signs` finds lights in the
-picture, which are told apart by where the map has their heads; `weather` gives the share of the speed limit. Signs of
-speed limits and stop signs are found, and feed nothing: a route has its limits from the map.
+`objects` detects road users in the sweep, which are tracked, and `trajectory` forecasts them; `signs` detects lights in
+the picture, which are matched with the projected signal heads of the map; `weather` gives the share of the speed limit.
+Speed limit signs and stop signs are detected but not used: a route has its limits from the map.
 """
 
 from collections.abc import Iterator
@@ -37,14 +37,14 @@ from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.weather import draw_weather
 
-SCORE = 0.3  # of objects that count
-LIGHT_SCORE = 0.25
+SCORE = 0.3  # least score of detected objects
+LIGHT_SCORE = 0.25  # least score of detected lights
 CAMERA_STEPS = 5  # of 0.1 s between two pictures
-LIGHTS_M = 70.0  # lights are looked for so far ahead
-BESIDE_PX = 6.0  # from the projected head to the box of a detection, at most
-REMEMBERED_S = 3.0  # a light is what it last was for so long
+LIGHTS_M = 70.0  # range of lights
+BESIDE_PX = 6.0  # greatest distance from the projected head to the box of a detection
+REMEMBERED_S = 3.0  # for which the last state of a light is kept
 LIDAR, CAMERA = "lidar", "camera"
-FACING = -0.3  # cosine between the camera's axis and a head's front below which it is read
+FACING = -0.3  # greatest cosine between the camera's axis and a head's front: others show their side or back
 SHOWN = {"light_red": "r", "light_yellow": "y", "light_green": "G"}
 
 
@@ -59,7 +59,7 @@ class Networks(NamedTuple):
 
 @lru_cache(maxsize=1)
 def load_networks() -> Networks:
-    """Return the networks of the package."""
+    """Return the networks of the package, cached."""
     return Networks(*(resolve_network(task_named(name), None) for name in Networks._fields))
 
 
@@ -71,12 +71,12 @@ def name_network(task: str) -> str:
 
 @lru_cache(maxsize=4)
 def load_road_map(town: str) -> RoadMap:
-    """Return the map of a town for forecasts, cached."""
+    """Return the road map of a town for the trajectory network, cached."""
     return road_map(load_town(town))
 
 
 class LightReader:
-    """Memory of the lights that were seen not to be green, for `REMEMBERED_S`."""
+    """Reader of traffic lights in camera pictures, with a memory of `REMEMBERED_S`."""
 
     def __init__(self, town: Town) -> None:
         heads = len(town.signals.link) - town.signals.walkers
@@ -85,17 +85,18 @@ class LightReader:
         self._last: dict[str, tuple[float, str]] = {}
 
     def read(self, frame: Frame, network: SignDetector, time_s: float) -> dict[str, str | None]:
-        """Read the lights in the frame's picture; return the letter of each that may be read, None where it was not."""
-        found, read = (
-            detect_in_picture(network, frame.images[CAMERA].rgb, threshold=LIGHT_SCORE),
-            dict[str, str | None](),
-        )
+        """Read the lights in the frame's picture, taken at `time_s` [s].
+
+        Return the state (a letter of SUMO) of each light in view, by its link; None where it was not detected.
+        """
+        detections = detect_in_picture(network, frame.images[CAMERA].rgb, threshold=LIGHT_SCORE)
+        read = dict[str, str | None]()
         for row, x, y in self.project(frame):
             read.setdefault(self._link[row], None)
-            box = found.box
-            beside = np.maximum(np.maximum(box[:, 0] - x, x - box[:, 2]), np.maximum(box[:, 1] - y, y - box[:, 3]))
-            for other in np.flatnonzero(beside <= BESIDE_PX).tolist():  # by falling score
-                letter = SHOWN.get(network.config.classes[int(found.label[other])])
+            box = detections.box
+            away = np.maximum(np.maximum(box[:, 0] - x, x - box[:, 2]), np.maximum(box[:, 1] - y, y - box[:, 3]))
+            for detection in np.flatnonzero(away <= BESIDE_PX).tolist():  # by falling score
+                letter = SHOWN.get(network.config.classes[int(detections.label[detection])])
                 if letter is not None:
                     self._last[self._link[row]] = (time_s, letter)
                     read[self._link[row]] = letter
@@ -103,7 +104,7 @@ class LightReader:
         return read
 
     def project(self, frame: Frame) -> Iterator[tuple[int, float, float]]:
-        """Yield the heads that a frame's camera may read: row, and the pixel of its centre from the image's corner."""
+        """Yield the signal heads in view of a frame's camera: row of the head, and x, y [px] from the corner."""
         pose = frame.assumed_world_from_sensor(CAMERA)
         seen = transform_points(inverse(pose), self._position)
         turned = heading_vectors(self._yaw) @ pose[:2, 2]  # the optical axis is z
@@ -115,11 +116,10 @@ class LightReader:
                 yield row, x, y
 
     def closed(self, time_s: float) -> tuple[frozenset[str], frozenset[str]]:
-        """Return the lights that were last seen red or yellow, and the yellow ones."""
+        """Return the links whose lights were last read as red or yellow at `time_s` [s], and those read as yellow."""
         fresh = {link: letter for link, (at, letter) in self._last.items() if time_s - at <= REMEMBERED_S}
-        return frozenset(n for n, each in fresh.items() if each != "G"), frozenset(
-            n for n, each in fresh.items() if each == "y"
-        )
+        closed = frozenset(link for link, letter in fresh.items() if letter != "G")
+        return closed, frozenset(link for link, letter in fresh.items() if letter == "y")
 
 
 class NetworkPerception:
@@ -134,7 +134,7 @@ class NetworkPerception:
         road: RoadUnits | None = None,
         confirmed: Confirmed | None = CONFIRMED,
     ) -> None:
-        """Take a drive, its seed, how uncertain tracks are, poles that send what they find, and which tracks hold."""
+        """Take a drive and its seed, the calibrated uncertainty, roadside units if any, and the confirmation rule."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
@@ -145,11 +145,12 @@ class NetworkPerception:
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
-        self.own = self.found = Boxes.empty()  # of the last look, world frame: the vehicle's own, and with the road's
+        # detections of the last look in the world frame: by the vehicle alone, and with those of roadside units
+        self.own = self.found = Boxes.empty()
         self.followed: FollowedTracks | None = None
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return the networks' perception at this instant."""
+        """Return the perception at this instant: observe the world with the rig, and run the networks."""
         self.scene.follow(snapshot.trace)
         pictured = self._step % CAMERA_STEPS == 0
         rig = Rig(lidars=lidar32().lidars, cameras=car().cameras if pictured else {})
@@ -159,19 +160,19 @@ class NetworkPerception:
         if pictured:
             self.heads = self.lights.read(frame, self.networks.signs, snapshot.time_s)
             self.named, self.lights_read_s = self.name_weather(frame), snapshot.time_s
-        found = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
-        self.own = self.found = found.transform(frame.assumed_world_from_sensor(LIDAR))
+        detections = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
+        self.own = self.found = detections.transform(frame.assumed_world_from_sensor(LIDAR))
         if self._road is not None:
             self.found = merge_detections(self.own, self._road.receive(self.scene, snapshot))
         closed, amber = self.lights.closed(snapshot.time_s)
-        told = self._following.step(self.found, snapshot.time_s, closed)
-        self.followed = told
+        tracks = self._following.step(self.found, snapshot.time_s, closed)
+        self.followed = tracks
         return Seen(
-            told.boxes,
-            told.velocity,
-            told.path,
-            told.yaw,
-            told.spread,
+            tracks.boxes,
+            tracks.velocity,
+            tracks.path,
+            tracks.yaw,
+            tracks.spread,
             closed,
             amber,
             WEATHER_SPEED[self.named],
@@ -179,17 +180,17 @@ class NetworkPerception:
         )
 
     def name_weather(self, frame: Frame) -> str:
-        """Return the likeliest class of weather in the frame's picture."""
+        """Return the most probable weather class of the frame's picture."""
         network = self.networks.weather
         shares = predict_probabilities(network, [reduce_picture(frame.images[CAMERA].rgb)])[0]
         return network.config.classes[int(shares.argmax())]
 
 
 def sense_networks(staged: StagedScenario, seed: int) -> NetworkPerception:
-    """Return the perception by the networks of the package, for `loop.drive`."""
+    """Return the perception by the networks of the package, as a `loop.Sensing`."""
     return NetworkPerception(staged, seed)
 
 
 def sense_unconfirmed(staged: StagedScenario, seed: int) -> NetworkPerception:
-    """Return the perception by the networks of the package, which believes every track of two detections."""
+    """Return the perception by the networks of the package, which reports every track of two detections."""
     return NetworkPerception(staged, seed, confirmed=None)

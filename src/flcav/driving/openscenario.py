@@ -1,7 +1,7 @@
-"""Reading of ASAM OpenSCENARIO XML: the ego vehicle's start, actors, weather, and what happens, as a driving scenario.
+"""Reader of ASAM OpenSCENARIO XML: the ego vehicle's start, actors, weather and story, as a driving scenario.
 
-Read are world positions, actions of speed and lane changes, and triggers by time and distance, as `odd.openscenario`
-writes them. What else a file has is refused, so that no drive is of less than its file says.
+It reads world positions, speed actions and lane changes, and triggers by time and distance, as `odd.openscenario`
+writes them. Anything else is refused, so that no drive leaves out a part of its file.
 """
 
 import math
@@ -18,20 +18,20 @@ from flcav.world.shapes import SHAPES
 from flcav.world.weather import NO_FOG_M, Weather
 
 EGO_NAMES = ("ego", "hero", "egovehicle", "ego_vehicle")
-CATEGORIES = {"motorbike": "motorcycle", "semitrailer": "truck", "trailer": "truck"}  # of vehicles, where not flcav's
+CATEGORIES = {"motorbike": "motorcycle", "semitrailer": "truck", "trailer": "truck"}  # to categories of flcav
 OKTAS = ("zero", "one", "two", "three", "four", "five", "six", "seven", "eight")
 WETNESS = {"dry": 0.0, "moist": 0.3, "wetWithPuddles": 0.6, "lowFlooded": 0.85, "highFlooded": 0.95}
-INSTANT_MPS2 = 100.0  # of a speed that is there at once
+INSTANT_MPS2 = 100.0  # rate of a speed change without a transition
 Step = Speed | Aside
 
 
 class _Reader:
-    """Reads one document."""
+    """Reader of one document."""
 
     def __init__(self, root: ElementTree.Element, path: Path) -> None:
         self._root, self._path = root, path
-        found = root.iterfind("ParameterDeclarations/ParameterDeclaration")
-        self._values = {f"${each.get('name')}": each.get("value", "") for each in found}
+        parameters = root.iterfind("ParameterDeclarations/ParameterDeclaration")
+        self._values = {f"${node.get('name')}": node.get("value", "") for node in parameters}
 
     def refuse(self, what: str) -> InputError:
         return InputError(f"{self._path}: {what}")
@@ -54,11 +54,12 @@ class _Reader:
 
     def scenario(self, name: str) -> DrivingScenario:
         town = self._town()
-        entities = {self.text(each, "name"): each for each in self._root.iterfind("Entities/ScenarioObject")}
+        entities = {self.text(node, "name"): node for node in self._root.iterfind("Entities/ScenarioObject")}
         if not entities:
             raise self.refuse("has no <ScenarioObject> in <Entities>")
-        ego = next((each for each in entities if each.lower() in EGO_NAMES), next(iter(entities)))
-        poses, speeds = dict[str, Pose](), dict[str, float]()
+        ego = next((name for name in entities if name.lower() in EGO_NAMES), next(iter(entities)))
+        poses = dict[str, Pose]()
+        speeds = dict[str, float]()
         for private in self._root.iterfind("Storyboard/Init/Actions/Private"):
             who = self.text(private, "entityRef")
             for action in private.iterfind("PrivateAction/*"):
@@ -66,19 +67,19 @@ class _Reader:
                     poses[who] = self._pose(action)
                 elif action.tag == "LongitudinalAction":
                     speeds[who] = self._speed(who, action).target
-        if lost := [each for each in entities if each not in poses]:
+        if lost := [who for who in entities if who not in poses]:
             raise self.refuse(f"{shorten(lost[0])} has no <TeleportAction> in <Init>")
         origin = poses[ego]
         actors = tuple(
-            self._entity(each, who, _relative(origin, poses[who]), speeds.get(who, 0.0))
-            for who, each in entities.items()
+            self._entity(node, who, _relative(origin, poses[who]), speeds.get(who, 0.0))
+            for who, node in entities.items()
             if who != ego
         )
         scripts = tuple(self._scripts(ego, actors, origin))
         if actors and not scripts:
             scripts = (Script(actors, (), origin=origin),)
-        own = speeds.get(ego, 0.0)
-        plain = DrivingScenario(name, town, "none", "clear", 0, 0, start=origin, speed=own, scripts=scripts)
+        speed = speeds.get(ego, 0.0)
+        plain = DrivingScenario(name, town, "none", "clear", 0, 0, start=origin, speed=speed, scripts=scripts)
         return plain.with_sky(self._weather())
 
     def _town(self) -> str:
@@ -115,11 +116,11 @@ class _Reader:
             if self.text(dynamics, "dynamicsDimension") == "rate":
                 rate = abs(amount)
             elif amount > 0:
-                rate = -amount  # a time, until the speed before is known
+                rate = -amount  # negative: a duration [s], until the previous speed is known and gives the rate
         return Speed(who, value, rate)
 
     def _entity(self, node: ElementTree.Element, name: str, start: Pose, speed: float) -> Entity:
-        body = next((each for each in node if each.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
+        body = next((child for child in node if child.tag in ("Vehicle", "Pedestrian", "MiscObject")), None)
         if body is None:
             raise self.refuse(f"{shorten(name)} is neither <Vehicle> nor <Pedestrian>; catalogues are not read")
         word = self.text(body, "vehicleCategory", "car") if body.tag == "Vehicle" else "pedestrian"
@@ -137,11 +138,11 @@ class _Reader:
         return Entity(name, category, shape if shape in known else known[0], start, speed, size)
 
     def _scripts(self, ego: str, actors: tuple[Entity, ...], origin: Pose) -> Iterator[Script]:
-        """Yield a script for each trigger; the actors are in the first."""
+        """Yield a script for each trigger; the first one has the actors."""
         groups: dict[tuple[str | None, float], list[Step]] = {}
-        speeds = {each.name: each.speed for each in actors}
+        speeds = {actor.name: actor.speed for actor in actors}
         for group in self._root.iterfind("Storyboard/Story/Act/ManeuverGroup"):
-            who = [self.text(each, "entityRef") for each in group.iterfind("Actors/EntityRef")]
+            who = [self.text(reference, "entityRef") for reference in group.iterfind("Actors/EntityRef")]
             for event in group.iterfind("Maneuver/Event"):
                 trigger = self._trigger(event, ego)
                 for action in event.iterfind("Action/PrivateAction/*"):
@@ -236,7 +237,8 @@ def _relative(origin: Pose, pose: Pose) -> Pose:
 def read_openscenario(path: Path, name: str) -> DrivingScenario:
     """Return the driving scenario of an OpenSCENARIO file.
 
-    Raises `InputError` where it is no OpenSCENARIO, its map is no town, or it has what flcav does not read.
+    Raises `InputError` if it is no OpenSCENARIO, its map is no town of flcav, or it has elements that flcav does not
+    read.
     """
     root = read_xml(path, "an OpenSCENARIO scenario")
     if root.tag != "OpenSCENARIO":

@@ -1,9 +1,9 @@
-"""Roadside perception while driving: detections by roadside units, which reach the ego vehicle after a latency.
+"""Cooperative perception while driving: detections of roadside units reach the ego vehicle after a latency.
 
-A pole spins its LiDAR every `SPIN_S`; the road detector of the package finds cars in the returns before the pole's
-static background, which a sweep of the town without actors shows. The message is as old on arrival as the detector
-takes and as its bytes need at the rate of the V2X link (3GPP TR 37.885: `network.radio`); out of coverage there is
-none. The vehicle moves the boxes on at the velocity that the pole has tracked, and drops those that it sees itself.
+A pole spins its LiDAR every `SPIN_S`; the road detector of the package finds cars in the returns in front of the pole's
+static background, which is learned from sweeps of the town without actors. The latency of a message is the time of the
+detector and of transmission at the rate of the V2X link (3GPP TR 37.885: `network.radio`); out of coverage no message
+arrives. The vehicle extrapolates the boxes at their tracked velocities, and drops those that it detects itself.
 """
 
 from collections.abc import Sequence
@@ -30,23 +30,23 @@ from flcav.world.trace import empty_trace
 SPIN_S = 0.5  # between two messages of a pole
 DETECTS_S = 0.1  # from the end of a spin to the boxes
 STALE_S = 0.9  # older messages are not used
-SAME_M = 2.5  # a box so near to one of the vehicle's own is the same road user
-EMPTY_SWEEPS = 4  # of the town without actors, since returns are lost at random
+SAME_M = 2.5  # detections of vehicle and pole within this distance are the same road user
+EMPTY_SWEEPS = 4  # of the town without actors: several, since returns are lost at random
 LIDAR = "lidar"
 
 
 @dataclass(frozen=True)
 class RoadMessage:
-    """Message of a pole: its tracks at one spin, and the time at which they arrive."""
+    """Message of a pole: its tracks at one spin, and their time of arrival."""
 
-    seen_s: float
+    seen_s: float  # time of the spin
     arrives_s: float
-    tracked: Tracked
-    megabytes: float
+    tracked: Tracked  # world frame
+    megabytes: float  # size of the message [MB]
 
 
 class RoadUnits:
-    """The roadside units of a drive, which send their detections."""
+    """The roadside units of a drive: detection, tracking and transmission."""
 
     def __init__(self, town: Town, poles: Sequence[int], seed: int, *, radio: Radio | None = None) -> None:
         """Take the numbers of the town's poles; raises `InputError` for one that the town does not have."""
@@ -59,7 +59,7 @@ class RoadUnits:
         self.latency_s: list[float] = []  # of the messages so far
 
     def receive(self, scene: Scene, snapshot: Snapshot) -> Boxes:
-        """Return the boxes (world frame) that have arrived, moved on to this instant; `scene` is at it."""
+        """Return the boxes (world frame) that have arrived, extrapolated to this instant, which `scene` shows."""
         if snapshot.time_s - self._spun_s >= SPIN_S - 1e-6:
             self._spun_s = snapshot.time_s
             self._spin(scene, snapshot)
@@ -75,7 +75,7 @@ class RoadUnits:
         return concatenate(parts) if parts else Boxes.empty()
 
     def _spin(self, scene: Scene, snapshot: Snapshot) -> None:
-        """Detect with every roadside unit, and send the detections."""
+        """Detect with every roadside unit, and send the tracks."""
         links = link_vehicles(self._town, snapshot.trace, [EGO], self.sites, self._radio, self._seed)
         for number, (name, messages) in enumerate(self._last.items()):
             boxes = self._detect(scene, snapshot, name)
@@ -98,14 +98,14 @@ class RoadUnits:
 
 
 def pack_tracks(tracked: Tracked) -> bytes:
-    """Return the message of a pole's tracks to vehicles: boxes, variances, classes, scores and velocities."""
+    """Return a pole's message to vehicles as bytes: boxes, variances, classes, scores and velocities of its tracks."""
     boxes = tracked.boxes
     arrays = {"boxes": boxes.array(), "category": from_names(boxes.label.tolist()), "velocity": tracked.velocity}
     return pack_arrays({**arrays, "score": np.asarray(boxes.score), "variance": np.asarray(boxes.variance)})
 
 
 def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
-    """Return the static background of a pole's LiDAR: its sweeps of the town without actors."""
+    """Return the static background of a pole's LiDAR, learned from its sweeps of the town without actors."""
     scene = Scene(town, empty_trace(town.name))
     sweeps = [
         observe(scene, lidar_pole(), pole, 0, scene_name="empty", seed=seed, number=number).lidar[LIDAR]
@@ -115,7 +115,7 @@ def learn_pole_background(town: Town, pole: str, seed: int) -> Background:
 
 
 def merge_detections(own: Boxes, road: Boxes) -> Boxes:
-    """Return the vehicle's own boxes, and those of the road that are none of them."""
+    """Return the vehicle's detections and those of roadside units farther than `SAME_M` from all of them."""
     if not len(road):
         return own
     if len(own):

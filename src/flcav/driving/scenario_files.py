@@ -1,7 +1,7 @@
-"""Driving scenarios in files: recipes of recordings, recordings, scenarios of one's own in YAML, and OpenSCENARIO.
+"""Driving scenarios from files: recipes of recordings, recordings, user-defined scenarios in YAML, and OpenSCENARIO.
 
 A recipe gives a scenario for each of its corner cases, at its place and in its weather; `flcav odd sample` writes such
-recipes. A file of one's own has the fields of `ScenarioFile`.
+recipes. A user-defined scenario has the fields of `ScenarioFile`.
 """
 
 from collections.abc import Sequence
@@ -37,19 +37,19 @@ class ScenarioFile(Config):
 
 
 def read_scenarios(names: Sequence[str]) -> tuple[DrivingScenario, ...]:
-    """Return the scenarios of these names, files and folders, all of the package for none.
+    """Return the scenarios of these names, files and folders; without any, all scenarios of the package.
 
-    Raises `InputError` for one that is neither, and for a file that is no scenario.
+    Raises `InputError` for an unknown name, a file that is no scenario, and a scenario that is given twice.
     """
     if not names:
         return find_scenarios(())
-    found = [each for name in names for each in _read_one(name)]
-    seen: dict[str, int] = {}
-    for each in found:
-        seen[each.name] = seen.get(each.name, 0) + 1
-    if twice := [name for name, count in seen.items() if count > 1]:
+    scenarios = [scenario for name in names for scenario in _read_one(name)]
+    counts: dict[str, int] = {}
+    for scenario in scenarios:
+        counts[scenario.name] = counts.get(scenario.name, 0) + 1
+    if twice := [name for name, count in counts.items() if count > 1]:
         raise InputError(f"--scenario {twice[0]}: given twice")
-    return tuple(found)
+    return tuple(scenarios)
 
 
 def _read_one(name: str) -> tuple[DrivingScenario, ...]:
@@ -71,7 +71,7 @@ def _read_one(name: str) -> tuple[DrivingScenario, ...]:
         and {"event", "case", "place", "traffic", "pedestrians"} & set(values)
         and "source" not in values
     ):
-        return (_make_own(parse_config(ScenarioFile, values, str(path)), called, path.parent),)
+        return (_make_scenario(parse_config(ScenarioFile, values, str(path)), called, path.parent),)
     if not isinstance(values, dict):
         raise InputError(f"{path}: a scenario is a mapping, with a town")
     return _list_cases(parse_recipe(values, str(path)), called, path.parent, path)
@@ -89,33 +89,33 @@ def _read_recording(folder: Path) -> tuple[DrivingScenario, ...]:
     return _list_cases(parse_recipe(known, str(folder)), folder.resolve().name, folder, folder)
 
 
-def _make_own(own: ScenarioFile, name: str, beside: Path) -> DrivingScenario:
-    plain = DrivingScenario(name, _find_town(own.town, beside), own.event, "clear", own.traffic, own.pedestrians)
-    sky = own.weather.draw(stream(0, "weather", name)).at(0.0)
-    return replace(plain, case=own.case, place=own.place).with_sky(sky)
+def _make_scenario(file: ScenarioFile, name: str, folder: Path) -> DrivingScenario:
+    plain = DrivingScenario(name, _find_town(file.town, folder), file.event, "clear", file.traffic, file.pedestrians)
+    sky = file.weather.draw(stream(0, "weather", name)).at(0.0)
+    return replace(plain, case=file.case, place=file.place).with_sky(sky)
 
 
-def _list_cases(recipe: Recipe, name: str, beside: Path, origin: Path) -> tuple[DrivingScenario, ...]:
-    """Return a scenario for each corner case of a recipe, one without any where it has none."""
+def _list_cases(recipe: Recipe, name: str, folder: Path, origin: Path) -> tuple[DrivingScenario, ...]:
+    """Return a scenario for each corner case of a recipe; a recipe without corner cases gives one without events."""
     if isinstance(recipe, CarlaRecipe):
         raise InputError(f"{origin}: is recorded in CARLA; flcav drives in its own towns")
-    town = _find_town(recipe.town, beside)
+    town = _find_town(recipe.town, folder)
     plain = DrivingScenario(name, town, "none", "clear", TRAFFIC, PEDESTRIANS)
     schedule = recipe.weather.draw(stream(recipe.seed, "weather", name))
     if not recipe.scenarios:
         return (plain.with_sky(schedule.at(0.0)),)
     first_s = recipe.warmup_steps[0] / 10
-    found = []
-    for number, each in enumerate(recipe.scenarios, start=1):
+    scenarios = []
+    for number, case in enumerate(recipe.scenarios, start=1):
         called = name if len(recipe.scenarios) == 1 else f"{name}-{number}"
-        placed = replace(plain, name=called, case=each.kind, place=each.position)
-        found.append(placed.with_sky(schedule.at(max(each.at_s - first_s, 0.0))))
-    return tuple(found)
+        placed = replace(plain, name=called, case=case.kind, place=case.position)
+        scenarios.append(placed.with_sky(schedule.at(max(case.at_s - first_s, 0.0))))
+    return tuple(scenarios)
 
 
-def _find_town(name: str, beside: Path) -> str:
+def _find_town(name: str, parent: Path) -> str:
     """Return the name of a town of flcav, or the folder of an imported one; raises `InputError` for neither."""
-    folder = beside / name
+    folder = parent / name
     known = name if name in PACKAGED or not folder.is_dir() else str(folder.resolve())
     load_town(known)
     return known

@@ -1,6 +1,6 @@
 """Scenarios of closed-loop drives: a route in a town, its traffic and weather, and an event that requires braking.
 
-A scenario with a seed is one drive: the route is of the scenario, traffic and the moment of the event are of the seed.
+A scenario and a seed determine a drive: the seed draws the route, the traffic and the moment of the event.
 """
 
 from collections.abc import Sequence
@@ -26,46 +26,46 @@ from flcav.world.weather import WEATHERS, Weather, find_nearest_class
 
 Event = Literal["none", "walker", "stalled", "braking"]
 
-CAR = ("car", 3)
-ROUTE_M = 500.0
-SHORTEST_M = 250.0
-TRIES = 200
-LEAST_M = 60.0  # of a route behind its start, where the start or a place is given
-BEFORE_M = 40.0  # before a place that a route passes by the drive begins
-REACHES_M = (3.0, 8.0, 15.0, 35.0)  # from the route to a place or a start, tried in this order
-SAME_RAD = np.pi / 4  # from the heading of a start to that of the route
-DT_S = 0.1
+CAR = ("car", 3)  # category and shape of the ego vehicle
+ROUTE_M = 500.0  # length of a drawn route
+SHORTEST_M = 250.0  # least length of a route after its start
+TRIES = 200  # of drawing a route
+LEAST_M = 60.0  # the same, where the start or a place is given
+BEFORE_M = 40.0  # a drive begins so far before the given place
+REACHES_M = (3.0, 8.0, 15.0, 35.0)  # greatest distance from the route to the place or start, tried in this order
+SAME_RAD = np.pi / 4  # greatest difference between the headings of a start and of the route
+DT_S = 0.1  # step of the closed loop
 WALKER_MPS = 1.6
-STALLED_S = 14.0  # so long a broken-down car stands
-BRAKES_MPS2 = 6.0  # of the car ahead
+STALLED_S = 14.0  # for which a broken-down car stands
+BRAKES_MPS2 = 6.0  # deceleration of the car ahead
 LEAD = "lead"
 
 
 @dataclass(frozen=True)
 class DrivingScenario:
-    """Driving scenario: town, event and weather; a seed makes a drive of it."""
+    """Driving scenario: town, traffic, event and weather; a seed makes it a drive."""
 
     name: str
     town: str
     event: Event
     weather: str  # a class of the weather task
-    traffic: int  # vehicles of SUMO
+    traffic: int  # number of SUMO's vehicles
     pedestrians: int
-    sky: Annotated[Weather | None, LEFT_OUT] = None  # the weather itself; None: drawn from its class
+    sky: Annotated[Weather | None, LEFT_OUT] = None  # weather parameters; None: drawn from the class
     place: Annotated[tuple[float, float] | None, LEFT_OUT] = None  # x, y that the route passes by [m]
     start: Annotated[Pose | None, LEFT_OUT] = None  # x, y [m] and yaw [rad] where the ego vehicle sets out
-    speed: Annotated[float, WHERE_TRUE] = 0.0  # of the ego vehicle at first [m/s]
-    case: Annotated[Kind | None, LEFT_OUT] = None  # corner case that happens, beside the event
-    scripts: Annotated[tuple[Script, ...], WHERE_TRUE] = ()  # of an OpenSCENARIO file, beside the event
+    speed: Annotated[float, WHERE_TRUE] = 0.0  # initial speed of the ego vehicle [m/s]
+    case: Annotated[Kind | None, LEFT_OUT] = None  # corner case, in addition to the event
+    scripts: Annotated[tuple[Script, ...], WHERE_TRUE] = ()  # of an OpenSCENARIO file, in addition to the event
 
     def with_sky(self, sky: Weather) -> "DrivingScenario":
-        """Return the scenario in a weather; of its classes the one that is driven slowest in counts."""
+        """Return the scenario in a weather; at night its class is `night` unless that of its rain or fog is slower."""
         day = find_nearest_class(sky.model_copy(update={"sun_elevation_deg": 45.0}) if sky.night else sky)
         slow = sky.night and WEATHER_SPEED[day] >= WEATHER_SPEED["night"]
         return replace(self, sky=sky, weather="night" if slow else day)
 
     def at_night(self) -> "DrivingScenario":
-        """Return the scenario at night, its rain and sight as they are."""
+        """Return the scenario at night, with the same rain and visibility."""
         sun = {name: getattr(WEATHERS["night"], name) for name in ("sun_elevation_deg", "sun_azimuth_deg")}
         sky = (self.sky or WEATHERS[self.weather]).model_copy(update=sun)
         return replace(self.with_sky(sky), name=f"{self.name}-night")
@@ -73,29 +73,30 @@ class DrivingScenario:
     def line(self) -> str:
         """Return the scenario in words."""
         events = [self.event if self.event != "none" else "", self.case or "", "script" if self.scripts else ""]
-        seen, sky = "", self.sky
+        details, sky = "", self.sky
         if sky is not None:
-            rain, sight = f"rain {sky.rain_mm_h:.1f} mm/h", f"sight {sky.visibility_m:.0f} m"
-            seen = f" (sun {sky.sun_elevation_deg:.0f} deg, {rain}, {sight})"
+            rain = f"rain {sky.rain_mm_h:.1f} mm/h"
+            sight = f"sight {sky.visibility_m:.0f} m"
+            details = f" (sun {sky.sun_elevation_deg:.0f} deg, {rain}, {sight})"
         happens = " and ".join(filter(None, events)) or "no event"
         around = f"{plural(self.traffic, 'vehicle')}, {plural(self.pedestrians, 'pedestrian')}"
-        return f"{self.name}: {self.town}, {happens}, {self.weather}{seen}, {around}"
+        return f"{self.name}: {self.town}, {happens}, {self.weather}{details}, {around}"
 
 
 def list_scenarios() -> tuple[DrivingScenario, ...]:
     """Return the scenarios of the package: every town with each event in clear weather, and in rain or fog in turn."""
     bad = ("fog", "heavy_rain")
     events: tuple[Event, ...] = ("none", "walker", "stalled", "braking")
-    found = []
+    scenarios = []
     for (i, town), (j, event) in product(enumerate(TOWNS), enumerate(events)):
         for weather in ("clear", bad[(i + j) % 2]):
-            found.append(DrivingScenario(f"{town}-{event}-{weather}", town, event, weather, 25, 8))
-    return tuple(found)
+            scenarios.append(DrivingScenario(f"{town}-{event}-{weather}", town, event, weather, 25, 8))
+    return tuple(scenarios)
 
 
 def find_scenarios(names: Sequence[str]) -> tuple[DrivingScenario, ...]:
-    """Return the scenarios of these names, or all for none; raises `InputError` for an unknown one."""
-    known = {each.name: each for each in list_scenarios()}
+    """Return the package's scenarios of these names, or all without names; raises `InputError` for an unknown name."""
+    known = {scenario.name: scenario for scenario in list_scenarios()}
     if odd := [name for name in names if name not in known]:
         raise InputError(
             f"scenario {shorten(odd[0])}: neither a file, nor one of flcav{suggest(odd[0], known)}; `flcav drive "
@@ -112,10 +113,10 @@ def spread_scenarios(count: int) -> tuple[DrivingScenario, ...]:
 
 
 def find_start(route: Route, wanted: tuple[float, ...], reach_m: float) -> float | None:
-    """Return how far along a route [m] a drive begins; None where the route does not fit.
+    """Return the distance [m] along a route at which a drive begins; None where the route does not fit.
 
-    `wanted` is the place x, y [m] that it passes by, `BEFORE_M` further on, or the pose x, y, yaw at which it begins;
-    the route comes within `reach_m` of it.
+    `wanted` is either a place x, y [m], which the drive passes after `BEFORE_M`, or its initial pose x, y [m] and yaw
+    [rad], in the world frame. The route has to come within `reach_m` [m] of it.
     """
     marks = np.arange(0.0, route.length_m, 1.0)
     poses: Array = route.at(marks)
@@ -128,10 +129,10 @@ def find_start(route: Route, wanted: tuple[float, ...], reach_m: float) -> float
 
 
 class StagedScenario:
-    """A scenario under way: the world with the ego vehicle at the start of its route, and the event's actors."""
+    """A running scenario: the world with the ego vehicle at the start of its route, and the event's actors."""
 
     def __init__(self, scenario: DrivingScenario, seed: int) -> None:
-        """Start the world; raises `InputError` where no room is found for the ego vehicle."""
+        """Start the world and place the actors; raises `InputError` where there is no room for the ego vehicle."""
         self.scenario = scenario
         self.town: Town = load_town(scenario.town)
         self.world = LiveWorld(
@@ -159,7 +160,7 @@ class StagedScenario:
             raise
 
     def act(self, along_m: float, speed: float) -> None:
-        """Let the event go on, when the ego vehicle is `along_m` its route [m] and drives at `speed` [m/s]."""
+        """Advance the event by a step; the ego vehicle is at `along_m` [m] of its route and drives at `speed` [m/s]."""
         if self._player is not None:
             at_x, at_y, _ = self.world.snapshot.trace.position[0, self.world.snapshot.row(EGO)].tolist()
             self._player.act((at_x, at_y), DT_S)
@@ -206,7 +207,7 @@ class StagedScenario:
             self._after_m = at + float(self._random.uniform(60.0, 110.0))
 
     def _spawn(self, command: Spawn) -> bool:
-        """Put an actor where there is room; return whether there was."""
+        """Spawn an actor if there is room; return whether there was."""
         if self.world.find_obstruction(command):
             return False
         self.world.apply(command)
@@ -218,7 +219,7 @@ class StagedScenario:
         return x, y
 
     def _walk(self, along_m: float, speed: float) -> None:
-        """Let the walker set out when the ego vehicle, at this speed, is near, and stop on the far side."""
+        """Let the walker cross when the ego vehicle is near for its speed, and stop on the far side."""
         if self._phase == "waits" and 0 < self._at_m - along_m < max(3.2 * speed, 8.0):
             across = left_vectors(self.route.at(self._at_m)[2]) * WALKER_MPS
             self.world.apply(Walk("walker", (float(across[0]), float(across[1]))))
@@ -228,7 +229,7 @@ class StagedScenario:
             self._phase = "gone"
 
     def _lead(self) -> None:
-        """Let the car ahead drive along the route, brake hard, wait, and go on."""
+        """Let the car ahead drive along the route, brake hard, and leave after five seconds."""
         if self._phase == "gone":
             return
         snapshot = self.world.snapshot

@@ -1,7 +1,7 @@
-"""Scripts of corner cases: what actors beside the ego vehicle do, and the player that lets them do it in a live world.
+"""Scripts of corner cases, with actors and their actions, and the player that runs them in a live world.
 
-Actors are kinematic: they keep to a line, that of the ego vehicle's route where they drive along it or against it, and
-otherwise a straight one, and nothing moves them. The same scripts are written as OpenSCENARIO (`odd.openscenario`).
+Actors are kinematic, without physics: they follow the ego vehicle's route where they drive along or against it, and
+otherwise a straight line. The same scripts are written as OpenSCENARIO (`odd.openscenario`).
 """
 
 import math
@@ -16,57 +16,58 @@ from flcav.world.scenarios.scenario import Kind
 from flcav.world.shapes import SHAPES
 
 BEGINS_S = 2.0
-LANE_M = 3.4  # from a lane's middle to that of the next
-ALONG_M, ALONG_RAD = 12.0, math.pi / 4  # an actor so near to the route, and so nearly parallel, keeps along it
-PREFIX = "script-"  # of the names of actors: those of the traffic begin otherwise
+LANE_M = 3.4  # between the centre lines of adjacent lanes
+ALONG_M = 12.0  # an actor that starts within this distance of the route,
+ALONG_RAD = math.pi / 4  # and within this angle of its direction or the opposite, follows it
+PREFIX = "script-"  # of the actors' names, to tell them from those of the traffic
 
-Pose = tuple[float, float, float]  # ahead of and left of the ego's start [m], heading to the ego's [rad]
+Pose = tuple[float, float, float]  # ahead and to the left of the ego's start [m], heading relative to the ego's [rad]
 
 
 @dataclass(frozen=True)
 class Entity:
-    """An entity of a scenario beside the ego."""
+    """A scripted actor of a scenario."""
 
     name: str
     category: str
     shape: str
-    start: Pose
-    speed: float  # [m/s]
+    start: Pose  # relative to the ego's start
+    speed: float  # initial [m/s]
     size: tuple[float, float, float] | None = None  # length, width, height [m]; None: that of the shape
 
 
 @dataclass(frozen=True)
 class Speed:
-    """An actor goes over to a speed [m/s] at a rate [m/s^2]."""
+    """A speed change of an actor at a constant rate."""
 
     actor: str
-    target: float
-    rate: float
+    target: float  # [m/s]
+    rate: float  # magnitude of the acceleration [m/s^2]
 
 
 @dataclass(frozen=True)
 class Aside:
-    """A lane change of an actor: the number of lanes to the left, and the duration."""
+    """A lane change of an actor."""
 
     actor: str
-    lanes: int
-    within_s: float
+    lanes: int  # to the left; negative to the right
+    within_s: float  # duration
 
 
 @dataclass(frozen=True)
 class Script:
-    """What happens in a corner case: actors, and actions that begin together when the trigger fires."""
+    """Script of a corner case: its actors, and the actions that start together when its trigger fires."""
 
     actors: tuple[Entity, ...]
     actions: tuple[Speed | Aside, ...]
-    near: str | None = None  # fires when the ego is within `within_m` of this actor; None: at `begins_s`
+    near: str | None = None  # trigger by distance: the ego is within `within_m` of this actor; None: by time
     within_m: float = 0.0
-    begins_s: float = BEGINS_S
-    origin: Pose | None = None  # world pose of the ego's start; None: where its route begins
+    begins_s: float = BEGINS_S  # trigger by time
+    origin: Pose | None = None  # world pose of the ego's start [m], [rad]; None: where its route begins
 
 
 def write_script(case: Kind, limit: float) -> Script:
-    """Return the script of a corner case on a street with that speed limit [m/s]."""
+    """Return the script of a corner case on a street with a speed limit [m/s]."""
     back = math.pi
     if case == "stalled_vehicle":
         return Script((Entity("stalled", "car", "sedan", (25.0, 0.0, 0.0), limit),), (Speed("stalled", 0.0, 4.0),))
@@ -90,34 +91,35 @@ def write_script(case: Kind, limit: float) -> Script:
 
 @dataclass
 class _Acting:
-    """An actor under way: its line, where it is on it, and what it goes over to."""
+    """State of an actor: its line, its position on the line, and the actions in progress."""
 
     entity: Entity
-    origin: tuple[float, float, float]  # x, y [m], yaw [rad] of a straight line
-    along: float | None  # the route [m]; None on a straight line
-    left: float  # of the line [m], to the actor's own left
+    origin: tuple[float, float, float]  # start of a straight line in the world: x, y [m], yaw [rad]
+    along: float | None  # distance along the route [m]; None on a straight line
+    left: float  # lateral offset from the line [m], to the actor's left
     way: int  # 1 along the route, -1 against it
-    speed: float
-    target: float | None = None
-    rate: float = 0.0
-    gone: float = 0.0  # on a straight line [m]
-    shift: tuple[float, float, float, float] | None = None  # begins [s], lasts [s], from, to [m]
+    speed: float  # [m/s]
+    target: float | None = None  # speed [m/s]
+    rate: float = 0.0  # [m/s^2]
+    gone: float = 0.0  # distance on a straight line [m]
+    shift: tuple[float, float, float, float] | None = None  # lane change: start, duration [s], from, to offset [m]
 
 
 class ScriptPlayer:
-    """The actors of scripts in a live world."""
+    """Player of scripts: moves their actors in a live world."""
 
     def __init__(self, world: LiveWorld, scripts: Sequence[Script], route: Route, start_m: float) -> None:
-        """Put the actors in their places; vehicles of the traffic that are there leave."""
-        self._world, self._route, self._waiting = world, route, list(scripts)
+        """Spawn the actors, and remove traffic that is in their place; the ego starts at `start_m` [m] of the route."""
+        self._world, self._route = world, route
+        self._waiting = list(scripts)
         self._actors = {
-            each.name: self._enter(each, script.origin, start_m) for script in scripts for each in script.actors
+            entity.name: self._enter(entity, script.origin, start_m) for script in scripts for entity in script.actors
         }
 
     def act(self, ego: tuple[float, float], dt_s: float) -> None:
-        """Let the actors go on for `dt_s` [s], when the ego vehicle is at x, y [m]."""
+        """Move the actors by a step of `dt_s` [s]; `ego` is the ego vehicle's position x, y [m] in the world."""
         now = self._world.snapshot.time_s
-        for script in [each for each in self._waiting if self._fires(each, ego, now)]:
+        for script in [waiting for waiting in self._waiting if self._fires(waiting, ego, now)]:
             self._waiting.remove(script)
             for action in script.actions:
                 self._begin(action, now)
@@ -137,7 +139,7 @@ class ScriptPlayer:
         return actor
 
     def _on_route(self, entity: Entity, start_m: float) -> _Acting:
-        """Return an actor whose place is ahead along the route, and to its left."""
+        """Return an actor that starts relative to the route: ahead along it, and to its left."""
         ahead, left, turned = entity.start
         x, y, yaw = self._route.at(start_m + ahead).tolist()
         aside = (x, y) + left * left_vectors(yaw)
@@ -145,15 +147,15 @@ class ScriptPlayer:
         return self._start(entity, place, start_m + ahead, left, turned)
 
     def _in_world(self, entity: Entity, origin: Pose, start_m: float) -> _Acting:
-        """Return an actor whose place is ahead and to the left of a pose in the world."""
+        """Return an actor that starts relative to a world pose: straight ahead of it, and to its left."""
         ahead, left, turned = entity.start
-        x, y = (float(each) for each in rotate(ahead, left, origin[2]))
+        x, y = (float(axis) for axis in rotate(ahead, left, origin[2]))
         place = (origin[0] + x, origin[1] + y, origin[2] + turned)
         along, aside = self._route.project(place[0], place[1], start_m + ahead)
         return self._start(entity, place, along, aside, place[2] - float(self._route.at(along)[2]))
 
     def _start(self, entity: Entity, place: Pose, along: float, left: float, turned: float) -> _Acting:
-        """Return an actor on the route's line where it goes along it, and otherwise on a straight one."""
+        """Return an actor that follows the route where it starts nearly parallel to it, otherwise a straight line."""
         angle = abs(float(wrap_angle(turned)))
         parallel = abs(left) < ALONG_M and min(angle, math.pi - angle) < ALONG_RAD
         if not parallel or entity.category == "pedestrian" or not 0 < along < self._route.length_m:

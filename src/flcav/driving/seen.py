@@ -1,15 +1,15 @@
-"""The surroundings that a driver perceives: the record, ground truth as a perception, and tasks that are left out.
+"""Perceived surroundings of the ego vehicle: their record, ground-truth perception, and ablation of tasks.
 
-All tasks of perception end in `Seen`: `objects` in the boxes, `trajectory` in the paths, `signs` in the lights,
-`weather` in the speed. World frame: ENU, metres, radians, seconds.
+All perception tasks end in `Seen`: `objects` in the boxes, `trajectory` in the paths, `signs` in the lights, `weather`
+in the speed. World frame: ENU, metres, radians, seconds.
 
-A task is left out by one of two couplings. In the *bare* one nobody is seen without `objects`, everybody is taken to
-stand without `trajectory`, no light is known without `signs`, and without `weather` the driver keeps to the limit in
-any. In the *cautious* one the driver knows what is missing: it drives slower, and tracks keep their velocity. How much
-the ranking of tasks depends on this choice is what the two show.
+A task is ablated by one of two couplings. In the *bare* one no road user is seen without `objects`, all are assumed to
+stand without `trajectory`, no light is known without `signs`, and without `weather` the full limit is driven. In the
+*cautious* one the driver knows what is missing: it drives more slowly, and tracks keep their velocity. The difference
+between the two shows how much a ranking of tasks depends on this choice.
 
-The true perception knows positions and velocities. What road users are going to do nobody knows in a live world, so
-that their paths are predicted with constant speed and turn rate here, too.
+Ground-truth perception has true positions and velocities. The future of a live world is not known, so that it predicts
+paths with constant speed and turn rate as well.
 """
 
 from collections.abc import Collection, Mapping
@@ -23,7 +23,7 @@ from flcav.geometry import Array, Boxes, heading_vectors, wrap_angle
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 
-TIMES_S: Array = np.arange(0.0, 4.01, 0.25)  # of the points of predicted paths, from the present on
+TIMES_S: Array = np.arange(0.0, 4.01, 0.25)  # (T,) times of the points of predicted paths, from the present on
 EGO = "ego"
 WEATHER_SPEED: Mapping[str, float] = {  # share of the speed limit that a driver keeps to in each class of weather
     "clear": 1.0,
@@ -39,31 +39,32 @@ WEATHER_SPEED: Mapping[str, float] = {  # share of the speed limit that a driver
 
 @dataclass(frozen=True)
 class Seen:
-    """The surroundings of the ego vehicle at one instant, as its perception has them."""
+    """The perceived surroundings of the ego vehicle at one instant, in the world frame."""
 
     boxes: Boxes  # (N,) road users
     velocity: Array  # (N, 2) over ground [m/s]
     path: Array  # (N, T, 2) predicted positions at `TIMES_S` [m]
     yaw: Array  # (N, T) predicted headings [rad]
     spread: Array  # (N, T) standard deviation of the predicted position, along each axis [m]
-    closed: frozenset[str]  # entries of `Trace.light` that are seen not to be green
-    amber: frozenset[str]  # those of them that are yellow
-    speed_share: float = 1.0  # of the speed limit, for the weather
-    found_by: str = "the truth"  # what the boxes are of
+    closed: frozenset[str]  # entries of `Trace.light` that are perceived as red or yellow
+    amber: frozenset[str]  # the yellow ones among them
+    speed_share: float = 1.0  # share of the speed limit to drive in the weather
+    found_by: str = "the truth"  # source of the boxes, in words
 
 
 class Perception(Protocol):
-    """The interface of a driver's perception: from the world to its perceived surroundings."""
+    """Interface of a driver's perception: from the world to the perceived surroundings."""
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return the perceived surroundings at this instant; called once for every decision, in order of time."""
+        """Return the perceived surroundings at this instant; called once per decision, in order of time."""
         ...
 
 
 def predict_motion(boxes: Boxes, velocity: Array, yaw_rate: Array | None = None) -> tuple[Array, Array]:
-    """Return paths (N, T, 2) [m] and headings (N, T) [rad] at `TIMES_S`: constant velocity, and turn rate if given.
+    """Return paths (N, T, 2) [m] and headings (N, T) [rad] at `TIMES_S` by constant velocity, and turn rate if given.
 
-    The chord of the arc is used (Schubert et al., FUSION 2008, CTRV); `yaw_rate` is (N,) [rad/s].
+    `velocity` is (N, 2) [m/s], `yaw_rate` (N,) [rad/s]. Positions are the chords of circular arcs (constant turn rate
+    and velocity: Schubert et al., FUSION 2008).
     """
     turn = np.zeros((len(boxes), 1)) if yaw_rate is None else yaw_rate[:, None] * TIMES_S
     half = turn / 2
@@ -76,7 +77,7 @@ def predict_motion(boxes: Boxes, velocity: Array, yaw_rate: Array | None = None)
 Coupling = Literal["bare", "cautious"]
 
 TASKS = ("objects", "trajectory", "signs", "weather")
-SLOWER: Mapping[str, float] = {  # share of the limit in the cautious coupling
+SLOWER: Mapping[str, float] = {  # share of the limit without a task, in the cautious coupling
     "objects": 0.3,
     "trajectory": 1.0,
     "signs": 0.5,
@@ -117,29 +118,29 @@ def leave_out(seen: Seen, task: str, coupling: Coupling) -> Seen:
 
 @dataclass(frozen=True)
 class Without:
-    """Perception without a task."""
+    """Perception with one task ablated."""
 
-    whole: Perception
+    whole: Perception  # with all tasks
     task: str  # one of `TASKS`
     coupling: Coupling
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return the surroundings as the complete perception has them, less the output of the task."""
+        """Return the output of the complete perception, without that of the task."""
         return leave_out(self.whole.look(snapshot), self.task, self.coupling)
 
 
 AMBER, CLOSED = "y", "ryu"  # SUMO's letters
-SIGHT_M = 90.0
+SIGHT_M = 90.0  # range of ground-truth perception
 
 
 class TruePerception:
-    """Ground truth within `SIGHT_M` of the ego vehicle; one per drive, since parked vehicles are looked up once."""
+    """Ground-truth perception within `SIGHT_M` of the ego vehicle."""
 
     def __init__(self, weather: str = "clear") -> None:
         self._share = WEATHER_SPEED[weather]
 
     def look(self, snapshot: Snapshot) -> Seen:
-        """Return all road users, lights, and the speed share of the weather as it is."""
+        """Return the true road users, lights, and share of the speed limit for the weather."""
         rows = find_around(snapshot, SIGHT_M)
         boxes, velocity, yaw_rate = read_actors(snapshot, rows)
         path, yaw = predict_motion(boxes, velocity, np.where(boxes.label == "pedestrian", 0.0, yaw_rate))
@@ -149,14 +150,14 @@ class TruePerception:
 
 def find_around(snapshot: Snapshot, reach_m: float) -> NDArray[np.int64]:
     """Return the rows of the actors within `reach_m` of the ego vehicle, without itself."""
-    trace, own = snapshot.trace, snapshot.row(EGO)
-    away = np.linalg.norm(trace.position[0, :, :2] - trace.position[0, own, :2], axis=1)
-    away[own] = np.inf
+    trace, ego = snapshot.trace, snapshot.row(EGO)
+    away = np.linalg.norm(trace.position[0, :, :2] - trace.position[0, ego, :2], axis=1)
+    away[ego] = np.inf
     return np.flatnonzero(away <= reach_m)
 
 
 def read_actors(snapshot: Snapshot, rows: NDArray[np.int64]) -> tuple[Boxes, Array, Array]:
-    """Return boxes (labels are categories), velocities (N, 2) [m/s] and yaw rates (N,) [rad/s] of some actors."""
+    """Return boxes (labels are categories), velocities (N, 2) [m/s] and yaw rates (N,) [rad/s] of actors by row."""
     trace = snapshot.trace
     size = trace.size[rows]
     centre = trace.position[0, rows] + size * np.array((0.0, 0.0, 0.5))
@@ -165,7 +166,7 @@ def read_actors(snapshot: Snapshot, rows: NDArray[np.int64]) -> tuple[Boxes, Arr
 
 
 def read_lights(snapshot: Snapshot) -> tuple[frozenset[str], frozenset[str]]:
-    """Return the lights that are not green, and those of them that are yellow."""
+    """Return the true lights that are red or yellow, and the yellow ones among them."""
 
     def showing(letters: Collection[str]) -> frozenset[str]:
         return frozenset(snapshot.trace.light[np.isin(snapshot.trace.light_state[0], list(letters))].tolist())
@@ -174,15 +175,16 @@ def read_lights(snapshot: Snapshot) -> tuple[frozenset[str], frozenset[str]]:
 
 
 FIELD_M = (51.2, 28.8)  # ahead, and to each side: the field of the vehicle's detector, `small`
-EYE_M = 1.85  # of its LiDAR above the ground
-ACROSS = (0.0, -0.4, 0.4)  # of a road user's extent across the line of sight: where rays end
-START_M = 0.6  # from the place to the start of a ray, outside a mast
+EYE_M = 1.85  # height of its LiDAR above the ground
+ACROSS = (0.0, -0.4, 0.4)  # ends of rays, as shares of a road user's extent across the line of sight
+START_M = 0.6  # from the place to the start of a ray, so that a sensor's mast does not block it
 
 
 def share_seen(scene: Scene, place: Array, boxes: Boxes, hidden: int | None = None) -> Array:
-    """Return (N,) the share of three rays from a place (3,) to each road user that nothing else is in the way of.
+    """Return the visibility (N,) of road users from a place (3,) [m]: the share of three rays that reach each of them.
 
-    A ray ends before the road user's own body. `hidden` is the row of an actor that is left out, such as the own one.
+    A ray ends in front of the road user's body. `hidden` is the row of an actor that does not block, such as the ego
+    vehicle.
     """
     if not len(boxes):
         return np.zeros(0)

@@ -42,8 +42,10 @@ from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
 PARTITION = "partition-id"  # key of Flower's simulation in a node's config: index of its client
-OWN, RESIDUAL = "own", "residual"  # records of a node's state: kept by strategy and compression between rounds
-OWN_DIGESTS = "own-digests"  # record in place of an `OWN` that stays with the client: of the last two, latest first
+OWN, RESIDUAL = "own", "residual"  # records of a node's state between rounds: of the strategy, of compression
+OWN_DIGESTS = (
+    "own-digests"  # record in place of an `OWN` that stays with the client: its last two digests, latest first
+)
 OPTIMISER = "optimiser"  # record of a node's state: that of the client's optimiser
 KEPT, KEPT_START = "kept", "kept-start"  # an update whose norm was reported, until it is asked for
 HIDDEN = "hidden"  # an update that was masked, until the sum of its round is unmasked
@@ -255,7 +257,8 @@ class _ClientSide:
         except BudgetExceeded as error:
             if isinstance(trainable, Accounts):
                 raise
-            raise RuntimeError(f"no budget is its own: {error}") from None  # else the federation ended
+            # `BudgetExceeded` would end the federation, which only the budget of a link may do.
+            raise RuntimeError(f"no budget is its own: {error}") from None
         if self.rules.keep_optimiser:
             if not (state := getattr(update, "optimiser", {})):
                 raise TypeError("keep_optimiser: its update has no 'optimiser' to keep")

@@ -146,38 +146,39 @@ def expected_clients(selection: Selection, names: Sequence[str]) -> float:
 
 @dataclass(frozen=True)
 class RoundNoise(Record):
-    """The noise of a round beside what it is to hide: L2 norms over all values that are learned and sent."""
+    """The noise of a round compared with its updates: L2 norms over all values that are learned and sent."""
 
-    clients: float  # that a round expects
-    values: int  # d, of an update
+    clients: float  # expected number in a round
+    values: int  # d, length of an update
     norm: float  # expected norm of the noise in the sum of the updates
-    most: float  # norm of the sum of clipped updates, if all point the same way
+    most: float  # greatest norm of the sum of clipped updates: all point the same way
 
     @property
     def drowns(self) -> bool:
-        """Return whether the noise is longer than all updates together can be."""
+        """Return whether the norm of the noise exceeds the greatest norm of the sum of the updates."""
         return self.norm > self.most
 
     def describe(self) -> str:
         """Return the comparison in words, with what would help where the noise is longer."""
-        told = (
+        compared = (
             f"noise of a round {self.norm:.3g} over {self.values:,} values, beside {self.most:.3g} at most of the "
             f"clipped updates of {self.clients:g} vehicles"
         )
         if not self.drowns:
-            return told
+            return compared
         return (
-            f"WARNING: {told}: {self.norm / self.most:.3g} times as long, which can ruin the network; less noise (a "
-            "larger epsilon, fewer rounds), more vehicles in a round, or fewer layers (upload.layers) make it shorter"
+            f"WARNING: {compared}: {self.norm / self.most:.3g} times as long, which can ruin the network; less noise "
+            "(a larger epsilon, fewer rounds), more vehicles in a round, or fewer layers (upload.layers) make it "
+            "shorter"
         )
 
 
 def measure_round_noise(privacy: Privacy, clients: float, values: int) -> RoundNoise:
-    """Return the noise of a round beside the most that its updates add up to: sigma C sqrt(d) and n C.
+    """Return the norm of a round's noise, sigma C sqrt(d), and the greatest norm of the sum of its updates, n C.
 
-    clients: n, expected in a round. values: d, that are learned and sent. Where each client adds noise, the sum has
-    sqrt(n) times as much. The mean that the weights change by is 1 / n of both. Raises ValueError where the noise is
-    not known yet.
+    clients: expected number n in a round. values: number d of values that are learned and sent. With local noise, the
+    sum has sqrt(n) times as much. The change of the weights, the mean, is 1 / n of both. Raises ValueError where the
+    noise is not known yet.
     """
     norm = privacy.deviation * math.sqrt(values * (clients if privacy.local else 1.0))
     return RoundNoise(clients, values, norm, clients * privacy.clip)

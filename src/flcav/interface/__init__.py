@@ -1,1 +1,1 @@
-"""What users meet: public names and their documentation, wording of messages, progress, optional extras."""
+"""User interface in Python: lazy public names, documentation of fields, wording of messages, progress bars."""

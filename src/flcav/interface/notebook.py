@@ -1,4 +1,4 @@
-"""What notebooks show: records as `flcav.plot` draws them, and an interrupted call as one sentence."""
+"""Display in notebooks: records as pictures or tables by `flcav.plot`, and interrupted calls as one sentence."""
 
 import functools
 from collections.abc import Callable
@@ -10,7 +10,7 @@ Result = TypeVar("Result")
 
 
 class Displayed:
-    """A record that a notebook displays as a picture or as a table; `flcav.plot` is imported when one is displayed."""
+    """Mixin of records that a notebook displays as a picture or table; `flcav.plot` is imported on first display."""
 
     __slots__ = ()
 
@@ -24,7 +24,7 @@ class Displayed:
 
 
 def resumable(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
-    """Decorate a function that resumes what an earlier call left: Ctrl-C ends it in a sentence that says so."""
+    """Decorate a resumable function: on Ctrl-C, its KeyboardInterrupt says that the same call continues the work."""
 
     @functools.wraps(function)
     def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
 Report = Callable[[int, int, str], None]  # done, total, note (e.g. "loss 0.31")
 WIDTH = 79  # of the line
-DAMAGED = "is damaged"  # in notes that stay on the terminal: a file is not what was written, and is made anew
+DAMAGED = "is damaged"  # in notes that stay on the terminal: a file failed its check and is made anew
 
 
 def ignore_progress(done: int, total: int, note: str = "") -> None:
@@ -17,9 +17,9 @@ def ignore_progress(done: int, total: int, note: str = "") -> None:
 
 
 def print_progress(done: int, total: int, note: str = "") -> None:
-    """Write progress on one line of stderr where somebody watches, in a terminal or a notebook: the `Report` of Python.
+    """Print progress on one line of stderr, in a terminal or notebook only: the default `Report` of Python calls.
 
-    A note that a file is damaged stays there.
+    A note that a file is damaged stays on a line of its own.
     """
     if not (sys.stderr.isatty() or "ipykernel" in sys.modules):
         return
@@ -32,8 +32,8 @@ def print_progress(done: int, total: int, note: str = "") -> None:
 def show_progress(title: str) -> Iterator[Report]:
     """Yield a `Report` that draws a progress bar with the estimated time left on stderr, if stderr is a terminal.
 
-    The `done` of the first call is taken as finished earlier and does not count towards the speed. A note that a file
-    is damaged is printed, with a terminal and without.
+    The `done` of the first call was finished by an earlier run, and does not count towards the speed. A note that a
+    file is damaged is always printed, even without a terminal.
     """
     columns = (
         TextColumn("{task.description}", markup=False),

@@ -1,4 +1,4 @@
-"""Wording of messages: names that were probably meant, numbers without their units, plurals of counts.
+"""Wording of messages: suggestions for misspelt names, hints on units, printable text, plurals.
 
 Optional dependencies: the packages of flcav's extras and the command that installs them.
 """
@@ -11,7 +11,7 @@ from difflib import get_close_matches
 from importlib.metadata import requires
 
 AMOUNT = re.compile(r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)\s*([A-Za-z%/]+)\s*")
-UNITS: Mapping[str, Mapping[str, float]] = {  # by the ending of a field's name: what one of a unit is in its own
+UNITS: Mapping[str, Mapping[str, float]] = {  # by suffix of a field's name: factors from other units to the field's
     "mb": {"b": 1e-6, "kb": 1e-3, "mb": 1.0, "gb": 1e3, "tb": 1e6},
     "mbps": {"kbps": 1e-3, "mbps": 1.0, "gbps": 1e3, "kbit/s": 1e-3, "mbit/s": 1.0, "gbit/s": 1e3},
     "s": {"ms": 1e-3, "s": 1.0, "min": 60.0, "h": 3600.0},
@@ -27,10 +27,10 @@ def suggest(name: str, known: Iterable[str]) -> str:
 
 
 def make_printable(text: str, most: int = 200) -> str:
-    """Return a text of somebody else as one line for a terminal, of `most` characters and an ellipsis.
+    """Return untrusted text as one line that is safe to print, cut to `most` characters with an ellipsis.
 
-    Control characters, such as escape sequences and line ends, and invisible ones, such as changes of the direction of
-    writing, are shown as Python escapes them.
+    Control characters (escape sequences, line ends) and invisible ones (such as changes of writing direction) are
+    escaped as in Python.
 
     >>> make_printable("well\\x1b[2J")
     'well\\\\x1b[2J'
@@ -40,12 +40,12 @@ def make_printable(text: str, most: int = 200) -> str:
 
 
 def escape_invisible(text: str, kept: str = "") -> str:
-    """Return a text in which characters that cannot be seen, but for those of `kept`, are shown as Python escapes them.
+    """Return a text with its unprintable characters escaped as in Python, except those in `kept`.
 
     >>> escape_invisible("well\\x1b[2J")
     'well\\\\x1b[2J'
     """
-    return "".join(each if each.isprintable() or each in kept else ascii(each)[1:-1] for each in text)
+    return "".join(letter if letter.isprintable() or letter in kept else ascii(letter)[1:-1] for letter in text)
 
 
 def plural(number: int, noun: str) -> str:
@@ -54,25 +54,25 @@ def plural(number: int, noun: str) -> str:
 
 
 def describe_number(text: str, field: str) -> str:
-    """Return what to write in place of a `text` that is no number, in the unit that the name of its field ends with.
+    """Return the advice for a `text` that is no number: the number in the unit that the field's name ends with.
 
     >>> describe_number("2 GB", "budgets_mb.wireless")
     'must be a number of MB, without the unit: 2000'
     >>> describe_number("55 %", "accuracy")
     'must be a number, without the unit: 0.55'
     """
-    found = AMOUNT.fullmatch(text)
-    if found is None:
+    match = AMOUNT.fullmatch(text)
+    if match is None:
         return "must be a number"
-    amount, unit = float(found[1]), found[2].lower()
-    own = next((part.rsplit("_", 1)[1] for part in reversed(field.split(".")) if _unit_of(part)), None)
-    if own is None and unit == "%":
+    amount, unit = float(match[1]), match[2].lower()
+    wanted = next((part.rsplit("_", 1)[1] for part in reversed(field.split(".")) if _unit_of(part)), None)
+    if wanted is None and unit == "%":
         return f"must be a number, without the unit: {amount / 100:g}"
-    if own is None:
+    if wanted is None:
         return "must be a number, without a unit"
-    if unit not in UNITS[own]:
-        return f"must be a number of {NAMES[own]}, without a unit"
-    return f"must be a number of {NAMES[own]}, without the unit: {amount * UNITS[own][unit]:.10g}"
+    if unit not in UNITS[wanted]:
+        return f"must be a number of {NAMES[wanted]}, without a unit"
+    return f"must be a number of {NAMES[wanted]}, without the unit: {amount * UNITS[wanted][unit]:.10g}"
 
 
 def _unit_of(part: str) -> bool:
@@ -80,12 +80,12 @@ def _unit_of(part: str) -> bool:
 
 
 def hint_share(value: float) -> str:
-    """Return "; 55 % is 0.55" of a value that is too large for a share, and may be a percentage; "" of others."""
+    """Return the hint "; 55 % is 0.55" for a value that may be a percentage where a share is wanted, otherwise ""."""
     return f"; {value:g} % is {value / 100:g}" if 1 < value <= 100 else ""
 
 
 def format_install_command(extra: str) -> str:
-    """Return the pip command that installs the packages of `extra`, as flcav's metadata list them, for this Python."""
+    """Return the pip command that installs the packages of flcav's `extra` into this Python environment."""
     lines = (line.partition(";") for line in requires("flcav") or ())
     wanted = f"extra == '{extra}'"  # a build back end may write either quotes
     packages = [package.strip() for package, _, condition in lines if wanted in condition.replace('"', "'")]

@@ -1,8 +1,7 @@
 """Communication ledger: the bytes of every message on every link, under uplink budgets that it enforces.
 
-Messages on a link: conversion of arrays to bytes and back, and sending through a ledger.
-
-A message is a safetensors file: names, types and shapes of its arrays in JSON, then their values; nothing is unpickled.
+Messages on a link: serialisation of arrays, and sending through a ledger. A message is a safetensors file: names, types
+and shapes of its arrays in JSON, then their values; nothing is unpickled.
 """
 
 import json
@@ -67,7 +66,7 @@ class LedgerEntry:
             raise ValueError(f"LedgerEntry.bytes = {self.bytes}, expected at least 0")
 
 
-_SCHEMA = pa.schema([(each.name, pa.int64() if each.type is int else pa.string()) for each in fields(LedgerEntry)])
+_SCHEMA = pa.schema([(field.name, pa.int64() if field.type is int else pa.string()) for field in fields(LedgerEntry)])
 
 
 class Ledger:
@@ -178,12 +177,13 @@ Arrays = Mapping[str, NDArray]  # by name
 
 
 def pack_arrays(arrays: Arrays) -> bytes:
-    """Return arrays of numbers or truth values as a message."""
+    """Serialise arrays of numbers or booleans as a message."""
+    # C order, since safetensors stores the buffer as it is; names are sorted by the library: equal arrays, equal bytes.
     return save({name: np.asarray(array, order="C") for name, array in arrays.items()})
 
 
 def unpack_arrays(message: bytes) -> dict[str, NDArray]:
-    """Return the arrays of a message: the inverse of `pack_arrays`, but for their order."""
+    """Return the arrays of a message: the inverse of `pack_arrays`, up to their order."""
     return load(message)
 
 
@@ -213,9 +213,10 @@ def send_message(
     client: str,
     round_: int = 0,
 ) -> bytes:
-    """Send a message of a client, up, or to it, down; return its bytes as received.
+    """Send a message from a client (up) or to a client (down), and return its bytes as received.
 
-    It is entered in the ledger first, see `LedgerEntry`. Raises `BudgetExceeded`, and then nothing is sent.
+    The message is first entered in the ledger (`LedgerEntry`); raises `BudgetExceeded` and sends nothing if it is an
+    uplink message over the budget.
     """
     book.enter(LedgerEntry(stage, task, link, direction, round_, client, len(message)))
     return carry(message)

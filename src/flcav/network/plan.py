@@ -11,8 +11,8 @@ class MessageSizes:
 
     sample_mb: float  # one labelled sample
     model_mb: float  # one model update
-    exchange_mb: float | None = None  # a vehicle's upload to be combined in a round; None: a model update
-    labels_mb: float | None = None  # its upload to have its samples labelled; None: nothing
+    exchange_mb: float | None = None  # a vehicle's upload for aggregation in a round; None: a model update
+    labels_mb: float | None = None  # a vehicle's upload for labelling of its samples; None: nothing
 
 
 @dataclass(frozen=True)

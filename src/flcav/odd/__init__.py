@@ -1,1 +1,1 @@
-"""Operational design domains: what recordings cover of them, and scenarios and tasks for what they do not."""
+"""Operational design domains: coverage by recordings, and scenarios and placing tasks for what is not covered."""

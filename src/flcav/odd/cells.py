@@ -1,6 +1,6 @@
-"""Errors of a detector by cell of a domain: average precision with intervals, misses, and the pole that covers most.
+"""Errors of a detector by cell of a domain: average precision with intervals, misses, and the best pole.
 
-A cell is a bucket of each of a few attributes; the frames of a recording are in one each.
+A cell is a combination of buckets of a few attributes; every frame of a recording lies in one cell.
 """
 
 from collections.abc import Mapping, Sequence
@@ -25,22 +25,23 @@ from flcav.storage.records import Record
 from flcav.world.map.town import Town
 
 MISSING = "<missing>"
-CERTAIN_RETURNS = 20  # LiDAR returns from which a missed object is a failure
-PATH_AHEAD_M, PATH_ASIDE_M = 40.0, 2.0  # the path of a vehicle: so far ahead, and so far to either side
+CERTAIN_RETURNS = 20  # least number of LiDAR returns of a missed object that counts as a failure
+PATH_AHEAD_M = 40.0  # length of a vehicle's path
+PATH_ASIDE_M = 2.0  # half its width
 
 
 @dataclass(frozen=True)
 class Coverer(Record):
-    """The pole that covers most errors of a cell."""
+    """The pole that covers the most errors of a cell."""
 
     town: str
     pole: int
-    covered: int  # errors within its range and its sight
+    covered: int  # errors within its range and line of sight
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A recording whose frames a detector was tested on."""
+    """Results of a detector on the frames of a recording."""
 
     town: Town | None
     cells: Mapping[int, tuple[str, ...]]  # frame -> its cell
@@ -50,25 +51,25 @@ class Trial:
 
 @dataclass(frozen=True)
 class CellErrors(Record):
-    """What a detector does in one cell."""
+    """Performance of a detector in one cell."""
 
     cell: tuple[str, ...]  # bucket of each attribute
     frames: int
     scenes: int
-    precision: Estimate | None  # mean AP with its interval over scenes; None: nothing is to be found
-    errors: int  # each once per scene
+    precision: Estimate | None  # mean AP with its interval over scenes; None without targets
+    errors: int  # an object counts once per scene
     misses: int
-    failures: int  # frames with a missed object of `CERTAIN_RETURNS` in the path
-    pole: Coverer | None  # None: no errors, no poles, or none sees one
+    failures: int  # frames with a failure, see `locate_failure`
+    pole: Coverer | None  # None if no pole covers an error
 
 
 def cells_of(domain: Domain, measured: Measurements, by: Sequence[str]) -> list[tuple[str, ...]]:
-    """Return the cell of each frame by the attributes `by`, full or leaf names.
+    """Return the cell of each frame by the attributes `by`, given as full or leaf names.
 
     Raises `InputError` for an attribute that the domain does not have, or that has no buckets.
     """
     items = {name: item_named(domain, name) for name in by}
-    columns = {name: domain.bound.get(found.name.removeprefix("odd."), "") for name, found in items.items()}
+    columns = {name: domain.bound.get(item.name.removeprefix("odd."), "") for name, item in items.items()}
     return [
         tuple(MISSING if (value := row.get(columns[name])) is None else item.bucket_of(value)
               for name, item in items.items())
@@ -77,31 +78,31 @@ def cells_of(domain: Domain, measured: Measurements, by: Sequence[str]) -> list[
 
 
 def full_name(domain: Domain, name: str) -> str:
-    """Return the full name of an attribute with buckets, given it or its leaf; raises `InputError` for another."""
+    """Return the full name of an attribute by its full or leaf name; raises `InputError` where it has no buckets."""
     return item_named(domain, name).name.removeprefix("odd.")
 
 
 def item_named(domain: Domain, name: str):
-    """Return the library's buckets of an attribute; raises `InputError` where it has none."""
+    """Return openodd-py's coverage item of an attribute; raises `InputError` where it has no buckets."""
     known = {item.name.removeprefix("odd."): item for item in domain.definition.cover_items()}
-    full = [each for each in known if name in (each, each.rpartition(".")[2])]
+    full = [attribute for attribute in known if name in (attribute, attribute.rpartition(".")[2])]
     if not full:
-        leaves = [each.rpartition(".")[2] for each in known]
+        leaves = [attribute.rpartition(".")[2] for attribute in known]
         raise InputError(f"{domain.name}: no attribute '{name}' with buckets; those are {', '.join(leaves)}"
                          f"{suggest(name, leaves)}")  # fmt: skip
     return known[full[0]]
 
 
 def measure_cell(measure: Measure, outcomes: Outcomes, inside: NDArray[np.bool_]) -> Estimate | None:
-    """Return the measure on the frames (F,) `inside` a cell, with its interval over the scenes there.
+    """Return the measure on the frames of a cell (mask `inside`, (F,)), with its bootstrap interval over their scenes.
 
-    None where it is not defined; no interval of fewer than two scenes.
+    None where the measure is not defined; an estimate of fewer than two scenes has no interval.
     """
 
     def of(times: Times) -> Values:
-        every = np.zeros((len(times), len(inside)), dtype=np.int64)
-        every[:, inside] = times
-        return measure(outcomes, every)
+        counts = np.zeros((len(times), len(inside)), dtype=np.int64)
+        counts[:, inside] = times
+        return measure(outcomes, counts)
 
     scenes = outcomes.scene[inside]
     mean = float(of(np.ones((1, len(scenes)), dtype=np.int64))[0]) if len(scenes) else np.nan
@@ -114,7 +115,7 @@ def measure_cell(measure: Measure, outcomes: Outcomes, inside: NDArray[np.bool_]
 
 
 def find_failures(data: Dataset, found: Mapping[int, Sequence[PerceptionError]]) -> dict[int, bool]:
-    """Return whether each frame has a failure, see `locate_failure`."""
+    """Return for each frame whether it has a failure (`locate_failure`)."""
     return {
         i: any(locate_failure(data.world_from_agent(i), error) is not None for error in errors)
         for i, errors in found.items()
@@ -122,9 +123,9 @@ def find_failures(data: Dataset, found: Mapping[int, Sequence[PerceptionError]])
 
 
 def locate_failure(world_from_agent: Array, error: PerceptionError) -> float | None:
-    """Return how far ahead [m] a failure is: a missed object of `CERTAIN_RETURNS` or more in the vehicle's path.
+    """Return the distance [m] ahead of a failure: a missed object with `CERTAIN_RETURNS` or more in the vehicle's path.
 
-    None where the error is no failure. `world_from_agent` is the (4, 4) pose of the vehicle.
+    None where the error is no failure. `world_from_agent` is the (4, 4) pose of the vehicle [m].
     """
     x, y = (inverse(world_from_agent) @ (error.x, error.y, error.z, 1.0)).tolist()[:2]
     certain = error.kind == MISS and error.returns >= CERTAIN_RETURNS
@@ -132,43 +133,44 @@ def locate_failure(world_from_agent: Array, error: PerceptionError) -> float | N
 
 
 def measure_cells(measure: Measure, outcomes: Outcomes, tested: Sequence[Trial], range_m: float) -> list[CellErrors]:
-    """Return a detector's measures in each cell of several recordings, the one with most errors per frame first.
+    """Return a detector's performance in each cell of several recordings, by falling number of errors per frame.
 
-    The units of `outcomes` are the frames of `tested`, in their order. range_m: of a pole's sensor.
+    The units of `outcomes` are the frames of `tested`, in the same order; `range_m` is that of a pole's sensor [m].
     """
-    frames = [(each, i) for each in tested for i in each.found]
+    frames = [(trial, i) for trial in tested for i in trial.found]
     rows = []
-    for cell in dict.fromkeys(each.cells[i] for each, i in frames):
-        inside = np.array([each.cells[i] == cell for each, i in frames])
-        errors = [
-            (each.town, keep_first(e for i in each.found if each.cells[i] == cell for e in each.found[i]))
-            for each in tested
+    for cell in dict.fromkeys(trial.cells[i] for trial, i in frames):
+        inside = np.array([trial.cells[i] == cell for trial, i in frames])
+        by_town = [
+            (trial.town, keep_first(e for i in trial.found if trial.cells[i] == cell for e in trial.found[i]))
+            for trial in tested
         ]
-        every = [error for _, own_errors in errors for error in own_errors]
+        errors = [error for _, in_town in by_town for error in in_town]
         rows.append(
             CellErrors(
                 cell,
                 int(inside.sum()),
                 len(np.unique(outcomes.scene[inside])),
                 measure_cell(measure, outcomes, inside),
-                len(every),
-                sum(error.kind == MISS for error in every),
-                sum(each.failures[i] for each, i in frames if each.cells[i] == cell),
-                _cover(errors, range_m),
+                len(errors),
+                sum(error.kind == MISS for error in errors),
+                sum(trial.failures[i] for trial, i in frames if trial.cells[i] == cell),
+                _cover(by_town, range_m),
             )
         )
     return sorted(rows, key=lambda row: -row.errors / row.frames)
 
 
 def _cover(errors: Sequence[tuple[Town | None, Sequence[PerceptionError]]], range_m: float) -> Coverer | None:
-    """Return the pole that covers most of the errors in its town, past the town's buildings; None where none does."""
+    """Return the pole that covers the most errors of its town, with occlusion by buildings; None if none covers any."""
     by_town: dict[str, tuple[Town, list[PerceptionError]]] = {}
-    for town, own in errors:
-        if town is not None and own and len(town.poles.id):
-            by_town.setdefault(town.name, (town, []))[1].extend(own)
+    for town, in_recording in errors:
+        if town is not None and in_recording and len(town.poles.id):
+            by_town.setdefault(town.name, (town, []))[1].extend(in_recording)
     best = None
-    for name, (town, own) in by_town.items():
-        placed = place([(each.x, each.y, each.z) for each in own], town.poles.position, range_m, 1, town=town)
+    for name, (town, in_town) in by_town.items():
+        positions = [(error.x, error.y, error.z) for error in in_town]
+        placed = place(positions, town.poles.position, range_m, 1, town=town)
         if placed.covered and (best is None or placed.covered > best.covered):
             best = Coverer(name, int(town.poles.id[placed.chosen[0]]), placed.covered)
     return best

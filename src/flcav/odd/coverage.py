@@ -1,7 +1,7 @@
-"""Coverage of a domain by recordings, and where in it a detector errs: openodd-py's documents, report and HTML matrix.
+"""Coverage of a domain by recordings, with a detector's errors by cell: openodd-py's documents, report and HTML matrix.
 
-A run is the drive of one vehicle through one scene. A COD, the current operational domain, is OpenODD's table of what
-was observed (ASAM OpenODD 1.0, section 8.3).
+A run is the drive of one vehicle through one scene. A COD (current operational domain) is OpenODD's table of observed
+attributes (ASAM OpenODD 1.0, section 8.3).
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,20 +29,20 @@ from flcav.storage.files import write_bytes, write_json
 from flcav.storage.records import Record
 from flcav.world.geodesy import convert_to_geodetic
 
-BEGINNING = "1970-01-01T00:00:00.000+00:00"  # of every run: recordings have no date
+BEGINNING = "1970-01-01T00:00:00.000+00:00"  # start of every run, since recordings have no date
 
-Document = dict[str, Json]  # as openodd-py writes it
+Document = dict[str, Json]  # coverage document of openodd-py
 
 
 @dataclass(frozen=True)
 class Covered(Record):
-    """How much of one attribute is covered: its buckets, and those inside the domain that no run was in."""
+    """Coverage of one attribute by buckets."""
 
     attribute: str
-    buckets: tuple[str, ...]
-    covered: tuple[str, ...]
-    holes: tuple[str, ...]
-    outside: tuple[str, ...]
+    buckets: tuple[str, ...]  # all
+    covered: tuple[str, ...]  # by a run
+    holes: tuple[str, ...]  # inside the domain, but not covered
+    outside: tuple[str, ...]  # outside the domain
     grade: float  # share of the buckets inside the domain that are covered
 
 
@@ -52,16 +52,18 @@ def collect_runs(
     measured: Measurements,
     failures: Mapping[int, bool] | None = None,
 ) -> dict[str, Document]:
-    """Return the coverage document of each run of a recording, by its name "SCENE_AGENT".
+    """Return the coverage documents of the runs of a recording, by name ("SCENE_AGENT").
 
-    failures: frame -> whether it fails, where frames were tested; a run fails at its first frame that does.
+    `failures` maps tested frames to whether they fail; a run fails at its first failing frame. Raises `InputError`
+    where the domain tests an attribute that nothing measures.
     """
     domain.require_bound()
     place = _positions(data, measured.frames)
     runs: dict[str, list[int]] = {}
     for row, i in enumerate(measured.frames):
         runs.setdefault(f"{data.keys[i].scene}_{data.keys[i].agent}", []).append(row)
-    values, documents = measured.rows(), dict[str, Document]()
+    values = measured.rows()
+    documents = dict[str, Document]()
     for name, rows in runs.items():
         rows = sorted(rows, key=lambda row: data.keys[measured.frames[row]].time_s)
         times = [data.keys[measured.frames[row]].time_s for row in rows]
@@ -85,18 +87,19 @@ def collect_runs(
 def list_outside(domain: Domain, item: Mapping[str, Json]) -> list[str]:
     """Return the buckets of an item of a coverage document that are outside a domain.
 
-    The library takes a bucket for inside where its lower edge is, so that "<= 50 km/h" had a gap [50, 70). A bucket of
-    numbers, after the first, is outside where nothing between its edges is inside; whole numbers are as the library
-    has them.
+    openodd-py counts a bucket as inside if its lower edge is, so that a limit of "<= 50 km/h" leaves the bucket
+    [50, 70) as a hole. Here a bucket of numbers, except the first, is outside if no value between its edges is inside.
+    Buckets of counts are those of the library.
     """
-    known = [str(each) for each in _list(item["outside_odd"])]
+    known = [str(bucket) for bucket in _list(item["outside_odd"])]
     name = str(item["attribute"])
-    definition = next((each.item for each in domain.definition.attributes if each.name == name), None)
+    definition = next((other.item for other in domain.definition.attributes if other.name == name), None)
     if definition is None or not definition.numeric or item["unit"] == "count" or name not in domain.tested:
         return known
     limits = domain.limits.get(name, ())
 
     def is_outside(low: float, high: float) -> bool:
+        # No condition changes between two cuts: one value in each interval decides.
         cuts = [low, *(limit for limit in limits if low < limit < high), high]
         return not any(domain.can_hold({name: (a + b) / 2}) for a, b in pairwise(cuts))
 
@@ -110,19 +113,22 @@ def _list(value: Json) -> Sequence[Json]:
 
 
 def count_cells(documents: Sequence[Document], x: str, y: str) -> tuple[int, int]:
-    """Return how many cells of the matrix of two attributes are covered, and how many are inside the domain."""
+    """Return the numbers of covered cells and of all cells inside the domain, in the matrix of two attributes."""
     cells = [cell for row in CoverageView(list(documents)).matrix(x=x, y=y)["cells"] for cell in row]
     inside = [cell for cell in cells if not cell["outside_odd"]]
     return sum(cell["state"] != "unsampled" for cell in inside), len(inside)
 
 
 def merge_runs(documents: Sequence[Document]) -> CoverageReport:
-    """Return the library's report of several runs."""
+    """Return openodd-py's coverage report of several runs."""
     return merge_coverage(list(documents))
 
 
 def load_report(folder: Path) -> CoverageReport:
-    """Return the library's report of the runs that `write_runs` wrote; raises `InputError` where there are none."""
+    """Return openodd-py's report of the runs that `write_runs` wrote to a folder.
+
+    Raises `InputError` where there are none, or a document is damaged.
+    """
     paths = sorted((folder / "runs").glob("*_coverage.json"))
     if not paths:
         raise InputError(f"{folder}: no runs of flcav odd cover")
@@ -142,7 +148,7 @@ def _document(path: Path) -> Document:
 
 
 def list_covered(report: CoverageReport) -> tuple[Covered, ...]:
-    """Return the coverage of each attribute with buckets."""
+    """Return the coverage of all attributes with buckets."""
     return tuple(
         Covered(
             entry.name.removeprefix("odd."),
@@ -157,29 +163,29 @@ def list_covered(report: CoverageReport) -> tuple[Covered, ...]:
 
 
 def write_runs(documents: Mapping[str, Document], out: Path) -> None:
-    """Write each run's document as OUT/runs/NAME_coverage.json, which openodd-py's own commands read."""
+    """Write the runs' documents as OUT/runs/NAME_coverage.json, in the format that openodd-py's commands read."""
     for name, document in documents.items():
         write_json(out / "runs" / f"{name}_coverage.json", document, sort=False)
 
 
 def write_matrix(documents: Sequence[Document], x: str, y: str, title: str, said: Sequence[str], path: Path) -> None:
-    """Write the HTML page of the matrix of two attributes, which drills into the cells, below sentences about it."""
+    """Write the HTML page of the matrix of two attributes, with the runs of each cell, below the sentences `said`."""
     lead = "".join(f"<p>{escape(line)}</p>" for line in said)
     page = view.page(title, lead + CoverageView(list(documents)).explorer_html(x=x, y=y, depth=1))
     write_bytes(path, page.encode())
 
 
 def write_cod(documents: Mapping[str, Document], out: Path) -> int:
-    """Write each run's COD: table, manifest and taxonomy in OUT; return the number of rows.
+    """Write the COD of each run to `out` (table, manifest and taxonomy), and return the total number of rows.
 
-    Frames without a place on Earth are left out, as OpenODD's tables need one.
+    Frames without latitude and longitude are left out, since OpenODD's tables require them.
     """
     given = [(Path(f"{name}_coverage.json"), document) for name, document in documents.items()]
-    return sum(each.rows for each in export_cods(given, out))
+    return sum(cod.rows for cod in export_cods(given, out))
 
 
 def _positions(data: Dataset, frames: Sequence[int]) -> list[dict[str, Value]]:
-    """Return where the agent is in each frame [m], and its latitude and longitude where the town is known."""
+    """Return the agent's position [m] in each frame, with latitude and longitude [deg] where the town is known."""
     place = np.array([data.world_from_agent(i)[:3, 3] for i in frames]).reshape(-1, 3)
     town = data.town()
     earth = np.full((len(frames), 2), np.nan) if town is None else convert_to_geodetic(town.geo, place)[:, :2]
@@ -199,16 +205,16 @@ class DomainCoverage(Record):
     domain: str
     revision: str | None  # digest of the domain's files
     runs: int
-    grade: float  # mean over these attributes
+    grade: float  # mean over `attributes`
     attributes: tuple[Covered, ...]
-    by: tuple[str, ...]  # the attributes of cells
-    cells: tuple[CellErrors, ...]  # empty where no detector ran
-    covered_cells: int  # of the matrix of the first two attributes of `by`
-    inside_cells: int  # cells of it inside the domain
+    by: tuple[str, ...]  # attributes that define the cells
+    cells: tuple[CellErrors, ...]  # empty without a detector
+    covered_cells: int  # in the matrix of the first two attributes of `by`
+    inside_cells: int  # cells of the matrix inside the domain
 
     @property
     def sentences(self) -> tuple[str, str]:
-        """Return the two shares in words: of buckets by attribute, and of cells of the matrix."""
+        """Return the coverage of buckets and of cells of the matrix in words."""
         leaves = " x ".join(name.rpartition(".")[2] for name in self.by[:2])
         share = f"{self.covered_cells / self.inside_cells:.0%}, " if self.inside_cells else ""
         return (
@@ -228,11 +234,12 @@ def cover_domain(
     range_m: float = 40.0,
     progress: Report = ignore_progress,
 ) -> DomainCoverage:
-    """Return how much of a domain recordings cover; writes coverage.json, matrix.html and runs/*.json to `out`.
+    """Return the coverage of a domain by recordings, and write coverage.json, matrix.html and runs/*.json to `out`.
 
-    Covered are the attributes that the domain tests, and those of `by`. A detector of objects, `network`, runs on the
-    vehicles' frames that fit it: AP, errors and failures by cell of the attributes `by`, over all recordings, and the
-    pole whose sensor of `range_m` covers most errors.
+    It is over the attributes that the domain tests and those of `by`. An object detector `network` is tested on the
+    vehicles' frames with its sensors: AP, errors and failures by cell of the attributes `by` over all recordings, and
+    the pole whose sensor of range `range_m` [m] covers the most errors. Raises `InputError` where the domain tests an
+    attribute that nothing measures, and for an attribute of `by` without buckets.
     """
     domain.require_bound()
     axes = [full_name(domain, name) for name in by]
@@ -245,17 +252,17 @@ def cover_domain(
         failures = None
         if network is not None:
             cells = dict(zip(measured.frames, cells_of(domain, measured, axes), strict=True))
-            found, own = _detect(network, data, cells, progress)
-            tested.append(found)
-            outcomes.append(own)
-            failures = found.failures
+            trial, of_trial = _detect(network, data, cells, progress)
+            tested.append(trial)
+            outcomes.append(of_trial)
+            failures = trial.failures
         runs = collect_runs(domain, data, measured, failures)
         documents |= {f"{number}_{name}" if len(folders) > 1 else name: document for name, document in runs.items()}
-    every = list_covered(merge_runs(list(documents.values())))
-    covered = tuple(row for row in every if row.attribute in {*domain.tested, *axes})
+    every_run = list(documents.values())
+    covered = tuple(row for row in list_covered(merge_runs(every_run)) if row.attribute in {*domain.tested, *axes})
     grade = float(np.mean([row.grade for row in covered])) if covered else 0.0
     cells = measure_cells(OBJECTS.measure, join_outcomes(outcomes), tested, range_m) if tested else []
-    every_run, revision = list(documents.values()), domain.definition.revision
+    revision = domain.definition.revision
     counts = count_cells(every_run, axes[0], axes[1])
     result = DomainCoverage(domain.name, revision, len(documents), grade, covered, tuple(axes), tuple(cells), *counts)
     write_runs(documents, out)
@@ -267,7 +274,7 @@ def cover_domain(
 def _detect(
     network: Second, data: Dataset, cells: Mapping[int, tuple[str, ...]], progress: Report
 ) -> tuple[Trial, Outcomes]:
-    """Return a detector's errors on a recording's frames that fit it, and its outcomes there."""
+    """Return a detector's errors and outcomes on the frames of a recording that have its sensors."""
     fitting = set(choose_frames(OBJECTS, network.config, data).frames)
     frames = [i for i in cells if i in fitting]
     total = 2 * len(frames)

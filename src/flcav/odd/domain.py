@@ -1,7 +1,7 @@
-"""Operational design domains (ODD) in ASAM OpenODD 1.0: read by openodd-py, with flcav's own binding and no other.
+"""Operational design domains (ODD) in ASAM OpenODD 1.0, read by openodd-py with the binding of flcav.
 
-A domain is one of `DOMAINS`, or a stranger's OpenODD file. The library would import what a binding calls
-`module:function`, and fetch what an import calls `git:`; of strangers' files both are refused before it reads them.
+A domain is one of `DOMAINS` or a user's OpenODD file. openodd-py would import code that a binding names
+("module:function") and fetch imports from git; in users' files both are refused before the library reads them.
 """
 
 import logging
@@ -29,20 +29,20 @@ from flcav.config import InputError, path_within, read_yaml, shorten
 from flcav.interface.wording import suggest
 from flcav.odd.ranges import has_ranges, rewrite_ranges
 
-logging.getLogger("openodd").setLevel(logging.ERROR)  # of its warnings commands say what matters in their own words
+logging.getLogger("openodd").setLevel(logging.ERROR)  # commands report what matters of its warnings
 
 FOLDER = Path(__file__).parent / "domains"
 TAXONOMY, BINDING = FOLDER / "taxonomy.yaml", FOLDER / "binding.yaml"
 DOMAINS = ("urban", "rural", "campus", "mine", "port", "parking_lot")
 MOST_BYTES, MOST_FILES = 1_000_000, 20
-REFUSED = {  # keys of strangers' files
+REFUSED = {  # keys of users' files
     "git": "it names a git source to fetch",
     "probe": "it brings a binding, which may name code to import",
     "probes": "it brings a binding, which may name code to import",
     "measure": "it brings a binding, which may name code to import",
     "openodd": "it brings a binding, which may name code to import",
 }
-MEANT = {  # how words that people use for a domain are said in flcav's concepts
+MEANT = {  # common words for domains in concepts of flcav's taxonomy
     **dict.fromkeys(("urban", "city", "suburban", "town"), "drivable_area_type: [distributor_road, minor_road]"),
     "residential": "drivable_area_type: [minor_road]",
     "rural": "drivable_area_type: [radial_road, distributor_road]",
@@ -53,7 +53,7 @@ MEANT = {  # how words that people use for a domain are said in flcav's concepts
     "fog": 'visibility: "<= 400 m"',
 }
 
-Value = float | str | None  # of an attribute: None is missing
+Value = float | str | None  # of an attribute; None if missing
 
 
 @dataclass(frozen=True)
@@ -63,40 +63,40 @@ class Domain:
     name: str
     definition: OddDefinition
     bound: Mapping[str, str]  # attribute -> column of `flcav.odd.measure` that measures it
-    tested: tuple[str, ...]  # attributes that its modules test
-    limits: Mapping[str, tuple[float, ...]]  # numbers at which a condition on an attribute changes, ascending
+    tested: tuple[str, ...]  # attributes in the conditions of its modules
+    limits: Mapping[str, tuple[float, ...]]  # thresholds of the conditions on an attribute, ascending
     backend: Backend
 
     @property
     def unbound(self) -> tuple[str, ...]:
-        """Return the attributes that its modules test and nothing measures."""
+        """Return the tested attributes that nothing measures."""
         return tuple(name for name in self.tested if name not in self.bound)
 
     def values(self, measured: Mapping[str, Value]) -> dict[str, Value]:
-        """Return the value of each bound attribute from measured columns; None where one is missing."""
+        """Return the values of the bound attributes from measured columns; None where missing."""
         return {name: measured.get(column) for name, column in self.bound.items()}
 
     def knobs(self) -> dict[str, OddKnob]:
-        """Return how a recipe sets each attribute that it can set, by attribute: the knobs of the binding."""
+        """Return the binding's knobs by attribute: the fields of a recipe that set it."""
         given = _section("knobs")
         return knobs_from_mapping({name: given[column] for name, column in self.bound.items() if column in given})
 
     def allowed(self, name: str) -> list[Value]:
-        """Return values of an attribute that can be inside: of its words, or of its limits and points between them.
+        """Return the values of an attribute that can be inside, from its words, or from its limits and their midpoints.
 
-        No condition changes between these values. Of one that is not bound nothing is known: one missing value.
+        No condition changes between these values. An attribute that is not bound has one missing value.
         """
-        item = next(each.item for each in self.definition.attributes if each.name == name)
+        item = next(attribute.item for attribute in self.definition.attributes if attribute.name == name)
         if item is None:
             return [None]
         edges = self.limits.get(name, ())
         between = [(low + high) / 2 for low, high in pairwise(edges)]
         values = [*edges, *between, edges[0] - 1, edges[-1] + 1] if edges else [0.0]
         candidates = values if item.numeric else list(item.labels)
-        return [each for each in candidates if self.can_hold({name: each})]
+        return [value for value in candidates if self.can_hold({name: value})]
 
     def can_hold(self, values: Mapping[str, Value]) -> bool:
-        """Return whether the domain can hold with these values, whatever the other attributes are."""
+        """Return whether these values can be inside the domain, with all other attributes undecided."""
         rest = {name: UNDECIDED for name in self.tested if name not in values}
         return self.definition.evaluate({**rest, **values}).inside
 
@@ -111,10 +111,10 @@ class Domain:
 
 
 def read_domain(name: str | Path) -> Domain:
-    """Return the domain of that name, or in that OpenODD file, with flcav's binding.
+    """Return the domain of a name of `DOMAINS` or in an OpenODD file, with flcav's binding.
 
-    A file without a taxonomy has flcav's. Raises `InputError` where it is missing, too large, names code to import or a
-    source to fetch, is not OpenODD as the library reads it, has units that do not convert, tests nothing, or is empty.
+    A file without a taxonomy uses flcav's. Raises `InputError` if the file is missing, too large, names code to import
+    or a git source, is not valid OpenODD for openodd-py, has units that do not convert, has no modules, or is empty.
     """
     path = FOLDER / f"{name}.yaml" if str(name) in DOMAINS else Path(name)
     if str(name) not in DOMAINS:
@@ -126,7 +126,7 @@ def read_domain(name: str | Path) -> Domain:
         _refuse_foreign(path, path.parent, set())
     documents = list(_documents(path, path.parent))
     taxonomies = [document["TAXONOMY"] for document in documents if "TAXONOMY" in document]
-    # The one that is imported is joined first, and those that extend it later.
+    # Imported documents come first, those that extend them later.
     sources = [rewrite_ranges(documents[::-1])] if any(map(has_ranges, taxonomies)) else [path]
     domain = _load(sources if taxonomies else [path, TAXONOMY], path.stem, path)
     _refuse_empty(domain, path)
@@ -134,7 +134,7 @@ def read_domain(name: str | Path) -> Domain:
 
 
 def everything() -> Domain:
-    """Return the domain without bounds: all concepts of flcav's taxonomy, and no modules."""
+    """Return the unbounded domain: all concepts of flcav's taxonomy, without modules."""
     return _load([TAXONOMY], "taxonomy", TAXONOMY)
 
 
@@ -142,27 +142,31 @@ def _load(sources: Sequence[Path | str], name: str, origin: Path) -> Domain:
     backend = _backend()
     concepts = _read(sources, {}, backend, name, origin)
     bindings = {
-        each.name: _section("probes")[leaf]
-        for each in concepts.attributes
-        if (leaf := each.name.rpartition(".")[2]) in _section("probes")
+        attribute.name: _section("probes")[leaf]
+        for attribute in concepts.attributes
+        if (leaf := attribute.name.rpartition(".")[2]) in _section("probes")
     }
-    # A stranger's concept of other words is not bound: flcav's would be none of them, and so outside by mistake.
+    # A concept of the same name with other words is not bound: flcav's words would be outside by mistake.
     words = _literals()
-    spoken = {each.name: each.item for each in _read(sources, bindings, backend, name, origin).attributes}
+    spoken = {
+        attribute.name: attribute.item for attribute in _read(sources, bindings, backend, name, origin).attributes
+    }
     for full in list(bindings):
-        item, own = spoken[full], words.get(full.rpartition(".")[2])
-        if item is not None and (item.numeric != (own is None) or (own and not set(own) <= set(item.labels))):
+        item, ours = spoken[full], words.get(full.rpartition(".")[2])
+        if item is not None and (item.numeric != (ours is None) or (ours and not set(ours) <= set(item.labels))):
             del bindings[full]
-    found = _read(sources, bindings, backend, name, origin)
-    conditions = [condition for module in found.modules for condition in module.conditions()]
-    tested = tuple(dict.fromkeys(each for condition in conditions for each in condition.attributes()))
-    bare = {full: {"probe": each["probe"], "unit": each.get("unit", "")} for full, each in bindings.items()}
-    items = [each.item for each in _read(sources, bare, backend, name, origin).attributes if each.item is not None]
+    definition = _read(sources, bindings, backend, name, origin)
+    conditions = [condition for module in definition.modules for condition in module.conditions()]
+    tested = tuple(dict.fromkeys(attribute for condition in conditions for attribute in condition.attributes()))
+    # Without the binding's buckets, the edges of an item are the thresholds of the domain's conditions.
+    bare = {full: {"probe": probe["probe"], "unit": probe.get("unit", "")} for full, probe in bindings.items()}
+    bounded = _read(sources, bare, backend, name, origin).attributes
+    items = [attribute.item for attribute in bounded if attribute.item is not None]
     limits = {item.name.removeprefix("odd."): item.edges for item in items if item.numeric}  # as conditions name them
     return Domain(
         name,
-        found,
-        {full: each["probe"] for full, each in bindings.items()},
+        definition,
+        {full: probe["probe"] for full, probe in bindings.items()},
         tested,
         {full: tuple(sorted(filter(math.isfinite, edges))) for full, edges in limits.items()},
         backend,
@@ -180,26 +184,26 @@ def _read(
 
 
 def _say_meant(error: str) -> str:
-    """Return what was meant by a word that an attribute does not have: of another attribute, or another word."""
-    found = re.search(r"has no literal (.+?) \(literals: (.*)\)", error)
-    if found is None:
+    """Return a hint for an unknown word in a message of openodd-py: its attribute, or a similar word; "" for others."""
+    match = re.search(r"has no literal (.+?) \(literals: (.*)\)", error)
+    if match is None:
         return ""
-    word = found[1].strip("'\"").lower()
+    word = match[1].strip("'\"").lower()
     for leaf, words in _literals().items():
         if word in words:
             return f"; {word} is a word of {leaf}: write `{leaf}: [{word}]`"
     if word in MEANT:
         return f"; {word} is said by another attribute: write `{MEANT[word]}`"
-    return suggest(word, found[2].split(", "))
+    return suggest(word, match[2].split(", "))
 
 
 def _section(name: str) -> dict[str, dict[str, str]]:
-    return _own(BINDING)[name]
+    return _packaged(BINDING)[name]
 
 
 @cache
-def _own(path: Path) -> dict:
-    """Return a file of the package."""
+def _packaged(path: Path) -> dict:
+    """Return the content of a file of the package, cached."""
     document = read_yaml(path)
     assert isinstance(document, dict)
     return document
@@ -207,21 +211,21 @@ def _own(path: Path) -> dict:
 
 def _literals() -> dict[str, list[str]]:
     """Return the words of each categorical concept of flcav's taxonomy, by leaf name."""
-    taxonomy = _own(TAXONOMY)["TAXONOMY"]
+    taxonomy = _packaged(TAXONOMY)["TAXONOMY"]
     leaves = {leaf: kind for group in taxonomy.values() for leaf, kind in group.items()}
     return {leaf: kind for leaf, kind in leaves.items() if isinstance(kind, list)}
 
 
 @dataclass
 class Recordings(Backend):
-    """The library's backend over rows of measured columns, with the agent's position and geolocation where known."""
+    """Backend of openodd-py over rows of measured columns, with the agent's position and geolocation where known."""
 
     def position(self, context: Mapping[str, Value]) -> tuple[float, float, float] | None:
-        """Return where the agent is [m]; None where the row does not say."""
+        """Return the agent's position x, y, z [m] in the world frame; None where missing."""
         return _numbers(context, ("x", "y", "z"))
 
     def geolocation(self, context: Mapping[str, Value]) -> tuple[float, float] | None:
-        """Return latitude and longitude [degrees]; None where the row does not say."""
+        """Return the agent's latitude and longitude [deg]; None where missing."""
         return _numbers(context, ("latitude", "longitude"))
 
 
@@ -231,7 +235,7 @@ def _numbers(row: Mapping[str, Value], names: tuple[str, ...]) -> tuple | None:
 
 
 def _backend() -> Recordings:
-    """Return the library's backend: a probe per column, which reads a row of measured columns, and no imports."""
+    """Return the backend with a probe per measured column; it imports no code."""
 
     def read(column: str) -> tuple:
         return (lambda row: row.get(column)), _section("probes")[column].get("unit", "")
@@ -240,7 +244,7 @@ def _backend() -> Recordings:
 
 
 def _documents(path: Path, folder: Path) -> Iterator[dict]:
-    """Yield the OpenODD document in a file and those that it imports."""
+    """Yield the OpenODD document of a file, followed by those that it imports."""
     document = read_yaml(path)
     if isinstance(document, dict):
         yield document
@@ -251,7 +255,7 @@ def _documents(path: Path, folder: Path) -> Iterator[dict]:
 
 
 def _refuse_foreign(path: Path, folder: Path, seen: set[Path]) -> None:
-    """Raise `InputError` where a file or an import is too large, names code or a source, or leaves its folder."""
+    """Raise `InputError` if a file or an import is too large, names code or a git source, or is outside the folder."""
     if path in seen:
         raise InputError(f"{path}: imports itself")
     if len(seen) >= MOST_FILES:
@@ -274,18 +278,18 @@ def _refuse_foreign(path: Path, folder: Path, seen: set[Path]) -> None:
 
 
 def _pairs(value: object) -> Iterator[tuple[str, object]]:
-    """Yield the keys and values of all mappings within a YAML document."""
+    """Yield the keys and values of all mappings within a YAML document, recursively."""
     if isinstance(value, dict):
-        for key, each in value.items():
-            yield str(key), each
-            yield from _pairs(each)
+        for key, item in value.items():
+            yield str(key), item
+            yield from _pairs(item)
     elif isinstance(value, list):
-        for each in value:
-            yield from _pairs(each)
+        for item in value:
+            yield from _pairs(item)
 
 
 def _refuse_empty(domain: Domain, origin: Path) -> None:
-    """Raise `InputError` where a domain has no modules, or leaves no value of one attribute inside."""
+    """Raise `InputError` if a domain has no modules, or no value of one of its attributes can be inside."""
     if not domain.definition.modules:
         raise InputError(f"{origin}: has no modules, so that it bounds nothing")
     for name in domain.tested:

@@ -1,7 +1,7 @@
-"""Judgement of frames by a domain, and how far towns and recordings realise it, attribute by attribute.
+"""Verdicts of a domain on frames, and the parts of a domain that towns and recordings realise.
 
-A judgement is three-valued: inside, outside, or unknown where it rests on missing values. OpenODD 1.0 counts what rests
-on missing values as inside; here it never is.
+A verdict is three-valued: inside, outside, or unknown where it depends on missing values. OpenODD 1.0 counts the latter
+as inside.
 """
 
 from collections import Counter
@@ -28,14 +28,14 @@ INSIDE, OUTSIDE, UNKNOWN = "inside", "outside", "unknown"
 
 @dataclass(frozen=True)
 class Verdicts:
-    """The verdict of a domain on each of F frames."""
+    """Verdicts of a domain on F frames."""
 
     frames: tuple[int, ...]
     verdict: NDArray[np.str_]  # (F,) inside, outside or unknown
-    failed: Mapping[str, int]  # module -> frames that it puts outside; those that only join others are left out
+    failed: Mapping[str, int]  # number of frames outside by module, without modules that only combine others
 
     def count(self, verdict: str) -> int:
-        """Return how many frames have that verdict."""
+        """Return the number of frames with a verdict."""
         return int((self.verdict == verdict).sum())
 
     @property
@@ -52,7 +52,7 @@ class Verdicts:
 
 @dataclass(frozen=True)
 class Rates(Record):
-    """Precision and recall of one verdict, with Wilson's intervals; None if it was never given, or never true."""
+    """Precision and recall of a verdict, with Wilson's intervals; None where it was never given, or never true."""
 
     precision: Estimate | None
     recall: Estimate | None
@@ -60,7 +60,10 @@ class Rates(Record):
 
 @dataclass(frozen=True)
 class PerceptionAgreement(Record):
-    """How often perceived verdicts are right, on the frames that truth decides, dependent as those of a scene are."""
+    """Agreement of perceived verdicts with the truth, on the frames with a true verdict of inside or outside.
+
+    The intervals take frames as independent, which those of a scene are not.
+    """
 
     frames: int
     inside: Rates
@@ -72,96 +75,97 @@ def describe_agreement(agreement: PerceptionAgreement) -> list[str]:
     """Return the agreement in words."""
     rows = []
     for name, rates in ((INSIDE, agreement.inside), (OUTSIDE, agreement.outside)):
-        words = ["-" if each is None else each.describe() for each in (rates.precision, rates.recall)]
+        words = ["-" if rate is None else rate.describe() for rate in (rates.precision, rates.recall)]
         rows.append(f"{name}: precision {words[0]}, recall {words[1]}")
     return [*rows, f"{plural(agreement.undecided, 'frame')} left unknown of {agreement.frames} that truth decides"]
 
 
 def write_verdicts(data: Dataset, truth: Verdicts, seen: Verdicts | None, path: Path) -> None:
-    """Write a table, CSV or Parquet: frame, verdict, and the perceived verdict where there is one."""
+    """Write the verdicts by frame, and the perceived ones if any, as a CSV or Parquet table."""
     columns = {"frame": [data.name(i) for i in truth.frames], "verdict": truth.verdict.tolist()}
     write_any_table(pa.table(columns if seen is None else columns | {"perceived": seen.verdict.tolist()}), path)
 
 
 def judge_values(domain: Domain, measured: Mapping[str, Value]) -> str:
-    """Return the verdict on one row of measured columns; a column that is not there is missing."""
+    """Return the verdict on one row of measured columns; absent columns are missing values."""
     verdict = domain.definition.evaluate(domain.definition.complete(domain.values(measured)))
     return OUTSIDE if not verdict.inside else UNKNOWN if verdict.assumed else INSIDE
 
 
 def judge_frames(domain: Domain, measured: Measurements) -> Verdicts:
-    """Return the verdict on each frame, and which modules put frames outside.
+    """Return the verdicts on frames, with the counts of the modules that put them outside.
 
     Raises `InputError` where the domain tests an attribute that nothing measures.
     """
     domain.require_bound()
     odd = domain.definition
     leaves = {module.name for module in odd.modules
-              if any(each.attributes() for each in module.conditions())}  # fmt: skip
-    verdicts, failed = [], Counter[str]()
+              if any(condition.attributes() for condition in module.conditions())}  # fmt: skip
+    verdicts = []
+    failed = Counter[str]()
     for row in measured.rows():
-        found = odd.evaluate(odd.complete(domain.values(row)))
-        verdicts.append(OUTSIDE if not found.inside else UNKNOWN if found.assumed else INSIDE)
-        failed.update(name for name, holds in found.modules.items() if holds is False and name in leaves)
+        result = odd.evaluate(odd.complete(domain.values(row)))
+        verdicts.append(OUTSIDE if not result.inside else UNKNOWN if result.assumed else INSIDE)
+        failed.update(name for name, holds in result.modules.items() if holds is False and name in leaves)
     return Verdicts(measured.frames, np.array(verdicts, dtype=np.str_), dict(failed.most_common()))
 
 
 def compare_verdicts(truth: Sequence[str], perceived: Sequence[str]) -> PerceptionAgreement:
-    """Return how well perceived verdicts match those of truth, on the frames that truth decides."""
-    wanted, found = np.asarray(truth), np.asarray(perceived)
+    """Return the agreement of perceived verdicts with the true ones, on the frames whose true verdict is known."""
+    wanted, given = np.asarray(truth), np.asarray(perceived)
     decided = wanted != UNKNOWN
-    wanted, found = wanted[decided], found[decided]
+    wanted, given = wanted[decided], given[decided]
 
-    def rate(of: str) -> Rates:
-        said, is_so = found == of, wanted == of
+    def rate(verdict: str) -> Rates:
+        positive, true = given == verdict, wanted == verdict
         shares = (
-            score_interval(float((said & is_so).sum() / every.sum()), int(every.sum())) if every.any() else None
-            for every in (said, is_so)
+            score_interval(float((positive & true).sum() / base.sum()), int(base.sum())) if base.any() else None
+            for base in (positive, true)
         )
         return Rates(*shares)
 
-    return PerceptionAgreement(int(decided.sum()), rate(INSIDE), rate(OUTSIDE), int((found == UNKNOWN).sum()))
+    return PerceptionAgreement(int(decided.sum()), rate(INSIDE), rate(OUTSIDE), int((given == UNKNOWN).sum()))
 
 
 SET, FOUND, RIG, TRAFFIC, UNMEASURED = "set", "found", "rig", "traffic", "unmeasured"
 OF_RIG = ("field_of_view", "sensing_range")
 OF_TRAFFIC = ("agents", "pedestrians", "ego_speed")
-VEHICLE_RIGS = ("car", "kitti", "lidar32", "car_surround", "kitti_lidar")  # the first that a domain allows is taken
+VEHICLE_RIGS = ("car", "kitti", "lidar32", "car_surround", "kitti_lidar")  # in the order of choice
 GROUND = {"surface_type": "asphalt"}  # of every town
 
 
 @dataclass(frozen=True)
 class DomainPart(Record):
-    """How far one attribute of a domain is realised."""
+    """Realisation of one attribute of a domain in towns or recordings."""
 
     attribute: str
     how: str  # set in recipes | found at places | by the rig | by traffic | unmeasured
     by: str  # field of a recipe, or what measures it
-    inside: int  # places or frames at which it is inside, or 1 where a recipe can set it so
+    inside: int  # number of places or frames inside, or 1 where a recipe can set a value inside
     outside: int
-    unknown: int  # those whose value is missing
+    unknown: int  # number of places or frames without a value
 
     @property
     def realised(self) -> bool | None:
-        """Return whether a value inside is realised; None where it is not known."""
+        """Return whether a value inside the domain is realised; None where unknown."""
         return True if self.inside else None if self.unknown else False
 
     @property
     def sentence(self) -> str:
-        """Return the state in words."""
+        """Return the realisation in words."""
         if self.how == UNMEASURED:
             return "unknown: nothing in the binding measures it"
         if self.how == TRAFFIC and not self.inside + self.outside + self.unknown:
             return "by traffic: recordings measure it, recipes do not set it"
         if self.how in (SET, RIG):
             return f"{'can be inside' if self.inside else 'is never inside'}: recipes set it by {self.by}"
-        of = self.inside + self.outside + self.unknown
+        total = self.inside + self.outside + self.unknown
         missing = f", unknown at {self.unknown}" if self.unknown else ""
-        return f"inside at {self.inside} of {of}{missing}"
+        return f"inside at {self.inside} of {total}{missing}"
 
 
 def check_towns(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[DomainPart, ...]:
-    """Return the parts of a domain that recipes for these towns realise, at all their places."""
+    """Return how recipes for these towns realise each tested attribute of a domain, over all their places."""
     rows: list[dict[str, Value]] = []
     for scenery in sceneries:
         rows += [{**row, **GROUND} for _, row in _describe_places(scenery)]
@@ -169,7 +173,7 @@ def check_towns(domain: Domain, sceneries: Sequence[Scenery]) -> tuple[DomainPar
 
 
 def check_frames(domain: Domain, measured: Measurements) -> tuple[DomainPart, ...]:
-    """Return the parts of a domain that the frames of a recording realise."""
+    """Return how the frames of a recording realise each tested attribute of a domain."""
     rows = measured.rows()
     return tuple(
         _count_part(domain, name, FOUND, "frames", [row.get(domain.bound[name]) for row in rows])
@@ -180,11 +184,11 @@ def check_frames(domain: Domain, measured: Measurements) -> tuple[DomainPart, ..
 
 
 def choose_rig(domain: Domain) -> str | None:
-    """Return the first of `VEHICLE_RIGS` whose field of view and range the domain allows; None where none is."""
+    """Return the first of `VEHICLE_RIGS` whose field of view and range are inside the domain; None without one."""
     for name in VEHICLE_RIGS:
         reach = reach_of(RIGS[name])
-        tested = [each for each in domain.tested if domain.bound.get(each) in OF_RIG]
-        if all(_can(domain, each, reach[domain.bound[each]]) for each in tested):
+        tested = [attribute for attribute in domain.tested if domain.bound.get(attribute) in OF_RIG]
+        if all(_can(domain, attribute, reach[domain.bound[attribute]]) for attribute in tested):
             return name
     return None
 
@@ -192,17 +196,17 @@ def choose_rig(domain: Domain) -> str | None:
 def find_inside_places(
     domain: Domain, sceneries: Sequence[Scenery]
 ) -> tuple[tuple[ScenarioPlace, dict[str, Value]], ...]:
-    """Return the places of towns that can be inside a domain, with the scenery of each; the rest is left open.
+    """Return the places of towns whose scenery is inside a domain, with that scenery; other attributes are open.
 
-    A place whose scenery is missing an attribute that the domain tests is none: it is not inside by silence.
+    A place with a missing value of a tested attribute is left out.
     """
     inside = []
     for scenery in sceneries:
         for place, row in _describe_places(scenery):
-            own = {**row, **GROUND}
-            known = {name: own[domain.bound[name]] for name in domain.tested if domain.bound.get(name) in own}
+            columns = {**row, **GROUND}
+            known = {name: columns[domain.bound[name]] for name in domain.tested if domain.bound.get(name) in columns}
             if None not in known.values() and domain.can_hold(known):
-                inside.append((place, own))
+                inside.append((place, columns))
     return tuple(inside)
 
 
@@ -242,7 +246,7 @@ def _count_part(domain: Domain, name: str, how: str, by: str, values: Sequence[V
 
 
 def _can(domain: Domain, name: str, value: Value) -> bool:
-    """Return whether the domain can hold with this value of an attribute; a missing one cannot."""
+    """Return whether a value of an attribute can be inside the domain; a missing value cannot."""
     if value is None or (isinstance(value, float) and np.isnan(value)):
         return False
     return domain.can_hold({name: value})

@@ -1,11 +1,11 @@
-"""Measurement of a domain's attributes in a recording: by its ground truth, and as a vehicle perceives them.
+"""Measurement of a domain's attributes in a recording, by ground truth and as perceived by a vehicle.
 
-By ground truth whole columns are measured at once, and no sweep is read.
+By ground truth all frames are measured at once, without reading sweeps.
 
-As perceived, the weather network names the class of each picture. Of rain, sight, clouds and sun it says that they are
-in the region of that class; where a limit of the domain lies within the region, the value is missing: the class does
-not decide. Detections to all sides are tracked: pedestrians, and vehicles that move, are the road users around. Scenery
-is the map's at the vehicle's pose, and its speed that of its odometry: both as recorded.
+As perceived, the weather network classifies each picture; rain, visibility, clouds and sun are then in the region of
+that class. Where a limit of the domain lies within the region, the class does not decide, and the value is missing.
+Road users are counted from tracked detections to all sides: pedestrians and moving vehicles. Scenery (from the map at
+the vehicle's pose) and ego speed (from odometry) are as recorded.
 """
 
 from collections.abc import Mapping, Sequence
@@ -35,23 +35,24 @@ from flcav.world.weather import NIGHT_DEG, WEATHER_CLASSES, Weather
 
 AROUND_M = 50.0  # within which road users count
 LOW_LIGHT_DEG = 10.0  # sun elevation below which the light is low
-WET, STANDING = 0.25, 0.9  # wetness of the road from which it is wet, and water stands on it
-SLOWEST_S = 2.0  # between two poses of which a speed is taken, at most
-PARKED = "parked"  # beginning of the track of a parked vehicle
+WET = 0.25  # wetness from which the road is wet
+STANDING = 0.9  # wetness from which there is standing water
+SLOWEST_S = 2.0  # greatest time between two poses that give a speed
+PARKED = "parked"  # prefix of the tracks of parked vehicles
 
 
 @dataclass(frozen=True)
 class Measurements:
-    """The measured columns of F frames: numbers with NaN, or words with "", where a value is missing."""
+    """Measured columns of F frames; missing values are NaN in columns of numbers, "" in columns of words."""
 
-    frames: tuple[int, ...]  # (F,) numbers in the recording
-    columns: Mapping[str, Column]  # (F,) each, by column of the binding
+    frames: tuple[int, ...]  # (F,) indices in the recording
+    columns: Mapping[str, Column]  # arrays (F,) by column of the binding
 
     def __len__(self) -> int:
         return len(self.frames)
 
     def rows(self) -> list[dict[str, Value]]:
-        """Return the values of each frame by column; None where one is missing."""
+        """Return the values by frame and column; None where missing."""
         names = list(self.columns)
         plain = [_plain(column) for column in self.columns.values()]
         return [dict(zip(names, row, strict=True)) for row in zip(*plain, strict=True)]
@@ -59,13 +60,13 @@ class Measurements:
 
 @dataclass(frozen=True)
 class Span(Record):
-    """What a recording covers of one attribute."""
+    """Range or word counts of one attribute in a recording."""
 
     attribute: str
-    low: float | None  # of a number; None where all are missing, and of words
-    high: float | None
-    words: Mapping[str, int]  # word -> frames
-    missing: int  # frames
+    low: float | None  # least number; None for words, and where all values are missing
+    high: float | None  # greatest number
+    words: Mapping[str, int]  # number of frames by word
+    missing: int  # number of frames without a value
 
     @property
     def sentence(self) -> str:
@@ -77,7 +78,7 @@ class Span(Record):
 
 
 def summarise_measurements(measured: Measurements) -> tuple[Span, ...]:
-    """Return the range or the values of each attribute in the frames, in the order of the columns."""
+    """Return the range or word counts of each measured column."""
     spans = []
     for name, column in measured.columns.items():
         if column.dtype.kind == "U":
@@ -92,7 +93,7 @@ def summarise_measurements(measured: Measurements) -> tuple[Span, ...]:
 
 
 def select_vehicles(data: Dataset) -> tuple[int, ...]:
-    """Return the frames of vehicles, the subjects of a domain; raises `InputError` where there are none."""
+    """Return the frames of vehicles, which domains are about; raises `InputError` where there are none."""
     frames = tuple(i for i, key in enumerate(data.keys) if not key.agent.startswith("pole"))
     if not frames:
         raise InputError(f"{data.folder}: has no frames of vehicles, which domains are of")
@@ -100,9 +101,9 @@ def select_vehicles(data: Dataset) -> tuple[int, ...]:
 
 
 def measure_domain(data: Dataset, frames: Sequence[int] | None = None, scenery: Scenery | None = None) -> Measurements:
-    """Return the value of each attribute in `frames` (None: all of vehicles), by ground truth.
+    """Return the measured attributes of `frames` (None: all frames of vehicles) by ground truth.
 
-    scenery: that of the recording's town, where it has been read before. What a recording does not say is missing.
+    `scenery` is that of the recording's town, if already read. Attributes that a recording lacks are missing values.
     """
     chosen = select_vehicles(data) if frames is None else tuple(frames)
     pose = _poses(data)[list(chosen)]
@@ -121,13 +122,13 @@ def measure_domain(data: Dataset, frames: Sequence[int] | None = None, scenery: 
 
 
 def scenery_of(data: Dataset) -> Scenery | None:
-    """Return the scenery of a recording's town; None where the town is not known."""
+    """Return the scenery of a recording's town; None where the town is unknown."""
     town = data.town()
     return None if town is None else Scenery(town)
 
 
 def describe_weather(weather: Mapping[str, Array]) -> dict[str, Column]:
-    """Return the environmental conditions (F,) of weathers whose fields are columns (F,); NaN is missing."""
+    """Return the columns (F,) of environmental conditions from fields of `Weather` (F,); NaN is missing."""
     sun, wet = weather["sun_elevation_deg"], weather["wetness"]
     light = np.select([np.isnan(sun), sun < NIGHT_DEG, sun <= LOW_LIGHT_DEG], ["", "night", "low_light"], "day")
     surface = np.select([np.isnan(wet), wet < WET, wet < STANDING], ["", "dry", "wet"], "standing_water")
@@ -142,14 +143,14 @@ def describe_weather(weather: Mapping[str, Array]) -> dict[str, Column]:
 
 
 def describe_reach(recipe: Mapping[str, object]) -> dict[str, float]:
-    """Return the field of view [deg] and the range [m] of a recipe's vehicle rig; NaN without a recipe."""
+    """Return the field of view [deg] and range [m] of the vehicle rig in a recipe; NaN where it has none."""
     if "vehicle_rig" not in recipe:
         return {"field_of_view": np.nan, "sensing_range": np.nan}
     return reach_of(parse_config(Rig, recipe["vehicle_rig"], "the rig of the recording"))
 
 
 def reach_of(rig: Rig) -> dict[str, float]:
-    """Return the horizontal field of view [deg] and the farthest range [m] of a rig; the range is NaN without LiDAR."""
+    """Return the horizontal field of view [deg] and the greatest range [m] of a rig; the range is NaN without LiDAR."""
     ranges = [lidar.settings.range_m for lidar in rig.lidars.values()]
     views = [np.degrees(2 * np.arctan2(lens.width / 2, lens.intrinsics()[0, 0]))
              for lens in (camera.settings for camera in rig.cameras.values())]  # fmt: skip
@@ -160,13 +161,13 @@ def reach_of(rig: Rig) -> dict[str, float]:
 
 
 def _poses(data: Dataset) -> Array:
-    """Return (all frames, 4, 4) the poses of the agents."""
+    """Return the poses of the agents in all frames (frames, 4, 4) [m]."""
     table, _ = data.rows("poses")
     return table["world_from_agent"].combine_chunks().flatten().to_numpy().reshape(-1, 4, 4)
 
 
 def _weather(data: Dataset) -> dict[str, Array]:
-    """Return each field of the weather of all frames, NaN where a frame has none."""
+    """Return the fields of the weather of all frames (frames,); NaN where a frame has none."""
     table, frame = data.rows("weather")
     out = {name: np.full(len(data), np.nan) for name in WEATHER_COLUMNS}
     for name, column in out.items():
@@ -175,16 +176,17 @@ def _weather(data: Dataset) -> dict[str, Array]:
 
 
 def _speeds(data: Dataset) -> Array:
-    """Return the speed of the agent of each frame [km/h], by its pose before and after; NaN where both are far off.
+    """Return the agents' speeds [km/h] from the poses before and after each frame; NaN without a pose in `SLOWEST_S`.
 
-    An imported recording whose poses are all that of the world has none.
+    Imported recordings without poses (all identity) have no speeds.
     """
     poses = _poses(data)
     if data.manifest.imported and (poses == np.eye(4)).all():
         return np.full(len(data), np.nan)
     place = poses[:, :3, 3]
     time = np.array([key.time_s for key in data.keys])
-    scenes, agents = (np.array([getattr(key, name) for key in data.keys]) for name in ("scene", "agent"))
+    scenes = np.array([key.scene for key in data.keys])
+    agents = np.array([key.agent for key in data.keys])
     order = np.lexsort((time, agents, scenes))
     same = (scenes[order][1:] == scenes[order][:-1]) & (agents[order][1:] == agents[order][:-1])
     apart = np.diff(time[order])
@@ -200,7 +202,7 @@ def _speeds(data: Dataset) -> Array:
 
 
 def _count_agents(data: Dataset) -> dict[str, Array]:
-    """Return how many road users that are not parked, and pedestrians, are within `AROUND_M` in each frame."""
+    """Return the numbers of road users that are not parked, and of pedestrians, within `AROUND_M` in each frame."""
     table, frame = data.rows("annotations")
     if data.manifest.imported and "objects" not in data.manifest.labels:
         missing = np.full(len(data), np.nan)
@@ -222,8 +224,8 @@ def _plain(column: Column) -> list[Value]:
     return [None if value != value else value for value in values]
 
 
-TRACKED_SCORE = 0.3  # lowest score of a detection that is tracked
-MOVING_MPS = 1.0  # a slower vehicle is taken for parked
+TRACKED_SCORE = 0.3  # least score of tracked detections
+MOVING_MPS = 1.0  # slower vehicles count as parked
 PEDESTRIAN = "Pedestrian"
 
 
@@ -235,7 +237,7 @@ def perceive(
     objects: Second | None,
     progress: Report = ignore_progress,
 ) -> Measurements:
-    """Return the attributes as a vehicle perceives them in its `frames`; those of a network that is None are missing.
+    """Return the attributes as perceived by vehicles in `frames`; without a network, its attributes are missing.
 
     Raises `InputError` where a frame lacks the camera of the weather network, or the LiDAR of the detector.
     """
@@ -252,7 +254,7 @@ def perceive(
 
 
 def _narrow(domain: Domain, low: Mapping[str, Column], high: Mapping[str, Column]) -> dict[str, Column]:
-    """Return the columns (F,) of values between `low` and `high`; missing where a limit lies between these."""
+    """Return the midpoints (F,) of intervals from `low` to `high`; missing where a limit lies within the interval."""
     limits = {column: domain.limits.get(name, ()) for name, column in domain.bound.items()}
     out: dict[str, Column] = {}
     for name, one in low.items():
@@ -269,7 +271,7 @@ def _narrow(domain: Domain, low: Mapping[str, Column], high: Mapping[str, Column
 def _see_weather(
     network: Classifier, data: Dataset, frames: Sequence[int]
 ) -> tuple[dict[str, Array], dict[str, Array]]:
-    """Return the least and the largest fields (F,) of the class that the network sees in each frame's first camera."""
+    """Return the bounds (F,) of weather fields for the class that the network predicts from each first camera."""
     blind = [i for i in frames if not data.cameras(i)]
     if blind:
         raise InputError(f"{data.folder}: frame '{data.name(blind[0])}' has no camera, which the weather network needs")
@@ -282,17 +284,18 @@ def _see_weather(
 
 
 def _track_agents(network: Second, data: Dataset, frames: Sequence[int], progress: Report) -> dict[str, Array]:
-    """Return how many moving road users, and pedestrians, are tracked within `AROUND_M` in each frame."""
+    """Return the numbers of moving road users, and of pedestrians, tracked within `AROUND_M` in each frame."""
     sequences: dict[tuple[str, str], list[int]] = {}
     for i in frames:
         sequences.setdefault((data.keys[i].scene, data.keys[i].agent), []).append(i)
-    read, counts = frame_reader(data, network.config.foreground), dict[int, tuple[int, int]]()
+    read = frame_reader(data, network.config.foreground)
+    counts = dict[int, tuple[int, int]]()
     for sequence in sequences.values():
         tracker = Tracker(confirm=1)
         for i in sorted(sequence, key=lambda number: data.keys[number].time_s):
             frame = read(i)
-            (found,) = detect_in(network, [frame], score_threshold=TRACKED_SCORE)
-            tracked = tracker.step(found.transform(frame.world_from_sensor(choose_lidar(frame))), frame.time_s)
+            (boxes,) = detect_in(network, [frame], score_threshold=TRACKED_SCORE)
+            tracked = tracker.step(boxes.transform(frame.world_from_sensor(choose_lidar(frame))), frame.time_s)
             counts[i] = _count_tracked(tracked, frame.world_from_agent[:2, 3])
             progress(len(counts), len(frames), "")
     agents, walking = np.array([counts[i] for i in frames], dtype=np.float64).reshape(-1, 2).T

@@ -1,8 +1,8 @@
-"""Scenarios as ASAM OpenSCENARIO XML 1.2: entities, their initial states, the weather, and the storyboard.
+"""Writer of scenarios as ASAM OpenSCENARIO XML 1.2: entities, their initial states, the weather, and the storyboard.
 
-The file says what happens to the vehicle under test, `ego`, on one street of the town, whose OpenDRIVE map it names.
-When a recipe is recorded, its actors are cast from the traffic; here each has a place of its own. docs/odd.md says what
-is written.
+The file describes a corner case of the vehicle under test, `ego`, on one street of the town, and names its OpenDRIVE
+map. When a recipe is recorded, actors are chosen from the traffic; here they have fixed places. docs/odd.md lists the
+elements that are written.
 """
 
 import math
@@ -15,22 +15,22 @@ from flcav.world.shapes import SHAPES
 from flcav.world.weather import NO_FOG_M
 
 REVISION = (1, 2)
-DATE = "1970-01-01T00:00:00"  # the same scenario gives the same bytes
-ENDS_S = 20.0
-AXLE_M = 0.32  # height of an axle: half of a wheel's diameter
-LUX = 120_000.0  # of the sun at the zenith
-CLOUDS = ((0.125, "oneOktas"), (0.5, "fourOktas"), (0.8, "sixOktas"), (1.0, "eightOktas"))  # up to this share
+DATE = "1970-01-01T00:00:00"  # fixed, so that the same scenario gives the same bytes
+ENDS_S = 20.0  # duration of the scenario
+AXLE_M = 0.32  # height of an axle: the radius of a wheel
+LUX = 120_000.0  # illuminance of the sun at the zenith
+CLOUDS = ((0.125, "oneOktas"), (0.5, "fourOktas"), (0.8, "sixOktas"), (1.0, "eightOktas"))  # by greatest cloud cover
 
 
 def to_openscenario(sample: SampledScenario, map_file: str) -> bytes:
-    """Return the scenario of a sample as OpenSCENARIO XML 1.2, with `map_file` as its OpenDRIVE map."""
+    """Return a sampled scenario as OpenSCENARIO XML 1.2, with `map_file` as its OpenDRIVE map."""
     limit = max(sample.limit_kmh / 3.6, 1.0)
     script = write_script(sample.case, limit)
     ego = Entity("ego", "car", "compact", (0.0, 0.0, 0.0), limit)
     root = ElementTree.Element("OpenSCENARIO")
     major, minor = map(str, REVISION)
-    told = f"{sample.case} at a {sample.place.kind} of {sample.place.town}"
-    _add(root, "FileHeader", revMajor=major, revMinor=minor, date=DATE, description=told, author="flcav")
+    about = f"{sample.case} at a {sample.place.kind} of {sample.place.town}"
+    _add(root, "FileHeader", revMajor=major, revMinor=minor, date=DATE, description=about, author="flcav")
     _add(root, "CatalogLocations")
     _add(_add(root, "RoadNetwork"), "LogicFile", filepath=map_file)
     entities = _add(root, "Entities")
@@ -50,7 +50,7 @@ def _add(parent: ElementTree.Element, tag: str, **attributes: str | float) -> El
 
 
 def _add_entity(entities: ElementTree.Element, actor: Entity) -> None:
-    shape = next(each for each in SHAPES[actor.category] if each.name == actor.shape)
+    shape = next(shape for shape in SHAPES[actor.category] if shape.name == actor.shape)
     named = _add(entities, "ScenarioObject", name=actor.name)
     if actor.category == "pedestrian":
         body = _add(named, "Pedestrian", name=shape.name, pedestrianCategory="pedestrian", mass=45.0)
@@ -69,11 +69,9 @@ def _add_entity(entities: ElementTree.Element, actor: Entity) -> None:
 
 
 def _add_start(actions: ElementTree.Element, sample: SampledScenario, actors: Sequence[Entity]) -> None:
-    """Write the weather, and the place and speed of each actor."""
-    weather, sky = (
-        sample.weather,
-        _add(_add(_add(actions, "GlobalAction"), "EnvironmentAction"), "Environment", name="sky"),
-    )
+    """Write the weather, and the initial poses and speeds of the actors."""
+    weather = sample.weather
+    sky = _add(_add(_add(actions, "GlobalAction"), "EnvironmentAction"), "Environment", name="sky")
     _add(sky, "TimeOfDay", animation="false", dateTime=DATE)
     share = next((word for most, word in CLOUDS if weather.cloud_cover <= most), "eightOktas")
     air = _add(sky, "Weather", fractionalCloudCover=share)

@@ -1,8 +1,8 @@
-"""Taxonomies of OpenODD whose classes are defined by ranges, rewritten as openodd-py reads them.
+"""Conversion of OpenODD taxonomies with classes defined by ranges into the form that openodd-py reads.
 
-The concepts of ISO 34503 in Autoware's form have no_rain: {rainfall_rate: "<= 0 mm/h"} where OpenODD has a list of
-words: no_rain is a word of rainfall_intensity, and rainfall_rate is a number. Files that extend one another may also
-give one concept more words, which are joined.
+Autoware's files with the concepts of ISO 34503 define no_rain: {rainfall_rate: "<= 0 mm/h"}, where openodd-py expects a
+list of words: no_rain becomes a word of rainfall_intensity, and rainfall_rate a number. Files that extend one another
+may add words to a concept; these are joined.
 """
 
 import re
@@ -14,8 +14,8 @@ from flcav.config import Json
 
 RANGE = re.compile(
     r"\s*(?:[<>]=?\s*[-+.\d]+|\[\s*[-+.\d]+\s*\.\.\s*[-+.\d]+\s*\])\s*(?P<unit>[A-Za-z%°/²]*)\s*"
-)  # of numbers, as conditions have it
-DIMENSIONS: Mapping[str, str] = {  # of a unit in such a range, in OpenODD's words
+)  # of numbers, as in conditions
+DIMENSIONS: Mapping[str, str] = {  # OpenODD's dimension by unit of such a range
     "m": "length",
     "km": "length",
     "m/s": "velocity",
@@ -33,19 +33,19 @@ Node = dict[str, Json]
 
 
 def has_ranges(taxonomy: Json) -> bool:
-    """Return whether a concept of a taxonomy has a range of numbers for its type."""
+    """Return whether a concept of a taxonomy is defined by a range of numbers."""
     if isinstance(taxonomy, dict):
-        return any(has_ranges(each) for each in taxonomy.values())
+        return any(has_ranges(node) for node in taxonomy.values())
     return isinstance(taxonomy, str) and RANGE.fullmatch(taxonomy) is not None
 
 
 def rewrite_ranges(documents: Sequence[Mapping[str, Json]]) -> str:
-    """Return one OpenODD document (YAML) of several that import one another, its classes in words and numbers."""
+    """Return several OpenODD documents as one (YAML), with words and numbers in place of classes by ranges."""
     taxonomy: Node = {}
     modules: Node = {}
     for document in documents:
-        own = document.get("TAXONOMY")
-        taxonomy = _join(taxonomy, own if isinstance(own, dict) else {})
+        concepts = document.get("TAXONOMY")
+        taxonomy = _join(taxonomy, concepts if isinstance(concepts, dict) else {})
         given = document.get("MODULES")
         modules |= given if isinstance(given, dict) else {}
     numbers: dict[str, str] = {}
@@ -56,28 +56,28 @@ def rewrite_ranges(documents: Sequence[Mapping[str, Json]]) -> str:
 
 
 def _join(one: Mapping[str, Json], other: Mapping[str, Json]) -> Node:
-    """Return two taxonomies as one: lists of words are joined, and otherwise the second is taken."""
+    """Merge two taxonomies: lists of words are joined, other values are those of the second."""
     joined = dict(one)
     for name, value in other.items():
         known = joined.get(name)
         if isinstance(known, dict) and isinstance(value, dict):
             joined[name] = _join(known, value)
         elif isinstance(known, list) and isinstance(value, list):
-            joined[name] = [*known, *(each for each in value if each not in known)]
+            joined[name] = [*known, *(word for word in value if word not in known)]
         else:
             joined[name] = value
     return joined
 
 
 def _rewrite(node: Mapping[str, Json], numbers: dict[str, str]) -> Node:
-    """Return a taxonomy without ranges, and note in `numbers` the type of each number that has one."""
+    """Return a taxonomy without ranges, and add the types of the numbers with ranges to `numbers`."""
     written: Node = {}
     for name, value in node.items():
-        if isinstance(value, str) and (found := RANGE.fullmatch(value)):
-            numbers[name] = f"float {DIMENSIONS.get(found['unit'], '')}".strip()
+        if isinstance(value, str) and (match := RANGE.fullmatch(value)):
+            numbers[name] = f"float {DIMENSIONS.get(match['unit'], '')}".strip()
         elif isinstance(value, dict):
-            classes = [key for key, each in value.items() if isinstance(each, dict) and _is_class(each)]
-            rest = {key: each for key, each in value.items() if key not in classes}
+            classes = [key for key, child in value.items() if isinstance(child, dict) and _is_class(child)]
+            rest = {key: child for key, child in value.items() if key not in classes}
             for key in classes:
                 _rewrite(value[key], numbers)  # pyright: ignore[reportArgumentType]
             if classes and rest:
@@ -90,7 +90,7 @@ def _rewrite(node: Mapping[str, Json], numbers: dict[str, str]) -> Node:
 
 
 def _is_class(node: Mapping[str, Json]) -> bool:
-    return bool(node) and all(isinstance(each, str) and RANGE.fullmatch(each) for each in node.values())
+    return bool(node) and all(isinstance(child, str) and RANGE.fullmatch(child) for child in node.values())
 
 
 def _names(node: Json) -> set[str]:

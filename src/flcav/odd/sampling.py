@@ -1,11 +1,12 @@
-"""Sampling of a domain: where a recipe is set, in what weather, and which corner case happens there.
+"""Sampling of scenarios from a domain: a place, the weather, and a corner case.
 
-Three ways to draw: openodd-py's sampler, least covered buckets first; Latin hypercubes; scrambled Sobol points
-(`scipy.stats.qmc`; Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995). A point of the unit cube has one
-axis per attribute that recipes set, one for the corner case and one for the place among those of its kind. An axis goes
-over the buckets inside the domain, equally, and within a bucket uniformly; sight on a logarithmic scale.
+There are three methods: openodd-py's sampler, which draws the least covered buckets first; Latin hypercubes; scrambled
+Sobol points (`scipy.stats.qmc`; Owen, "Randomly permuted (t,m,s)-nets and (t,s)-sequences", 1995). A point of the unit
+cube has one axis per attribute that recipes set, one for the corner case, and one for the place among those of its
+kind. An axis is divided equally among the buckets inside the domain; values are uniform within a bucket, with
+visibility on a logarithmic scale.
 
-A sample becomes the recipe of a recording, with its corner case where and when it is to happen.
+A sample becomes the recipe of a recording with the corner case at its place and time.
 """
 
 import math
@@ -34,31 +35,32 @@ from flcav.world.scenarios.scenario import Kind
 from flcav.world.weather import Weather
 
 METHODS = ("coverage", "lhs", "sobol")
-CASES: Mapping[str, tuple[Kind, ...]] = {  # corner cases that a kind of place lends itself to
+CASES: Mapping[str, tuple[Kind, ...]] = {  # possible corner cases by kind of place
     "none": ("stalled_vehicle", "crash", "cut_in", "overtaking", "pedestrian_behind_van"),
     "t_junction": ("stalled_vehicle", "crash", "pedestrian_behind_van", "red_light_runner"),
     "crossroad": ("stalled_vehicle", "crash", "pedestrian_behind_van", "red_light_runner"),
     "roundabout": ("stalled_vehicle", "crash"),
 }
-LIT: Kind = "red_light_runner"  # happens at signalised junctions alone
+LIT: Kind = "red_light_runner"  # only at signalised junctions
 CASE = "corner case"  # name of its axis
-RAIN_MM_H, RAIN_CLOUDS = 0.3, 60.0  # rain from there on needs clouds of that share [%]
-WETTEST_MM_H = 20.0  # rain rate at which the road is as wet as rain makes it
-MOST_TRIES = 50  # points per recipe before the domain is taken to have none
+RAIN_MM_H = 0.3  # least rain rate that needs clouds
+RAIN_CLOUDS = 60.0  # least cloud cover with rain [%]
+WETTEST_MM_H = 20.0  # rain rate of the greatest wetness
+MOST_TRIES = 50  # refused points per recipe before the search is given up
 HARDLY = "hardly any weather and place together are inside it"
 
 
 @dataclass(frozen=True)
 class Axis:
-    """An attribute that recipes set: the part of its buckets inside the domain that can be set."""
+    """Sampling axis of an attribute that recipes set: its buckets, as far as they are inside the domain."""
 
     attribute: str
-    labels: tuple[str, ...]
-    spans: tuple[tuple[float, float], ...]  # of each bucket; of words empty
+    labels: tuple[str, ...]  # of the buckets
+    spans: tuple[tuple[float, float], ...]  # range of values in each bucket; empty for words
     logarithmic: bool = False
 
     def at(self, share: float) -> tuple[str, Value]:
-        """Return bucket and value at a share in [0, 1) of the axis."""
+        """Return the bucket and the value at a share in [0, 1) of the axis."""
         number, within = divmod(share * len(self.labels), 1.0)
         label = self.labels[int(number)]
         if not self.spans:
@@ -71,40 +73,41 @@ class Axis:
 
 @dataclass(frozen=True)
 class SampledScenario(Record):
-    """One drawn scenario of a domain."""
+    """A scenario sampled from a domain."""
 
     place: ScenarioPlace
     case: Kind
     weather: Weather
-    buckets: Mapping[str, str]  # attribute, and the corner case -> bucket
-    rig: str  # of vehicles, a name of `RIGS`
+    buckets: Mapping[str, str]  # bucket by attribute, and the corner case as `CASE`
+    rig: str  # name of the vehicles' rig in `RIGS`
     limit_kmh: float  # speed limit on the approach
 
 
 @dataclass(frozen=True)
 class Sampled:
-    """Samples of a domain, and the pairs of buckets that they have."""
+    """Samples of a domain with their pairwise coverage."""
 
     samples: tuple[SampledScenario, ...]
-    pairs: int  # pairs of buckets of two axes in the samples
-    possible: int  # pairs that a sample can have
-    refused: int  # points that were outside the domain
+    pairs: int  # number of pairs of buckets of two axes in the samples
+    possible: int  # number of pairs that samples can have
+    refused: int  # number of points outside the domain
 
     @property
     def pairwise(self) -> float:
-        """Return the pairwise coverage: the share of possible pairs that the samples have."""
+        """Return the pairwise coverage: the share of the possible pairs of buckets that occur in the samples."""
         return self.pairs / self.possible if self.possible else 1.0
 
 
 class Space:
-    """What can be sampled of a domain in some towns.
+    """Sample space of a domain in some towns: its places, rig and axes.
 
-    Raises `InputError` where no place of the towns, no rig or no value of a field is inside it.
+    Raises `InputError` where no place of the towns, no rig, or no value of a recipe's field is inside the domain.
     """
 
     def __init__(self, domain: Domain, sceneries: Sequence[Scenery]) -> None:
         domain.require_bound()
-        self.domain, self.sceneries = domain, {scenery.town.name: scenery for scenery in sceneries}
+        self.domain = domain
+        self.sceneries = {scenery.town.name: scenery for scenery in sceneries}
         self.places: dict[str, list[tuple[ScenarioPlace, dict[str, Value]]]] = {}
         for place, row in find_inside_places(domain, sceneries):
             if cases_at(place):
@@ -122,8 +125,8 @@ class Space:
         self.axes.append(Axis(self.kinds, tuple(kind for kind in CASES if kind in self.places), ()))
 
     def _axis(self, name: str, knob: OddKnob) -> Axis:
-        """Return the axis of a number: the buckets that the knob reaches, as far as values in them are inside."""
-        item = next(each.item for each in self.domain.definition.attributes if each.name == name)
+        """Return the axis of a number: the buckets within the knob's range, narrowed to values inside the domain."""
+        item = next(attribute.item for attribute in self.domain.definition.attributes if attribute.name == name)
         assert item is not None, "knobs are of attributes with buckets"
         limits, reach = self.domain.limits.get(name, ()), knob.reach or (-math.inf, math.inf)
         labels, spans = [], []
@@ -139,7 +142,7 @@ class Space:
         return Axis(name, tuple(labels), tuple(spans), self.domain.bound[name] == "visibility")
 
     def _is_inside(self, name: str, value: float) -> bool:
-        """Return whether a value can be inside the domain, with its implications: light by sun, surface by rain."""
+        """Return whether a value can be inside the domain with what it implies: light by sun, surface by rain."""
         column = self.domain.bound[name]
         weather = {field: np.full(1, np.nan) for field in Weather.model_fields}
         if column == "sun_elevation":
@@ -148,22 +151,24 @@ class Space:
             weather["rain_mm_h"][0], weather["wetness"][0] = value, wet_by(value)
         implied = {key: one.tolist()[0] for key, one in describe_weather(weather).items()}
         known = {**implied, column: value}
-        given = {each: known[own] for each, own in self.domain.bound.items() if known.get(own) not in (None, "")}
-        return self.domain.can_hold({each: one for each, one in given.items() if one == one})
+        bound = self.domain.bound.items()
+        given = {attribute: known[key] for attribute, key in bound if known.get(key) not in (None, "")}
+        return self.domain.can_hold({attribute: one for attribute, one in given.items() if one == one})
 
     def realise(self, values: Mapping[str, Value], case: float, place: float) -> SampledScenario | None:
-        """Return the sample with these values, shares in [0, 1) of its cases and places; None if it cannot be.
+        """Return the scenario with these attribute values; None where it is outside the domain.
 
-        Where it rains, fewer clouds than `RAIN_CLOUDS` are lifted above it. A sample is refused where the domain is
-        outside, with what traffic decides left open.
+        `case` and `place` are shares in [0, 1) that choose among the corner cases and places. With rain, a cloud cover
+        below `RAIN_CLOUDS` is mapped above it. Attributes that depend on traffic are left open.
         """
         column = {self.domain.bound[name]: value for name, value in values.items()}
-        rain, clouds = float(column.get("rainfall") or 0.0), float(column.get("cloud_cover") or 0.0)
+        rain = float(column.get("rainfall") or 0.0)
+        clouds = float(column.get("cloud_cover") or 0.0)
         if rain >= RAIN_MM_H and clouds < RAIN_CLOUDS:
             clouds = RAIN_CLOUDS + clouds * (100 - RAIN_CLOUDS) / RAIN_CLOUDS
         kind = str(values[self.kinds])
-        every = self.places[kind]
-        here, row = every[int(place * len(every))]
+        places = self.places[kind]
+        here, row = places[int(place * len(places))]
         cases = cases_at(here)
         chosen = cases[int(case * len(cases))]
         weather = Weather(
@@ -177,7 +182,7 @@ class Space:
         known = row | {name: value.tolist()[0] for name, value in sky.items()} | self.reach
         if judge_values(self.domain, known) == OUTSIDE:
             return None
-        items = {each.name: each.item for each in self.domain.definition.attributes}
+        items = {attribute.name: attribute.item for attribute in self.domain.definition.attributes}
         buckets = {
             name: item.bucket_of(known[self.domain.bound[name]])
             for name in self.knobs
@@ -188,12 +193,12 @@ class Space:
         )
 
     def possible_pairs(self) -> set[tuple[tuple[str, str], tuple[str, str]]]:
-        """Return the pairs of buckets, of two axes or of an axis and the corner cases, that a sample can have."""
+        """Return the pairs of buckets of two axes (the corner case is one) that can occur in a sample."""
         cases = {
             kind: {case for place, _ in places for case in cases_at(place)} for kind, places in self.places.items()
         }
-        own = [[(axis.attribute, label) for label in axis.labels] for axis in self.axes]
-        own.append([(CASE, case) for case in dict.fromkeys(each for every in cases.values() for each in sorted(every))])
+        labels = [[(axis.attribute, label) for label in axis.labels] for axis in self.axes]
+        labels.append([(CASE, case) for case in dict.fromkeys(c for group in cases.values() for c in sorted(group))])
         tops = {(a.attribute, label): span for a in self.axes for label, span in zip(a.labels, a.spans)}
 
         def fits(one: tuple[str, str], other: tuple[str, str]) -> bool:
@@ -205,7 +210,7 @@ class Space:
 
         return {
             (one, other)
-            for these, those in combinations(own, 2)
+            for these, those in combinations(labels, 2)
             for one in these
             for other in those
             if fits(one, other)
@@ -213,22 +218,22 @@ class Space:
 
 
 def cases_at(place: ScenarioPlace) -> tuple[Kind, ...]:
-    """Return the corner cases that can happen at a place."""
+    """Return the corner cases that are possible at a place."""
     return tuple(case for case in CASES.get(place.kind, ()) if case != LIT or place.control == "signalised")
 
 
 def wet_by(rain_mm_h: float) -> float:
-    """Return the wetness of a road in the rain: none in a drizzle, up to .95 from `WETTEST_MM_H` on."""
+    """Return the wetness of a road for a rain rate [mm/h]: 0 below `RAIN_MM_H`, 0.95 from `WETTEST_MM_H` on."""
     return 0.0 if rain_mm_h < RAIN_MM_H else 0.3 + 0.65 * min(rain_mm_h / WETTEST_MM_H, 1.0)
 
 
 def sample_domain(
     space: Space, count: int, method: str, seed: int = 0, covered: CoverageReport | None = None
 ) -> Sampled:
-    """Return `count` samples of a space.
+    """Return `count` samples of a space by a method of `METHODS`.
 
-    covered: report of earlier runs, of the method "coverage". Points that are refused are replaced by further ones.
-    Raises `InputError` where hardly any point can be realised.
+    `covered` is the coverage of earlier runs, for the method "coverage". Points outside the domain are replaced by
+    further ones. Raises `InputError` where hardly any point is inside.
     """
     samples: list[SampledScenario] = []
     refused = 0
@@ -238,34 +243,34 @@ def sample_domain(
         else draw_sample_points(space, count, method, seed)
     )
     for values, case, place in points:
-        found = space.realise(values, case, place)
-        if found is None:
+        sample = space.realise(values, case, place)
+        if sample is None:
             refused += 1
             if refused > MOST_TRIES * max(count, 10):
                 raise InputError(f"{space.domain.name}: {HARDLY}")
             continue
-        samples.append(found)
+        samples.append(sample)
         if len(samples) == count:
             break
     return count_pairs(space, samples, refused)
 
 
 def count_pairs(space: Space, samples: Sequence[SampledScenario], refused: int = 0) -> Sampled:
-    """Return samples of a space with the pairs of buckets that they have."""
+    """Return samples of a space with their pairwise coverage."""
     possible = space.possible_pairs()
     order = [axis.attribute for axis in space.axes] + [CASE]
-    had = {
-        ((one, each.buckets[one]), (other, each.buckets[other]))
-        for each in samples
+    pairs = {
+        ((one, sample.buckets[one]), (other, sample.buckets[other]))
+        for sample in samples
         for one, other in combinations(order, 2)
     }
-    return Sampled(tuple(samples), len(had & possible), len(possible), refused)
+    return Sampled(tuple(samples), len(pairs & possible), len(possible), refused)
 
 
 def draw_sample_points(
     space: Space, count: int, method: str, seed: int
 ) -> Iterator[tuple[dict[str, Value], float, float]]:
-    """Yield values by attribute and the shares of case and place, without end, in batches of quasi-random points."""
+    """Yield values by attribute and the shares in [0, 1) of corner case and place, from endless batches of points."""
     axes, rng = space.axes, stream(seed, "odd", method)
     sobol = qmc.Sobol(len(axes) + 2, scramble=True, rng=rng)
     batch = 1 << max(count - 1, 1).bit_length()  # Sobol points are balanced in powers of two
@@ -278,7 +283,7 @@ def draw_sample_points(
 def _draw_covering(
     space: Space, count: int, seed: int, covered: CoverageReport | None
 ) -> Iterator[tuple[dict[str, Value], float, float]]:
-    """Yield points of openodd-py's sampler, the least covered buckets first, without end."""
+    """Yield points of openodd-py's sampler without end, the least covered buckets first."""
     rng, kinds = stream(seed, "odd", "coverage"), space.axes[-1]
     knobs = {
         name: OddKnob(knob.key, {kind: kind for kind in kinds.labels}) if name == space.kinds else knob
@@ -294,15 +299,16 @@ def _draw_covering(
             yield dict(case.values), float(rng.random()), float(rng.random())
 
 
-WARMUP_S, BEGINS_S = 30.0, 31.0  # of the traffic; from then on the corner case may begin
+WARMUP_S = 30.0  # of the traffic
+BEGINS_S = 31.0  # earliest start of the corner case
 SPINS, EVERY_S = 20, 2.0
-CAVS = 6  # the case waits for one of them to come within 50 m of its place
-POLE_M = 40.0  # a pole this near to the place records, too
+CAVS = 6  # connected vehicles; the case waits for one to come within 50 m of its place
+POLE_M = 40.0  # a pole within this distance of the place also records
 INDEX = "samples.json"
 
 
 def make_recipe(sample: SampledScenario, scenery: Scenery, seed: int, split: str = "train") -> dict[str, Json]:
-    """Return the fields of the recipe of a sample, which `parse_recipe` takes."""
+    """Return the fields of a sample's recipe, as `parse_recipe` reads them."""
     town, place = scenery.town, sample.place
     away = np.linalg.norm(town.poles.position[:, :2] - (place.x, place.y), axis=1)
     near = town.poles.id[np.flatnonzero(away <= POLE_M)[np.argsort(away[away <= POLE_M])][:1]]
@@ -332,19 +338,21 @@ def write_recipes(
     also: Callable[[SampledScenario, Recipe, Path], None],
     told: Sequence[Mapping[str, Json]] = (),
 ) -> list[Path]:
-    """Write the recipe of each sample as OUT/NUMBER.yaml, and OUT/samples.json last; return the recipes' paths.
+    """Write the recipe of each sample as OUT/NUMBER.yaml, then OUT/samples.json; return the recipes' paths.
 
-    also: called for each sample with its recipe and path; told: further values of each sample in samples.json. Every
-    recipe has been read before it is written. Raises `InputError` where the folder has recipes already.
+    `also` is called for each sample with its recipe and path; `told` has further values of each sample for
+    samples.json. All recipes are validated before the first is written. Raises `InputError` where the folder already
+    has recipes.
     """
     if out.exists() and any(out.glob("*.yaml")):
         raise InputError(f"{out}: has recipes already; name another folder")
-    values = [make_recipe(each, sceneries[each.place.town], seed + number) for number, each in enumerate(drawn.samples)]
-    recipes = [parse_recipe(each, f"sample {number}") for number, each in enumerate(values, start=1)]
+    samples = enumerate(drawn.samples)
+    values = [make_recipe(sample, sceneries[sample.place.town], seed + number) for number, sample in samples]
+    recipes = [parse_recipe(fields, f"sample {number}") for number, fields in enumerate(values, start=1)]
     out.mkdir(parents=True, exist_ok=True)
     paths = [out / f"{number:0{len(str(len(values)))}}.yaml" for number in range(1, len(values) + 1)]
-    for sample, each, recipe, path in zip(drawn.samples, values, recipes, paths, strict=True):
-        path.write_text(yaml.safe_dump(each, sort_keys=False, default_flow_style=None))
+    for sample, fields, recipe, path in zip(drawn.samples, values, recipes, paths, strict=True):
+        path.write_text(yaml.safe_dump(fields, sort_keys=False, default_flow_style=None))
         also(sample, recipe, path)
     flush_all([*paths, out])
     summary: dict[str, Json] = {
@@ -353,8 +361,8 @@ def write_recipes(
         "possible_pairs": drawn.possible,
         "refused": drawn.refused,
         "samples": [
-            {"recipe": path.name, **each.as_json(), **more}
-            for path, each, more in zip(paths, drawn.samples, told or [{}] * len(paths), strict=True)
+            {"recipe": path.name, **sample.as_json(), **more}
+            for path, sample, more in zip(paths, drawn.samples, told or [{}] * len(paths), strict=True)
         ],
     }
     write_json(out / INDEX, summary, sort=False)

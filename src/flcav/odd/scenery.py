@@ -1,7 +1,7 @@
-"""Scenery of a town in terms of ISO 34503: what its road net says of the drivable area and the junctions at a place.
+"""Scenery of a town in terms of ISO 34503: drivable area and junctions at a place, from the road network.
 
 Conflict points of a junction are counted as in traffic engineering (FHWA, "Roundabouts: An Informational Guide", 2000,
-ch. 5): where paths of vehicles diverge, merge and cross; 32 at a cross-road of single lanes, 9 at a T-junction.
+ch. 5): where paths of vehicles diverge, merge and cross; 32 at a crossroad of single lanes, 9 at a T-junction.
 """
 
 from collections import Counter
@@ -22,35 +22,35 @@ from flcav.world.map.town import Town
 
 Column = Array | NDArray[np.str_]  # NaN and "" are missing
 
-NEAR_M = 15.0  # a frame this near to the area of a junction is at it; so with parking spaces
-LANE_M = 12.0  # from a place to the middle of the lane that it is on, at most
-TURNED = 10.0  # distance [m] that a lane in the opposite direction counts as farther away, half of it
-SLOPE_M = 5.0  # to either side, over which a gradient is taken
-STRAIGHT_M = 20.0  # to either side of the middle of a straight road
-BEFORE_M = 40.0  # from where a scenario starts to a junction
-BENT = 0.99  # chord by length: a street below it is no straight road
+NEAR_M = 15.0  # greatest distance from a place to the junction or parking space that it is at
+LANE_M = 12.0  # greatest distance from a place to the centre line of its lane
+TURNED = 10.0  # penalty [m] of a lane at 90 degrees to the direction of travel; twice for the opposite direction
+SLOPE_M = 5.0  # half the distance over which a gradient is measured
+STRAIGHT_M = 20.0  # half the length of a straight road that a place needs
+BEFORE_M = 40.0  # from the start of a scenario to the junction
+BENT = 0.99  # least ratio of chord to length of a straight road
 ARMS = {3: "t_junction", 4: "crossroad"}
-CONTROLS = {"traffic_light": "signalised", "priority": "signed", "allway_stop": "signed"}  # by SUMO's type's beginning
+CONTROLS = {"traffic_light": "signalised", "priority": "signed", "allway_stop": "signed"}  # by prefix of SUMO's type
 ROADS = ((100.0, "radial_road"), (55.0, "distributor_road"), (35.0, "minor_road"))  # up to this limit [km/h]; see docs
 
 
 @dataclass(frozen=True)
 class ScenarioPlace:
-    """A place of a town where scenarios happen: the middle of a junction, or of a straight road."""
+    """A place of a town for scenarios: the centre of a junction, or the middle of a straight road (world frame)."""
 
     town: str
     kind: str  # none (a straight road), t_junction, crossroad, roundabout or other
     control: str  # none, signalised, signed or uncontrolled
-    x: float  # world [m]
-    y: float
-    approach: tuple[float, float]  # end of a lane that leads to it; of a straight road the place itself [m]
-    yaw: float  # of that lane [rad]
+    x: float  # [m]
+    y: float  # [m]
+    approach: tuple[float, float]  # x, y [m] of the end of a lane that leads to it; for a straight road the place
+    yaw: float  # direction of that lane [rad]
     start: tuple[float, float, float]  # x, y [m] and yaw [rad] on that lane, up to `BEFORE_M` before its end
     conflicts: int  # conflict points of vehicles
 
 
 class Scenery:
-    """The scenery of one town: lanes and junctions, with their search trees."""
+    """The scenery of one town: its lanes and junctions, with spatial indices."""
 
     def __init__(self, town: Town) -> None:
         self.town = town
@@ -65,7 +65,10 @@ class Scenery:
         self._near = shapely.STRtree([area.buffer(NEAR_M) for _, _, area in self._areas])
 
     def measure(self, position: Array, yaw: Array) -> dict[str, Column]:
-        """Return the scenery at places (F, 2) [m] in directions (F,) [rad] of travel: a column (F,) per concept."""
+        """Return the scenery at places (F, 2) [m] and directions of travel (F,) [rad], as a column (F,) per concept.
+
+        Units are those of the binding: speed limit [km/h], lane width [m], gradient [%].
+        """
         lane = self._match(position, yaw)
         known, row = lane >= 0, np.maximum(lane, 0)
         limit = np.where(known, self._limit[row], np.nan)
@@ -92,33 +95,35 @@ class Scenery:
         }
 
     def places(self) -> tuple[ScenarioPlace, ...]:
-        """Return the places of the town, junctions first: every junction, and the middle of every straight road."""
+        """Return the places of the town: every junction, then the middle of every straight road."""
         return (*self._junction_places(), *self._straight_places())
 
     def measure_places(self, places: Sequence[ScenarioPlace]) -> dict[str, Column]:
-        """Return the scenery on the approaches of places, with the kind and control of each: a column per concept."""
-        found = self.measure(np.array([place.approach for place in places]), np.array([place.yaw for place in places]))
+        """Return the scenery on the approaches of places, with their kinds and controls: a column per concept."""
+        columns = self.measure(
+            np.array([place.approach for place in places]), np.array([place.yaw for place in places])
+        )
         kinds, controls = ([getattr(place, name) for place in places] for name in ("kind", "control"))
-        return found | {"junction": np.array(kinds), "junction_control": np.array(controls)}
+        return columns | {"junction": np.array(kinds), "junction_control": np.array(controls)}
 
     def _match(self, position: Array, yaw: Array) -> NDArray[np.int64]:
-        """Return (F,) the lane that each place is on, -1 for none: the nearest, and rather one in its direction."""
+        """Return the lane (F,) of each place, -1 for none: the nearest, with a penalty for other directions."""
         points = np.asarray(shapely.points(position), dtype=object)
         at, lane = self._tree.query(points, predicate="dwithin", distance=LANE_M)
-        lines, own = self._lines[lane], points[at]
-        along = shapely.line_locate_point(lines, own)
+        lines, near = self._lines[lane], points[at]
+        along = shapely.line_locate_point(lines, near)
         ends = [shapely.line_interpolate_point(lines, np.clip(along + side, 0.0, None)) for side in (-1.0, 1.0)]
         step = shapely.get_coordinates(ends[1]) - shapely.get_coordinates(ends[0])
         turned = 1 - np.cos(np.arctan2(step[:, 1], step[:, 0]) - yaw[at])
-        cost = shapely.distance(lines, own) + TURNED * turned
+        cost = shapely.distance(lines, near) + TURNED * turned
         order = np.lexsort((cost, at))
         first = np.unique(at[order], return_index=True)[1]
-        found = np.full(len(position), -1)
-        found[at[order][first]] = lane[order][first]
-        return found
+        lanes = np.full(len(position), -1)
+        lanes[at[order][first]] = lane[order][first]
+        return lanes
 
     def _gradient(self, position: Array, yaw: Array) -> Array:
-        """Return (F,) the slope of the ground in the direction of travel, without sign [%]."""
+        """Return the magnitude (F,) of the ground's slope in the direction of travel [%]."""
         step = SLOPE_M * np.column_stack((np.cos(yaw), np.sin(yaw)))
         ahead, behind = (self.town.grounds(*(position + side * step).T) for side in (1, -1))
         return 100 * np.abs(ahead - behind) / (2 * SLOPE_M)
@@ -127,7 +132,7 @@ class Scenery:
         conflicts = count_conflicts(self.net)
         for kind, control, area in self._areas:
             middle = area.centroid
-            inside = [name for name, each in self.net.junctions.items() if area.covers(Point(each.centre))]
+            inside = [name for name, node in self.net.junctions.items() if area.covers(Point(node.centre))]
             leads = [
                 edge.lanes_of("driving")[0]
                 for edge in self.net.streets
@@ -152,7 +157,7 @@ class Scenery:
 
 
 def _name_roads(limit: Array) -> NDArray[np.str_]:
-    """Return (F,) the type of road by its speed limit [km/h]; "" beyond the largest: that may be a motorway."""
+    """Return the type of road (F,) by its speed limit (F,) [km/h]; "" above the largest, which may be a motorway."""
     out = np.full(len(limit), "", dtype="<U16")
     for most, name in ROADS:
         out[limit <= most] = name
@@ -160,7 +165,7 @@ def _name_roads(limit: Array) -> NDArray[np.str_]:
 
 
 def _junctions(net: RoadNet) -> Iterator[tuple[str, str, BaseGeometry]]:
-    """Yield kind, control and area of each junction of three arms or more; a roundabout is one, with its circle."""
+    """Yield kind, control and area of the junctions with three or more arms; a roundabout is one junction."""
     arms: dict[str, set[str]] = {}
     for edge in net.streets:
         arms.setdefault(edge.start, set()).add(edge.end)
@@ -185,7 +190,7 @@ def _outline(net: RoadNet, name: str) -> BaseGeometry:
 
 
 def count_conflicts(net: RoadNet) -> Counter[str]:
-    """Return the conflict points of vehicles at each junction: where paths diverge, merge and cross."""
+    """Return the number of conflict points of vehicles at each junction: where paths diverge, merge and cross."""
     driving = {lane.id: (edge, lane) for edge in net.edges.values() for lane in edge.lanes_of("driving")}
     ways: dict[str, list[LaneConnection]] = {}
     for way in net.connections:
@@ -194,20 +199,20 @@ def count_conflicts(net: RoadNet) -> Counter[str]:
             if edge.function == "normal":
                 ways.setdefault(edge.end, []).append(way)
     onward = {(way.start, way.end): way.via for way in net.connections}
-    found: Counter[str] = Counter()
-    for junction, own in ways.items():
-        for ends in (Counter(way.start for way in own), Counter(way.end for way in own)):
-            found[junction] += sum(count - 1 for count in ends.values())
-        paths = {way: _path(way, driving, onward) for way in own}
-        found[junction] += sum(
+    points: Counter[str] = Counter()
+    for junction, through in ways.items():
+        for ends in (Counter(way.start for way in through), Counter(way.end for way in through)):
+            points[junction] += sum(count - 1 for count in ends.values())
+        paths = {way: _path(way, driving, onward) for way in through}
+        points[junction] += sum(
             one.start != other.start and one.end != other.end and paths[one].crosses(paths[other])
-            for one, other in combinations(own, 2)
+            for one, other in combinations(through, 2)
         )
-    return found
+    return points
 
 
 def _path(way: LaneConnection, driving: dict[str, tuple], onward: dict[tuple[str, str], str]) -> LineString:
-    """Return the line through a junction, from the end of a lane to the start of another."""
+    """Return the path through a junction, from the end of a lane to the start of another."""
     points = [driving[way.start][1].shape[-1:]]
     via, seen = way.via, set[str]()
     while via in driving and via not in seen:
@@ -218,7 +223,7 @@ def _path(way: LaneConnection, driving: dict[str, tuple], onward: dict[tuple[str
 
 
 def _pose_along(line: LineString, along: float) -> tuple[float, float, float]:
-    """Return x, y [m] and direction [rad] at a distance along a line, within its ends."""
+    """Return x, y [m] and direction [rad] at a distance `along` a line [m], limited to its ends."""
     along = min(max(along, 0.0), line.length)
     here = line.interpolate(along)
     behind, ahead = line.interpolate(max(along - 1.0, 0.0)), line.interpolate(min(along + 1.0, line.length))

@@ -1,13 +1,13 @@
 """Adaptive search for failures by Thompson sampling: earlier results determine which scenarios and frames to test.
 
-A naive Bayes model has the rate of failures in each bucket of each axis of a frame's cell, of the corner case and of
-the town; a rate is drawn from its Beta posterior (Thompson sampling: Russo et al., "A tutorial on Thompson sampling",
-2018), so that what is little known is tried. Of a few Sobol points that scenario is taken whose cells without a failure
-so far promise most, and of its traffic those frames. The plain draws it is compared with have as many of both.
+A naive Bayes model estimates failure rates by bucket of a frame's cell, by corner case and by town. Rates are drawn
+from their Beta posteriors (Thompson sampling: Russo et al., "A tutorial on Thompson sampling", 2018), so that rarely
+tested buckets are explored. Of a few Sobol points, the scenario with the greatest expected yield in cells without a
+failure so far is tested, on the frames of its traffic with the greatest yield. The baselines test as many scenarios and
+frames.
 
-A failure is a missed object of many LiDAR returns in the vehicle's path (`cells.locate_failure`). Two are distinct
-where they are in different cells of a grid that is fixed before any search: by place, class, weather, road users
-around, distance and occlusion.
+A failure is a missed object with many LiDAR returns in the vehicle's path (`cells.locate_failure`). Two failures are
+distinct if they lie in different cells of a fixed grid of place, class, weather, traffic, distance and occlusion.
 """
 
 import hashlib
@@ -36,42 +36,42 @@ from flcav.storage.records import Record, from_json, to_json
 from flcav.world.trace import Trace
 from flcav.world.weather import Weather
 
-SCORE = 0.3  # from which a detection counts
-APART_M = 5.0  # between two tested frames of one vehicle
+SCORE = 0.3  # least score of detections
+APART_M = 5.0  # least distance between two tested frames of a vehicle
 GRID: Mapping[str, tuple[float, ...]] = {  # edges between the buckets of numbers
     "rainfall": (0.3, 5.0),  # [mm/h]
     "visibility": (400.0, 3000.0),  # [m]
-    "agents": (5.0, 15.0, 30.0),  # that are not parked, within `AROUND_M`
+    "agents": (5.0, 15.0, 30.0),  # number of road users not parked within `AROUND_M`
     "distance": (10.0, 20.0, 30.0),  # ahead [m]
     "occlusion": (1 / 3, 2 / 3),
 }
 CLASSES = tuple(dict.fromkeys(DETECTION_CLASS.values()))
-NOBODY = ""  # class of a candidate without anybody in the path
+NOBODY = ""  # class of a candidate with an empty path
 
-Cell = tuple[str, ...]  # kind of place, class, and the bucket of each number of `GRID`
+Cell = tuple[str, ...]  # kind of place, class, and the buckets of the numbers of `GRID`
 
 
 @dataclass(frozen=True)
 class CandidateFrame:
-    """A candidate frame of the search: a vehicle at a spin, and the road users in its path."""
+    """A candidate frame of the search: a vehicle at one spin of its LiDAR."""
 
     spin: int
     vehicle: int  # number of "cav0", ...
-    x: float  # of the vehicle [m]
-    y: float
-    cell: Cell  # without occlusion, of the nearest in the path; its class is `NOBODY` where there is none
-    away_m: float  # from the place of the sample
-    plays: bool  # whether the corner case plays
+    x: float  # of the vehicle, world frame [m]
+    y: float  # [m]
+    cell: Cell  # of the nearest road user in the path, without occlusion; class `NOBODY` where the path is empty
+    away_m: float  # distance to the place of the scenario
+    plays: bool  # whether the corner case is in progress
 
 
 @dataclass(frozen=True)
 class Failure(Record):
-    """One failure: a missed object in the path of a vehicle."""
+    """A failure: a missed object in the path of a vehicle."""
 
     frame: str  # key in the recording of the recipe
     cell: Cell
-    distance_m: float
-    returns: int
+    distance_m: float  # ahead of the vehicle
+    returns: int  # of the LiDAR on the object
 
 
 @dataclass(frozen=True)
@@ -88,26 +88,26 @@ def bucket(name: str, value: float) -> str:
 
 
 def weather_buckets(weather: Weather) -> tuple[str, str]:
-    """Return the buckets of rain and of sight."""
+    """Return the buckets of rain and visibility."""
     return bucket("rainfall", weather.rain_mm_h), bucket("visibility", weather.visibility_m)
 
 
 def list_candidates(sample: SampledScenario, trace: Trace, cavs: int, plays_s: float = 12.0) -> list[CandidateFrame]:
-    """Return the frames of connected vehicles in the traffic of a sample's recipe.
+    """Return the candidate frames of the connected vehicles in the traffic of a sample's recipe.
 
-    A corner case plays for `plays_s` from its beginning.
+    A corner case lasts `plays_s` [s].
     """
     names = trace.actor.tolist()
     rows = [names.index(f"cav{number}") for number in range(cavs)]
-    labels = np.array([DETECTION_CLASS.get(str(each), NOBODY) for each in trace.category])
+    labels = np.array([DETECTION_CLASS.get(str(category), NOBODY) for category in trace.category])
     driving = ~np.char.startswith(trace.actor, PARKED)
     begins_s = trace.events[0].begins_s if trace.events else np.inf
-    found = []
+    candidates = []
     for spin, time_s in enumerate(trace.time_s.tolist()):
         at = np.where(trace.present[spin, :, None], trace.position[spin, :, :2], np.inf)
         for vehicle, row in enumerate(rows):
-            own, yaw = at[row], float(trace.yaw[spin, row])
-            gap = np.where(np.isfinite(at), at - own, 1e6)
+            here, yaw = at[row], float(trace.yaw[spin, row])
+            gap = np.where(np.isfinite(at), at - here, 1e6)
             ahead = gap @ (np.cos(yaw), np.sin(yaw))
             aside = gap @ (-np.sin(yaw), np.cos(yaw))
             path = (ahead > 0) & (ahead <= PATH_AHEAD_M) & (np.abs(aside) <= PATH_ASIDE_M) & (labels != NOBODY)
@@ -121,20 +121,20 @@ def list_candidates(sample: SampledScenario, trace: Trace, cavs: int, plays_s: f
                 bucket("agents", count),
                 bucket("distance", float(ahead[nearest]) if path.any() else np.inf),
             )
-            away = float(np.hypot(own[0] - sample.place.x, own[1] - sample.place.y))
+            away = float(np.hypot(here[0] - sample.place.x, here[1] - sample.place.y))
             plays = begins_s <= time_s <= begins_s + plays_s
-            found.append(CandidateFrame(spin, vehicle, float(own[0]), float(own[1]), cell, away, plays))
-    return found
+            candidates.append(CandidateFrame(spin, vehicle, float(here[0]), float(here[1]), cell, away, plays))
+    return candidates
 
 
 def take_apart(ranked: Sequence[CandidateFrame], count: int) -> list[CandidateFrame]:
-    """Return the first `count` candidates, without those within `APART_M` of an earlier one of the same vehicle."""
+    """Return the first `count` candidates, skipping those within `APART_M` of an earlier one of the same vehicle."""
     taken: list[CandidateFrame] = []
-    for each in ranked:
+    for one in ranked:
         if all(
-            other.vehicle != each.vehicle or np.hypot(other.x - each.x, other.y - each.y) >= APART_M for other in taken
+            other.vehicle != one.vehicle or np.hypot(other.x - one.x, other.y - one.y) >= APART_M for other in taken
         ):
-            taken.append(each)
+            taken.append(one)
         if len(taken) == count:
             break
     return taken
@@ -143,17 +143,18 @@ def take_apart(ranked: Sequence[CandidateFrame], count: int) -> list[CandidateFr
 def try_frames(
     sample: SampledScenario, source: EmbeddedSource, trace: Trace, chosen: Sequence[CandidateFrame], network: Second
 ) -> list[TriedFrame]:
-    """Return the failures of a detector in chosen frames of a sample's recording, whose traffic is `trace`."""
-    scene, tested = source.scenes()[0], []
-    for each in chosen:
-        number = each.spin * len(source.agents) + each.vehicle
+    """Render chosen frames of a sample's recording with traffic `trace`, and return a detector's failures in them."""
+    scene = source.scenes()[0]
+    tested = []
+    for candidate in chosen:
+        number = candidate.spin * len(source.agents) + candidate.vehicle
         frame = next(source.replay(scene, trace, range(number, number + 1)))
-        found = detect_in(network, [frame], score_threshold=SCORE)
+        detections = detect_in(network, [frame], score_threshold=SCORE)
         marks = frame.annotations
         away = np.linalg.norm(marks.boxes.center[:, :2] - frame.world_from_agent[:2, 3], axis=1)
         agents = int((~np.char.startswith(marks.track, PARKED) & (away <= AROUND_M)).sum())
         failures = []
-        for error in next(find_errors([frame], found, network.config, SCORE)):
+        for error in next(find_errors([frame], detections, network.config, SCORE)):
             ahead = locate_failure(frame.world_from_agent, error)
             if ahead is None:
                 continue
@@ -161,16 +162,16 @@ def try_frames(
             buckets = (bucket(name, value) for name, value in numbers.items())
             cell = (sample.place.kind, error.label, *weather_buckets(sample.weather), *buckets)
             failures.append(Failure(frame.key, cell, ahead, error.returns))
-        tested.append(TriedFrame(each.cell, tuple(failures)))
+        tested.append(TriedFrame(candidate.cell, tuple(failures)))
     return tested
 
 
 RULES = ("sobol", "path", "failures")
-TESTED = "tested.jsonl"  # kept results beside recipes
-FRAMES = 4  # of a scenario that are tested
-POINTS = 8  # Sobol points of which one is taken
-PRIOR = 4.0  # tests that a bucket's rate is taken to be known by before the first
-FIRST_RATE = 0.2  # of failures, before the first test
+TESTED = "tested.jsonl"  # kept results, in the folder of the recipes
+FRAMES = 4  # number of tested frames per scenario
+POINTS = 8  # number of Sobol points to choose from
+PRIOR = 4.0  # weight of the prior of a bucket's rate, in tests
+FIRST_RATE = 0.2  # prior mean of the failure rate
 
 
 @dataclass(frozen=True)
@@ -194,14 +195,14 @@ class Searched(Record):
 
 @dataclass
 class FailureModel:
-    """A naive Bayes model of failures: their rates by bucket, and the cells in which one has been found."""
+    """A naive Bayes model of failures: counts by bucket, and the cells with failures."""
 
-    tests: Counter[str] = field(default_factory=Counter)  # by bucket
-    hits: Counter[str] = field(default_factory=Counter)
-    failed: Counter[Cell] = field(default_factory=Counter)  # by cell without occlusion
+    tests: Counter[str] = field(default_factory=Counter)  # tested frames by bucket
+    hits: Counter[str] = field(default_factory=Counter)  # failing frames by bucket
+    failed: Counter[Cell] = field(default_factory=Counter)  # failing frames by cell without occlusion
 
     def learn(self, sample: SampledScenario, tested: Sequence[TriedFrame]) -> None:
-        """Take the frames of a scenario into account."""
+        """Update the counts with the tested frames of a scenario."""
         for frame in tested:
             names = (*frame.cell, *_context(sample), "any")
             self.tests.update(names)
@@ -210,7 +211,7 @@ class FailureModel:
             self.failed.update({failure.cell[:-1] for failure in frame.failures})
 
     def draw_ratios(self, rng: np.random.Generator) -> Mapping[str, float]:
-        """Return a draw of each bucket's rate over the mean rate; of one not yet tested it is missing."""
+        """Draw failure rates from their posteriors, divided by the mean rate, by bucket; untested ones are missing."""
         mean = (self.hits["any"] + PRIOR * FIRST_RATE) / (self.tests["any"] + PRIOR)
         return {
             name: float(rng.beta(self.hits[name] + PRIOR * mean, count - self.hits[name] + PRIOR * (1 - mean))) / mean
@@ -218,7 +219,7 @@ class FailureModel:
         }
 
     def promise(self, names: Sequence[str], cell: Cell, ratios: Mapping[str, float]) -> float:
-        """Return the expected yield of a frame in a cell: the product of its ratios, less in a cell with a failure."""
+        """Return the expected yield of a frame: the product of its ratios, reduced in cells that already failed."""
         rate = float(np.prod([ratios.get(name, 1.0) for name in (*names, *cell)]))
         return rate / (1 + self.failed[cell]) ** 2
 
@@ -232,14 +233,17 @@ def search_failures(
     kept: Path | None = None,
     progress: Report = ignore_progress,
 ) -> list[Searched]:
-    """Return a number of scenarios of a space, with the failures of a detector in `FRAMES` frames of each.
+    """Test a detector in a number of scenarios of a space, `FRAMES` frames each, and return its failures.
 
-    rule: "failures" searches; "sobol" takes Sobol points as they come, and the frames nearest to the place while the
-    corner case plays; "path" takes frames of them at random, but with somebody in the path. Scenario n has seed + n.
-    With `kept`, a file of JSON lines, scenarios in it are not tested again.
+    The rule "failures" searches; "sobol" takes Sobol points in order, and the frames nearest to the place during the
+    corner case; "path" takes random frames of these points with road users in the path. Scenario n has seed + n. With
+    `kept`, a file of JSON lines, results in the file are used again. Raises `InputError` where hardly any Sobol point
+    is inside the domain.
     """
     model = FailureModel()
-    points, detector, kind = _realise(space, scenarios, seed), _hash_weights(network), tuple[TriedFrame, ...]
+    points = _realise(space, scenarios, seed)
+    detector = _hash_weights(network)
+    kind = tuple[TriedFrame, ...]
     known = {key: from_json(kind, held, str(kept)) for key, held in read_kept(kept, "tested").items()}
     done: list[Searched] = []
     for number in range(scenarios):
@@ -252,10 +256,9 @@ def search_failures(
             values = make_recipe(sample, space.sceneries[sample.place.town], seed + number)
             source = EmbeddedSource(parse_recipe(values, f"sample {number}"))
             trace = source.trace(source.scenes()[0])
-            every = list_candidates(sample, trace, source.recipe.cavs)
-            tested = tuple(
-                try_frames(sample, source, trace, choose_candidates(every, sample, model, rule, rng), network)
-            )
+            candidates = list_candidates(sample, trace, source.recipe.cavs)
+            chosen = choose_candidates(candidates, sample, model, rule, rng)
+            tested = tuple(try_frames(sample, source, trace, chosen, network))
             keep(kept, key, "tested", to_json(tested, kind))
         model.learn(sample, tested)
         done.append(Searched(sample, seed + number, tested))
@@ -264,14 +267,14 @@ def search_failures(
 
 
 def distinct(searched: Sequence[Searched]) -> set[Cell]:
-    """Return the cells with a failure: the distinct failures."""
-    return {failure.cell for each in searched for failure in each.failures}
+    """Return the distinct failures: the cells with a failure."""
+    return {failure.cell for scenario in searched for failure in scenario.failures}
 
 
 def choose_scenario(
     samples: Sequence[SampledScenario], model: FailureModel, rng: np.random.Generator
 ) -> SampledScenario:
-    """Return the sample whose cells promise most, by one draw of the rates."""
+    """Return the sample with the greatest expected yield over its cells, by one draw of the rates."""
     ratios = model.draw_ratios(rng)
     agents, distances = ([f"{name} {i}" for i in range(len(GRID[name]) + 1)] for name in ("agents", "distance"))
 
@@ -289,26 +292,26 @@ def choose_candidates(
     every: Sequence[CandidateFrame], sample: SampledScenario, model: FailureModel, rule: str, rng: np.random.Generator
 ) -> list[CandidateFrame]:
     """Return the frames of a scenario to test, by a rule of `RULES`."""
-    near = sorted(every, key=lambda each: (not each.plays, each.away_m))
+    near = sorted(every, key=lambda frame: (not frame.plays, frame.away_m))
     if rule == "sobol":
         return take_apart(near, FRAMES)
-    path = [each for each in near if each.cell[1] != NOBODY]
+    path = [frame for frame in near if frame.cell[1] != NOBODY]
     if rule == "path":
         order = rng.permutation(len(path)).tolist()
         return take_apart([path[i] for i in order] + near, FRAMES)
     ratios, names = model.draw_ratios(rng), _context(sample)
-    ranked = sorted(path, key=lambda each: -model.promise(names, each.cell, ratios))
-    firsts = {each.cell: each for each in reversed(ranked)}  # one of each cell first
-    return take_apart([*(each for each in ranked if firsts[each.cell] is each), *ranked, *near], FRAMES)
+    ranked = sorted(path, key=lambda frame: -model.promise(names, frame.cell, ratios))
+    firsts = {frame.cell: frame for frame in reversed(ranked)}  # different cells come first
+    return take_apart([*(frame for frame in ranked if firsts[frame.cell] is frame), *ranked, *near], FRAMES)
 
 
 def _context(sample: SampledScenario) -> tuple[str, ...]:
-    """Return the further features that a rate depends on, beside those of the cell."""
+    """Return the features of a scenario that failure rates depend on, in addition to the cell."""
     return f"case {sample.case}", f"town {sample.place.town}"
 
 
 def _realise(space: Space, scenarios: int, seed: int) -> Iterator[SampledScenario]:
-    """Yield the samples of Sobol points, those that the domain refuses left out; raises `InputError` if all are."""
+    """Yield the samples of Sobol points inside the domain; raises `InputError` after too many points outside."""
     refused = 0
     for point in draw_sample_points(space, scenarios, "sobol", seed):
         sample = space.realise(*point)

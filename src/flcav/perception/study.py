@@ -76,7 +76,7 @@ class Studied(Protocol):
 
 
 def read_recipe(name: str) -> RecipeFields:
-    """Return the YAML fields of one of the package's recipes without its `split`, since a study sets its own.
+    """Return the YAML fields of one of the package's recipes without its `split`, which a study sets.
 
     Raises `InputError` for an unknown name.
     """

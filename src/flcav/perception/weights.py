@@ -233,7 +233,7 @@ def find_shipped(task: Task, name: str = SHIPPED) -> Path:
 
 
 def find_weights(task: Task, named: Path | str | None) -> Path:
-    """Return the file of weights `named`; of None and of `PACKAGED` the task's own in the package (`find_shipped`)."""
+    """Return the file of weights `named`; for None and `PACKAGED`, the task's packaged weights (`find_shipped`)."""
     return find_shipped(task) if named is None or str(named) == PACKAGED else Path(named)
 
 

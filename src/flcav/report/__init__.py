@@ -1,1 +1,1 @@
-"""Figures and HTML pages of results."""
+"""Reports of results: figures, Markdown tables and HTML pages."""

@@ -1,4 +1,4 @@
-"""Cloud rounds over retrainings: weight divergence of the regions, and what their mean gains over stage II."""
+"""Cloud rounds over retrainings: weight divergence of the regions, and gains of cloud FL over edge FL."""
 
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -19,21 +19,22 @@ PERMUTATIONS = 50_000  # more than those of 8 trainings
 
 
 def cloud_tables(run: Run) -> dict[str, str]:
-    """Return Markdown by name: divergence and gain of each training of the run itself, and scores by statistics.
+    """Return Markdown tables by name: divergence and gain of each training, and scores by normalisation statistics.
 
-    Only what the run's stage III measured: older results have neither, and divergence needs retrainings.
+    They are of the main arm. A table is missing where stage III did not measure its values, as in older results;
+    divergence also needs retrainings.
     """
-    found: dict[str, str] = {}
-    kept = {task: own for task in run.recipe.tasks if (own := _trainings(run, task))}
-    if kept and run.recipe.retrainings and all(_span(stage) for own in kept.values() for stage in own):
-        found["divergence"] = "\n\n".join(_divergence(run, task, own) for task, own in kept.items())
-    if kept and all(stage.statistics for own in kept.values() for stage in own):
-        found["statistics"] = "\n\n".join(_statistics(task, own) for task, own in kept.items())
-    return found
+    tables: dict[str, str] = {}
+    trained = {task: stages for task in run.recipe.tasks if (stages := _trainings(run, task))}
+    if trained and run.recipe.retrainings and all(_span(stage) for stages in trained.values() for stage in stages):
+        tables["divergence"] = "\n\n".join(_divergence(run, task, stages) for task, stages in trained.items())
+    if trained and all(stage.statistics for stages in trained.values() for stage in stages):
+        tables["statistics"] = "\n\n".join(_statistics(task, stages) for task, stages in trained.items())
+    return tables
 
 
 def _trainings(run: Run, task: str) -> list[StageResult]:
-    """Return stage III of a task, of the run and of its retrainings; the run's first."""
+    """Return stage III of a task in the main run, followed by its retrainings."""
     main = run.arms[MAIN]
     return select((*main.stages, *(main.retrained or ())), stage=CLOUD, task=task)
 
@@ -43,48 +44,53 @@ def _span(stage: StageResult) -> RoundDivergence | None:
 
 
 def _divergence(run: Run, task: str, trainings: Sequence[StageResult]) -> str:
-    measured = [found for stage in trainings if (found := _span(stage)) is not None]
-    gains = {f"{region}: cloud - edge FL": own for region, own in _gains(run, task).items()}
+    measured = [span for stage in trainings if (span := _span(stage)) is not None]
+    gains = {f"{region}: cloud - edge FL": values for region, values in _gains(run, task).items()}
     return format_divergence([f"{task}, training {i + 1}" for i in range(len(trainings))], measured, gains)
 
 
 def span_divergence(records: Iterable[FederatedRound]) -> RoundDivergence | None:
-    """Return the divergence that the first cloud round begins with, and that of what the last one averages.
+    """Return the divergence at the start of the first cloud round and that before averaging in the last one.
 
-    None where there was no cloud round of several regions among `records`.
+    None where `records` have no cloud round of several regions.
     """
-    rounds = [each.divergence for each in records if each.divergence is not None]
+    rounds = [record.divergence for record in records if record.divergence is not None]
     return RoundDivergence(rounds[0].begun, rounds[-1].trained) if rounds else None
 
 
 def _gains(run: Run, task: str) -> Mapping[str, Sequence[float]]:
     """Return edge + cloud FL minus edge FL in each federating region, in each training."""
     compared = select(run.differences, arm=MAIN, stage=CLOUD, before_arm=MAIN, before_stage=EDGE, task=task)
-    return {each.region: (each.over_scenes.mean, *each.retrained) for each in compared}
+    return {difference.region: (difference.over_scenes.mean, *difference.retrained) for difference in compared}
 
 
 def format_divergence(
     names: Sequence[str], measured: Sequence[RoundDivergence], gains: Mapping[str, Sequence[float]]
 ) -> str:
-    """Return a row per training, the means, and each column's rank correlation (Spearman's rho) with the mean gain.
+    """Return a table with a row per training, the means, and Spearman's rank correlations with the mean gain.
 
-    names: of the trainings. gains: of each training, by the name of the comparison.
+    `names` are those of the trainings; `gains` has one value per training, by the name of the comparison.
     """
     columns: dict[str, list[float]] = {}
-    for when, own in (("after edge FL", "begun"), ("before averaging", "trained")):
+    for when, moment in (("after edge FL", "begun"), ("before averaging", "trained")):
         for part in PARTS:
-            values = [getattr(getattr(each, own), part) for each in measured]
+            values = [getattr(getattr(divergence, moment), part) for divergence in measured]
             if None not in values:
                 columns[f"{part}, {when}"] = values
     gain = np.mean([*gains.values()], axis=0)
     shown = {**gains, "mean gain": gain} if len(gains) > 1 else gains
     rows = [
-        [name, *(f"{own[number]:.4f}" for own in columns.values()), *(f"{own[number]:+.3f}" for own in shown.values())]
+        [
+            name,
+            *(f"{column[number]:.4f}" for column in columns.values()),
+            *(f"{column[number]:+.3f}" for column in shown.values()),
+        ]
         for number, name in enumerate(names)
     ]
-    means = [f"{np.mean(own):.4f}" for own in columns.values()]
-    rows.append(["mean", *means, *(f"{np.mean(own):+.3f}" for own in shown.values())])
-    rows.append([CORRELATION, *(describe_correlation(own, gain) for own in columns.values()), *("" for _ in shown)])
+    means = [f"{np.mean(column):.4f}" for column in columns.values()]
+    rows.append(["mean", *means, *(f"{np.mean(column):+.3f}" for column in shown.values())])
+    correlations = (describe_correlation(column, gain) for column in columns.values())
+    rows.append([CORRELATION, *correlations, *("" for _ in shown)])
     return format_table(("", *columns, *shown), rows)
 
 
@@ -96,6 +102,7 @@ def describe_correlation(values: Sequence[float], gain: Sequence[float]) -> str:
     if len(values) < 3 or len({*values}) == 1 or len({*gain}) == 1:
         return ""
     ranks, of_gain = rankdata(values), rankdata(gain)
+    # Under permutation, rho is a monotone function of this inner product of ranks.
     centred = of_gain - of_gain.mean()
     drawn = permutation_test(
         (ranks,),
@@ -108,14 +115,16 @@ def describe_correlation(values: Sequence[float], gain: Sequence[float]) -> str:
 
 
 def _statistics(task: str, trainings: Sequence[StageResult]) -> str:
-    """Return a row per region: scores with averaged and with own statistics, and the mean of the paired differences."""
-    rows, regions = [], [each.region for each in trainings[0].statistics or ()]
+    """Return a row per region: scores with averaged and with local statistics, and the mean paired difference."""
+    rows = []
+    regions = [scores.region for scores in trainings[0].statistics or ()]
     for place, region in enumerate(regions):
         scores = [stage.statistics[place] for stage in trainings if stage.statistics]
-        averaged, own = (np.array([getattr(each, kind) for each in scores]) for kind in ("averaged", "own"))
-        gained = own - averaged
+        averaged = np.array([score.averaged for score in scores])
+        local = np.array([score.own for score in scores])
+        gained = local - averaged
         spread = f", sd {np.std(gained, ddof=1):.3f}" if len(gained) > 1 else ""
-        means = (f"{averaged.mean():.3f}", f"{own.mean():.3f}", f"{gained.mean():+.3f}{spread}")
+        means = (f"{averaged.mean():.3f}", f"{local.mean():.3f}", f"{gained.mean():+.3f}{spread}")
         rows.append([f"{region}, {task}", len(scores), scores[0].frames, *means])
     header = (
         "region, task",

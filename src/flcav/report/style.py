@@ -1,6 +1,6 @@
 """Style of all figures: greys for context, the colour-blind safe palette of Okabe and Ito (2008) for data.
 
-Figures are drawn at the size they are shown at, so that their smallest text has 9 pt or more.
+Figures are drawn at the size of display, so that their smallest text is at least 9 pt.
 """
 
 import io
@@ -106,7 +106,7 @@ def interval(axes: Axes, x: float, estimate: Estimate, **look: Any) -> None:
 
 
 def keep_apart(heights: Sequence[float], gap: float, top: float) -> list[float]:
-    """Return heights of labels for lines that end at `heights`: there or lower, `gap` from each other and `top`."""
+    """Return heights of labels for lines that end at `heights`: there or lower, `gap` apart and below `top`."""
     places: dict[int, float] = {}
     above = top
     for i in sorted(range(len(heights)), key=lambda i: -heights[i]):

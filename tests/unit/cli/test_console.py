@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from flcav.cli.federate import _describe, _telling
+from flcav.cli.federate import _describe, _print_rounds
 from flcav.cli.main import run
 from flcav.cli.steps import live_steps
 from flcav.runs.results.training import FederatedRound, StageResult
@@ -49,8 +49,8 @@ def test_what_a_round_cost_in_privacy_and_who_failed_stays_on_the_terminal(capsy
 def test_stage_two_alone_tells_a_round_once_with_who_failed(capsys: pytest.CaptureFixture[str]):
     note = "loss 0.460, failed or lost: grid/cav1 (no power)"
     with live_steps("federate") as notify:
-        _telling(notify)("grid-federate-weather", 3, 6, note)
-        _telling(notify)("pretrain-weather", 1, 1, "done")
+        _print_rounds(notify)("grid-federate-weather", 3, 6, note)
+        _print_rounds(notify)("pretrain-weather", 1, 1, "done")
     told = capsys.readouterr()
     assert told.out == f"grid-federate-weather, round 3 of 6: {note}\n"
     assert told.err == "federate: pretrain-weather done\n"

@@ -62,7 +62,7 @@ class Calls:
 
     @property
     def managed(self) -> bool:
-        """Whether a client's Traffic Manager is running."""
+        """Whether a client has registered a Traffic Manager."""
         return bool(self._managers)
 
     # ---- connection

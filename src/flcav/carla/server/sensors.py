@@ -235,12 +235,12 @@ def _pack_returns(sensor: Sensor, channels: int, rays: NDArray[np.int64], points
 
 
 class Kind(NamedTuple):
-    """How a kind of sensor measures."""
+    """The implementation of a kind of sensor."""
 
-    stream: Stream
-    measure: Callable[[TownSight, Sensor], bytes] | None  # None: it sends events, not measurements
-    rays: bool = False  # it casts rays, which takes some time
-    late: bool = False  # it renders an image, which takes longer
+    stream: Stream  # of its messages
+    measure: Callable[[TownSight, Sensor], bytes] | None  # returns the payload; None for sensors that send events
+    rays: bool = False  # whether it casts rays, which takes some time
+    late: bool = False  # whether it renders an image, which takes longer: sent after the world state
 
 
 KINDS: dict[str, Kind] = {

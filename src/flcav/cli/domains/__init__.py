@@ -1,1 +1,1 @@
-"""Commands about operational design domains, and about drives in them."""
+"""Commands of `flcav odd`, about operational design domains and drives within them."""

@@ -1,4 +1,4 @@
-"""`flcav odd importance`: what driving loses without a task of perception."""
+"""`flcav odd importance`: the driving score that is lost without a perception task."""
 
 from enum import StrEnum
 from pathlib import Path
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from flcav.config import Json
 
-LEAST = 1e-3  # a weight is above 0
+LEAST = 1e-3  # least weight, since weights have to be above 0
 
 
 class Perceives(StrEnum):
@@ -96,14 +96,14 @@ def importance(
 
         from flcav.storage.files import write_bytes
 
-        weights = {each.task: max(each.weight, LEAST) for each in found.tasks[coupling or CouplingName.bare]}
+        weights = {task.task: max(task.weight, LEAST) for task in found.tasks[coupling or CouplingName.bare]}
         write_bytes(out, yaml.safe_dump(set_weights(document, weights, str(weigh)), sort_keys=False).encode())
     yield found.as_json()
     yield "\n".join(found.lines())
 
 
 def read_model(perception: Perceives, errors: Path | None):
-    """Return the error model of a modelled perception, None for another; raises `InputError` for a bad file."""
+    """Return the error model of modelled perception, None for others; raises `InputError` for a file that is none."""
     from flcav.config import InputError
     from flcav.driving.errors import load_error_model
 
@@ -115,9 +115,9 @@ def read_model(perception: Perceives, errors: Path | None):
 
 
 def set_weights(document: object, weights: "Mapping[str, float]", origin: str) -> "Json":
-    """Return an allocation problem or a run recipe whose tasks have these weights; others keep theirs.
+    """Return an allocation problem or run recipe with the weights of its tasks replaced; tasks not given keep theirs.
 
-    Raises `InputError` where it has no tasks in either form.
+    Raises `InputError` where the document has no tasks in either form.
     """
     from flcav.config import InputError
 
@@ -125,8 +125,8 @@ def set_weights(document: object, weights: "Mapping[str, float]", origin: str) -
     if not isinstance(document, dict) or not isinstance(tasks, list | dict) or not tasks:
         raise InputError(f"{origin}: has no tasks; --weigh takes an allocation problem or a run recipe")
     if isinstance(tasks, dict):
-        own = {name: {**(task or {}), **_weight(weights, str(name))} for name, task in tasks.items()}
-        return {**document, "tasks": own}
+        weighted = {name: {**(task or {}), **_weight(weights, str(name))} for name, task in tasks.items()}
+        return {**document, "tasks": weighted}
     if not all(isinstance(task, dict) and "name" in task for task in tasks):
         raise InputError(f"{origin}: a task has no name")
     return {**document, "tasks": [{**task, **_weight(weights, str(task["name"]))} for task in tasks]}

@@ -1,4 +1,4 @@
-"""`flcav odd`: operational design domains, what of them recordings cover, and recipes for what they do not."""
+"""`flcav odd`: operational design domains, their coverage by recordings, and tasks for the scenarios of recordings."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -147,8 +147,8 @@ def inside(
         agreement = compare_verdicts(truth.verdict.tolist(), seen.verdict.tolist())
     if frames is not None:
         write_verdicts(recorded, truth, seen, frames)
-    told = None if agreement is None else agreement.as_json()
-    yield {"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": told}
+    compared = None if agreement is None else agreement.as_json()
+    yield {"domain": found.name, **truth.as_json(), "frames_per_s": rate, "perceived": compared}
     yield f"{found.name}: {truth.sentence}, by ground truth ({rate:,.0f} a second)"
     for module, count in truth.failed.items():
         yield f"    {module} puts {plural(count, 'frame')} outside"
@@ -248,18 +248,19 @@ def tasks(
         table = read_input_table(errors, ("x", "y", "scene"), ("scene",))
         places = numbers(table, ("x", "y"), errors).tolist()
         found = [(str(scene), *place) for scene, place in zip(table["scene"].to_pylist(), places, strict=True)]
-    scenarios = [each for folder in data for each in generate_tasks(folder, found)]
+    scenarios = [scenario for folder in data for scenario in generate_tasks(folder, found)]
     towns = {name_region(town): town for town in map(town_of, data)}
     recipe = make_run(scenarios, towns, pretrain, wireless, wireline)
     write_bytes(out, yaml.safe_dump(recipe, sort_keys=False).encode())
-    rows = [each.as_json() | {"total": each.complexity.total} for each in scenarios]
+    rows = [scenario.as_json() | {"total": scenario.complexity.total} for scenario in scenarios]
     yield {"scenarios": rows, "recipe": recipe}
-    for each in scenarios:
-        parts = ", ".join(f"{name} {value:.2f}" for name, value in each.complexity.as_json().items())
-        named = ", ".join(task.task for task in each.tasks)
-        yield f"{each.town}, {each.kind}: complexity {each.complexity.total:.2f} ({parts})"
-        yield f"    {plural(len(each.tasks), 'task')}: {named}"
-    yield f"{out}: run recipe of {plural(len({task.task for each in scenarios for task in each.tasks}), 'task')}"
+    for scenario in scenarios:
+        parts = ", ".join(f"{name} {value:.2f}" for name, value in scenario.complexity.as_json().items())
+        named = ", ".join(task.task for task in scenario.tasks)
+        yield f"{scenario.town}, {scenario.kind}: complexity {scenario.complexity.total:.2f} ({parts})"
+        yield f"    {plural(len(scenario.tasks), 'task')}: {named}"
+    distinct = {task.task for scenario in scenarios for task in scenario.tasks}
+    yield f"{out}: run recipe of {plural(len(distinct), 'task')}"
 
 
 def _describe_cell(row: "CellErrors") -> str:

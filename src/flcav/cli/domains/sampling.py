@@ -116,7 +116,7 @@ def sample(
 
 
 def _search(space: "Space", weights: Path | None, count: int, seed: int, out: Path) -> "Sequence[Searched]":
-    """Return the scenarios of a search for failures; their results are kept in the folder of the recipes."""
+    """Search for failures and return the tested scenarios; results are kept in the folder of the recipes."""
     from flcav.config import InputError
     from flcav.interface import progress
     from flcav.odd.searching import TESTED, search_failures

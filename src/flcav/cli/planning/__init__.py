@@ -1,1 +1,1 @@
-"""Commands about plans: fit learning curves, allocate budgets, place sensors."""
+"""Commands for planning: learning histories and curves, allocation of budgets, placement of sensors."""

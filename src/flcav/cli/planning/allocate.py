@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from flcav.optimization.allocation.vehicles import Shares
     from flcav.optimization.problem import Problem
 
-SHOWN = "#.2g"  # predictions: trainings on the same frames differ in the second digit
+SHOWN = "#.2g"  # format of predictions: repeated trainings on the same frames differ in the second digit
 
 
 class BaselineName(StrEnum):
@@ -104,44 +104,45 @@ def _plan(
     from flcav.sources.recipe import find_recipe
 
     problem = find_recipe(problem)
-    asked, told = load_problem(problem), ()
+    loaded = load_problem(problem)
+    notes = ()
     if throughput is not None:
         from flcav.network.radio.measured import load_throughput
         from flcav.optimization.allocation.uploads import measure_links
 
         measured = load_throughput(throughput)
-        asked = measure_links(asked, measured)
+        loaded = measure_links(loaded, measured)
         means = ", ".join(f"{name} {measured.mean_mbps(name):.3g}" for name in measured.rates["wireless"])
-        told = (*measured.taken, f"{throughput}: mean wireless Mbit/s: {means}")
+        notes = (*measured.taken, f"{throughput}: mean wireless Mbit/s: {means}")
     if progress is not None:
-        asked = condition_problem(asked, read_config(PlanState, progress))
+        loaded = condition_problem(loaded, read_config(PlanState, progress))
     try:
-        plan, shares = allocate_fleet(asked)
+        plan, shares = allocate_fleet(loaded)
     except Infeasible as error:
         yield {"status": "infeasible", "message": str(error)}
         raise
-    more = compute_savings(asked, plan)
+    more = compute_savings(loaded, plan)
     if out is not None:
         from flcav.optimization.allocation.comparison import compare_plan
         from flcav.report.pages.plan_page import plan_page
         from flcav.storage.files import write_bytes
 
-        page = plan_page(compare_plan(asked, plan, shares, more), read_graph(problem))
+        page = plan_page(compare_plan(loaded, plan, shares, more), read_graph(problem))
         write_bytes(out, page.encode())
-    beside = None if baseline is None else compared(asked, baseline.value)
-    verified = verify_allocation(asked.model_dump_json(), json.dumps(_plain(plan))) if verify else None
-    beside_it = {} if beside is None else {"baseline": _plain(beside)}
-    beside_it |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
-    yield _as_json(plan, shares, more) | beside_it
+    simpler = None if baseline is None else compared(loaded, baseline.value)
+    verified = verify_allocation(loaded.model_dump_json(), json.dumps(_plain(plan))) if verify else None
+    extra = {} if simpler is None else {"baseline": _plain(simpler)}
+    extra |= {} if verified is None else {"verification": dataclasses.asdict(verified)}
+    yield _as_json(plan, shares, more) | extra
     yield _table(plan)
     if any(task.accuracy_low is not None for task in plan.tasks):
         yield Text("In brackets: the band of the predicted accuracy.")
-    yield from map(Text, (*_describe(asked, plan, more), *told))
+    yield from map(Text, (*_describe(loaded, plan, more), *notes))
     if shares:
         yield _table_vehicles(shares)
-    if beside is not None:
-        yield _table(beside)
-        yield Text(_describe_baseline(beside, plan))
+    if simpler is not None:
+        yield _table(simpler)
+        yield Text(_describe_baseline(simpler, plan))
     if verified is not None:
         yield from map(Text, verified.lines())
     if verified is not None and verified.faults:
@@ -149,7 +150,7 @@ def _plan(
 
 
 def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> dict[str, Any]:
-    values = _plain(plan) | {"savings": [dataclasses.asdict(each) for each in more]}
+    values = _plain(plan) | {"savings": [dataclasses.asdict(saving) for saving in more]}
     for task in values["tasks"]:
         if task["name"] in shares:
             task["vehicles"] = [dataclasses.asdict(share) for share in shares[task["name"]]]
@@ -157,7 +158,7 @@ def _as_json(plan: "Allocation", shares: "Shares", more: "Sequence[Saving]") -> 
 
 
 def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
-    """Return the plan as a JSON value: links by name, without empty optional fields."""
+    """Return a plan as a JSON object, with links by name and without empty optional fields."""
     values = dataclasses.asdict(plan)
     for task in values["tasks"]:
         for name in ("accuracy_low", "accuracy_high"):
@@ -187,12 +188,13 @@ def _describe(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") 
     yield (f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")
     verb = "adds" if problem.objective == "area" else "saves"
     for link in ("wireless", "wireline"):
-        used, budget = getattr(plan.used_mb, f"{link}_mb"), getattr(problem.budgets_mb, link)
+        used = getattr(plan.used_mb, f"{link}_mb")
+        budget = getattr(problem.budgets_mb, link)
         yield (f"{link}: {used:.1f} of {budget:.6g} MB")
-        for each in (each for each in more if each.link == link):
-            saved = f"{each.saved:{SHOWN}}" if each.saved else "nothing"
-            budget = f"{each.added:.0%} more ({each.added_mb:.6g} MB)"
-            yield (f"  {budget}, solved anew: {verb} {saved} ({_proven(each.gap)})")
+        for saving in (saving for saving in more if saving.link == link):
+            saved = f"{saving.saved:{SHOWN}}" if saving.saved else "nothing"
+            larger = f"{saving.added:.0%} more ({saving.added_mb:.6g} MB)"
+            yield (f"  {larger}, solved anew: {verb} {saved} ({_proven(saving.gap)})")
     if plan.busy_s is not None:
         yield (f"time: {plan.busy_s:.1f} of {problem.horizon_s:.6g} s on the busiest vehicle")
     yield from filter(None, (plan.note, *plan.warnings))
@@ -202,11 +204,11 @@ def _proven(gap: float | None) -> str:
     return "no certificate" if gap is None else f"proven within {gap:.2%}"
 
 
-def _describe_baseline(beside: "Baseline", plan: "Allocation") -> str:
-    note = f" ({beside.note})" if beside.note else ""
-    one, other = f"{beside.objective:{SHOWN}}", f"{plan.objective:{SHOWN}}"
-    apart = f", {abs(plan.objective - beside.objective):{SHOWN}} apart" if one == other else ""
-    return f"{beside.name}: {one}{note}; the plan above: {other}{apart}"
+def _describe_baseline(simpler: "Baseline", plan: "Allocation") -> str:
+    note = f" ({simpler.note})" if simpler.note else ""
+    one, other = f"{simpler.objective:{SHOWN}}", f"{plan.objective:{SHOWN}}"
+    apart = f", {abs(plan.objective - simpler.objective):{SHOWN}} apart" if one == other else ""
+    return f"{simpler.name}: {one}{note}; the plan above: {other}{apart}"
 
 
 def _table(plan: "Allocation | Baseline") -> "Table":
@@ -226,8 +228,8 @@ def _table_vehicles(shares: "Shares") -> "Table":
     from rich.table import Table
 
     table = Table("task", "vehicle", "samples", "rounds joined", "wireless MB", "busy s")
-    for task, own in shares.items():
-        for share in own:
+    for task, of_task in shares.items():
+        for share in of_task:
             cells = (str(share.samples), str(len(share.rounds)), f"{share.wireless_mb:.1f}", f"{share.busy_s:.1f}")
             table.add_row(task, share.vehicle, *cells)
     return table

@@ -31,7 +31,7 @@ class CurveForm(StrEnum):
     best = "best"
 
 
-ROUNDS = {  # by model: the letters of its formula
+ROUNDS = {  # letters in the formula of each model
     "additive": "y edge, z cloud rounds",
     "effective": "t rounds",
     "federated": "t rounds, z cloud rounds",
@@ -94,38 +94,38 @@ def fit(
     if model is CurveForm.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")
 
-    asked = [_counts(text) for text in at]
+    points_at = [_counts(text) for text in at]
     held, unnamed = _held(problem, history.stem)
-    answers, shown, found_of = [], [], {}
+    answers, fits, found_of = [], [], {}
 
     def fit_curve(points: "History") -> "CurveFit":
         return fitting.fit(points, model=model.value, group_samples=group_samples, k=k, alpha=alpha, beta=beta)
 
     for task, points in parse_histories(read_input_table(history, ()).to_pydict(), str(history), unnamed).items():
         try:
-            found = fit_curve(points)
+            fitted = fit_curve(points)
             checked = hold_out_runs(points, fit_curve, k) if held_out else None
         except InputError as error:
             raise InputError(f"{history}: task {task!r}: {error}") from None
-        band = bootstrap_bands(found, level=level, repeats=repeats, seed=seed, k=k)
-        upper = None if band is None else fit_upper_curve(found, band)
-        own = _answer(task, found, band, upper, points, asked, k)
-        answers.append(own if checked is None else own | {"held_out": dataclasses.asdict(checked)})
-        shown.append(found)
-        lower = None if band is None else fit_lower_curve(found, band)
-        found_of[task] = collect_fitted_fields(found, points.resources, upper, lower)
+        band = bootstrap_bands(fitted, level=level, repeats=repeats, seed=seed, k=k)
+        upper = None if band is None else fit_upper_curve(fitted, band)
+        answer = _answer(task, fitted, band, upper, points, points_at, k)
+        answers.append(answer if checked is None else answer | {"held_out": dataclasses.asdict(checked)})
+        fits.append(fitted)
+        lower = None if band is None else fit_lower_curve(fitted, band)
+        found_of[task] = collect_fitted_fields(fitted, points.resources, upper, lower)
     if problem is not None:
         _write(problem, held, found_of, k, history.name)
     yield {"curves": answers}
-    yield from _list_lines(answers, shown)
+    yield from _list_lines(answers, fits)
     if problem is not None:
         yield _next(problem, list(found_of))
 
 
 def _held(problem: Path | None, stem: str) -> tuple[str | None, str]:
-    """Return the text of the problem, if there is one, and the task of a history that does not name any.
+    """Return the text of the problem file, if it exists, and the task of a history that does not name one.
 
-    That is the only task of the problem, or the name `stem` of the history's file.
+    The task is the only one of the problem, or otherwise the name `stem` of the history's file.
     """
     from flcav.config import InputError, read_yaml
     from flcav.optimization.allocation.problem_file import read_task_names
@@ -149,16 +149,16 @@ def _write(problem: Path, held: str | None, found: "Mapping[str, FittedFields]",
 
 
 def _next(problem: Path, tasks: list[str]) -> str:
-    """Return the message about what was written, and whether `flcav allocate` takes it."""
+    """Return the message about the written problem, and whether `flcav allocate` accepts it."""
     from flcav.config import InputError
     from flcav.optimization.graph import load_problem
 
-    told = f"{problem}: now has the curve{'s' if len(tasks) > 1 else ''} of {', '.join(tasks)}"
+    message = f"{problem}: now has the curve{'s' if len(tasks) > 1 else ''} of {', '.join(tasks)}"
     try:
         load_problem(problem)
     except InputError as error:
-        return f"{told}; not yet what `flcav allocate` takes: {str(error).removeprefix(f'{problem}: ')}"
-    return f"{told}; next: flcav allocate {problem}"
+        return f"{message}; not yet what `flcav allocate` takes: {str(error).removeprefix(f'{problem}: ')}"
+    return f"{message}; next: flcav allocate {problem}"
 
 
 def _counts(text: str) -> list[float]:
@@ -182,7 +182,7 @@ def _answer(
     asked: list[list[float]],
     k: int,
 ) -> dict[str, Any]:
-    """Return a curve, its bands and the predictions asked for as a JSON object."""
+    """Return a curve with its bands and the predictions at the counts `asked` as a JSON object."""
     import numpy as np
 
     from flcav.optimization.curves.bands import METHOD, tabulate_bands
@@ -228,7 +228,7 @@ def _list_lines(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> Iterat
             yield Text(f"{answer['task']}: error {row['error']:.4f} at {counts}{between}")
         if "held_out" in answer:
             checked = answer["held_out"]
-            told = (
+            lines = (
                 f"{plural(checked['runs'], 'run')} held out, {plural(checked['points'], 'point')}: "
                 f"mean error of the prediction "
                 f"{checked['mean_error']:.4f}, rank correlation {checked['rank_correlation']:.3f}",
@@ -236,18 +236,18 @@ def _list_lines(answers: list[dict[str, Any]], fits: list["CurveFit"]) -> Iterat
                 f" deviations): the true curve would reach a rank correlation of {checked['attainable']:.3f}",
             )
             if (least := checked["attainable_error"]) is not None:
-                told += (
+                lines += (
                     "seeds differ by so much at the same samples and rounds that the true curve would be off by "
                     f"{least:.4f}",
                 )
             if new := checked["new_seeds"]:
-                told += (
+                lines += (
                     f"seeds held out whole, {plural(new['points'], 'point')} after pretraining: mean error "
                     f"{new['mean_error']:.4f}, rank correlation {new['rank_correlation']:.3f} before the run; scaled to"
                     f" what its run reached by pretraining {new['mean_error_pretrained']:.4f} and "
                     f"{new['rank_correlation_pretrained']:.3f}",
                 )
-            for line in told:
+            for line in lines:
                 yield Text(f"{answer['task']}: {line}")
         for warning in answer["warnings"]:
             yield Text(f"{answer['task']}: {warning}")

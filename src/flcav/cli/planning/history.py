@@ -43,18 +43,18 @@ def history(
     counts = _parse_counts(samples)
     check_writable(out)
     found = find_recipe(recipe)
-    asked = load_run_recipe(found)
-    recipes = history_recipes(asked, task, counts, edge_rounds, cloud_rounds, range(first_seed, first_seed + seeds))
+    loaded = load_run_recipe(found)
+    recipes = history_recipes(loaded, task, counts, edge_rounds, cloud_rounds, range(first_seed, first_seed + seeds))
     with live_steps("history") as notify:
         runs = run_several(
             recipes, out, beside=found.parent, jobs=jobs, notify=notify, stale=stale.value, engine=engine.value
         )
-    save_origin(asked, task, runs, out)
+    save_origin(loaded, task, runs, out)
     echo(f"{out / HISTORY}: {plural(len(runs), 'run')}; next: flcav fit {out / HISTORY}")
 
 
 def _parse_counts(text: str) -> tuple[int, ...]:
-    """Return the whole numbers of a list with commas; raises `InputError` for other text."""
+    """Return the whole numbers in a comma-separated list, sorted; raises `InputError` for other text."""
     try:
         counts = tuple(sorted({int(part) for part in text.split(",")}))
     except ValueError:

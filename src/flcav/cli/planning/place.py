@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from flcav.world.trace import Trace
 
 MAP_IN = 6.4  # width of the map [inch]
-LISTED = 20  # candidates: of more than these only those that are placed are listed
+LISTED = 20  # number of candidates above which only the chosen ones are listed
 
 
 @answer_json
@@ -121,7 +121,7 @@ def place(
     steps: list[solve.Placement] = []
     if count is not None:
         fewer = range(1, count) if curve else ()
-        steps = [solve.place_count(candidates, each, method=method.value) for each in fewer]
+        steps = [solve.place_count(candidates, number, method=method.value) for number in fewer]
         result = solve.place_count(candidates, count, method=method.value)
     elif budget is not None:
         result = solve.place_budget(candidates, budget, method=method.value)
@@ -150,17 +150,17 @@ def place(
         "cost_lower_bound": least,
         "marginal_gain": result.marginal_gain,
         "certificate": None if result.certificate is None else asdict(result.certificate),
-        **({"curve": _tell_curve(given, [*steps, result])} if curve else {}),
+        **({"curve": _curve_as_json(given, [*steps, result])} if curve else {}),
         **(
             {}
             if here is None
-            else {"sites": [asdict(each) for each in locate_sites(here, given.poles[list(result.chosen)])]}
+            else {"sites": [asdict(site) for site in locate_sites(here, given.poles[list(result.chosen)])]}
         ),
         **({"notes": [*given.notes]} if given.notes else {}),
         **({} if hidden is None else {"hidden": hidden.as_json()}),
         **({} if verified is None else {"verification": asdict(verified)}),
         "baselines": {
-            **{name: _tell(given, placed) for name, placed in conventional.items()},
+            **{name: None if placed is None else _describe(given, placed) for name, placed in conventional.items()},
             "random": {"covered": random.covered, "covered_weight": random.covered_weight},
         },
     }
@@ -184,11 +184,11 @@ def _list_lines(
     least: float | None,
     town: "Town | None",
 ) -> Iterator[str]:
-    """Yield the placement in words; `near` are the numbers of errors within range of each candidate."""
+    """Yield the placement in words; `near` has the number of errors within range of each candidate."""
     from flcav.world.sites import locate_sites
 
     cost, by_range = given.cost_of(result), given.names == (None,)
-    chosen = [f"{each['pole']}" + ("" if by_range else f" ({each['sensor']})") for each in _name(given, result)]
+    chosen = [f"{pair['pole']}" + ("" if by_range else f" ({pair['sensor']})") for pair in _name(given, result)]
     yield (f"poles {', '.join(chosen)}")
     places = [] if town is None else [f" at {site}" for site in locate_sites(town, given.poles[list(result.chosen)])]
     at = dict(zip(result.chosen, places))
@@ -197,21 +197,21 @@ def _list_lines(
         placed = f", placed{at.get(number, '')}" if number in result.chosen else ""
         yield f"    pole {given.ids[number]}: {plural(near[number], given.noun)} within {given.ranges_m[0]:g} m{placed}"
     if by_range and len(listed) < len(near):
-        most = max((each for number, each in enumerate(near) if number not in result.chosen), default=0)
+        most = max((errors for number, errors in enumerate(near) if number not in result.chosen), default=0)
         yield f"    {plural(len(near) - len(listed), 'other candidate')}: at most {plural(most, given.noun)}"
     yield from () if by_range else (f"    pole {pole}{place}" for pole, place in zip(chosen, places))
     proof = "optimal" if result.optimal else f"at most {result.upper_bound:.10g} can be covered"
     if least is not None and not result.optimal:
         proof = f"at least {least:.10g} has to be spent for that"
-    told = "" if cost is None else f", cost {cost:.10g}"
-    yield (f"cover {given.count(result.covered)}, weight {result.covered_weight:.10g}{told} ({proof})")
+    priced = "" if cost is None else f", cost {cost:.10g}"
+    yield (f"cover {given.count(result.covered)}, weight {result.covered_weight:.10g}{priced} ({proof})")
     for name, placed in conventional.items():
         if placed is not None:
             yield (f"by {name.replace('-', ' ')}: weight {placed.covered_weight:.10g}")
 
 
 def _list_curve(given: "Given", steps: "list[Placement]") -> Iterator[str]:
-    """Yield what each further sensor gains: `steps` are the placements of 1, 2, ... sensors."""
+    """Yield the gain of each further sensor in words; `steps` are the placements of 1, 2, ... sensors."""
     yield "gain of each further sensor, all of them placed anew:"
     before = 0.0
     for number, placed in enumerate(steps, start=1):
@@ -219,17 +219,17 @@ def _list_curve(given: "Given", steps: "list[Placement]") -> Iterator[str]:
         share = 100 * placed.covered_weight / float(given.weight.sum())
         poles = ", ".join(str(given.ids[pole]) for pole in placed.chosen)
         proof = "" if placed.optimal else f", at most {placed.upper_bound:.10g} can be covered"
-        told = f"weight {placed.covered_weight:.10g} ({share:.1f} %), gain {gain:.10g}{proof}"
-        yield f"    {plural(number, 'sensor')}: {told}; on {poles}"
+        covered = f"weight {placed.covered_weight:.10g} ({share:.1f} %), gain {gain:.10g}{proof}"
+        yield f"    {plural(number, 'sensor')}: {covered}; on {poles}"
 
 
-def _tell_curve(given: "Given", steps: "list[Placement]") -> "Json":
-    before, told = 0.0, []
+def _curve_as_json(given: "Given", steps: "list[Placement]") -> "Json":
+    before, values = 0.0, []
     for placed in steps:
         gain, before = placed.covered_weight - before, placed.covered_weight
         proof = {"gain": gain, "upper_bound": placed.upper_bound, "optimal": placed.optimal}
-        told.append({**_describe(given, placed), **proof})
-    return told
+        values.append({**_describe(given, placed), **proof})
+    return values
 
 
 def _verify(
@@ -258,7 +258,7 @@ def _verify(
 def _place_conventionally(
     candidates: "Candidates", given: "Given", limit: float, town: "Town | None", traces: "list[Trace]"
 ) -> "dict[str, Placement | None]":
-    """Return the placements by visible objects and by traffic density; None where town or traffic is not given."""
+    """Return the placements by visible objects and by traffic density; None without a town or traffic."""
     import numpy as np
 
     from flcav.optimization.placement.baselines import place_by_score
@@ -283,10 +283,6 @@ def _name(given: "Given", placed: "Placement") -> "list[dict[str, Json]]":
     ]
 
 
-def _tell(given: "Given", placed: "Placement | None") -> "Json":
-    return None if placed is None else _describe(given, placed)
-
-
 def _describe(given: "Given", placed: "Placement") -> "dict[str, Json]":
     return {"chosen": _name(given, placed), "covered": placed.covered, "covered_weight": placed.covered_weight}
 
@@ -300,9 +296,9 @@ def _draw(
     seen: "csr_array | None",
     traces: "list[Trace]",
 ) -> None:
-    """Write the map of the errors, the poles and the placement, with the poles of conventional rules that are known.
+    """Write the map of errors, poles, the placement, and the placements by conventional rules.
 
-    Where the placement is by line of sight (`seen` is given), the map shows what each sensor sees.
+    With line of sight (`seen`), the map shows the viewsheds of the sensors.
     """
     from flcav.report import style
     from flcav.report.charts.figures import town_map
@@ -318,9 +314,9 @@ def _draw(
     ranges = {names[pole]: float(given.ranges_m[sensor]) for pole, sensor in zip(placed.chosen, placed.sensors)}
     sites = dict(zip(names, given.poles, strict=True))
     noted = {
-        note: [names[pole] for pole in own.chosen]
+        note: [names[pole] for pole in rule_placed.chosen]
         for note, rule in ((DENSEST, "traffic-density"), (MOST_VISIBLE, "visible-objects"))
-        if (own := conventional[rule]) is not None
+        if (rule_placed := conventional[rule]) is not None
     }
     scene = ErrorMap(
         town,
@@ -342,22 +338,22 @@ def _draw(
 
 
 def _note(given: "Given", placed: "Placement") -> list[str]:
-    """Return lines on what is placed: errors covered and cost, and the poles and the cost of each kind of sensor."""
+    """Return lines on the placement: covered errors and cost, then poles and cost by kind of sensor."""
     from flcav.report.pictures.maps import LONGEST, name_poles
 
     def name(pole: int) -> str:
-        own = str(given.ids[pole])
-        return own if max(len(str(each)) for each in given.ids) <= LONGEST else f"{own} ({pole + 1})"
+        number = str(given.ids[pole])
+        return number if max(len(str(other)) for other in given.ids) <= LONGEST else f"{number} ({pole + 1})"
 
     def cost(chosen: "list[tuple[int, int]]") -> str:
-        own = float(sum(given.costs[pair] for pair in chosen))
-        return f", cost {own:.6g}" if given.priced else ""
+        total = float(sum(given.costs[pair] for pair in chosen))
+        return f", cost {total:.6g}" if given.priced else ""
 
     pairs = list(zip(placed.chosen, placed.sensors, strict=True))
     lines = [f"{given.count(placed.covered)} covered{cost(pairs)}"]
     for kind, (sensor_name, range_m) in enumerate(zip(given.names, given.ranges_m, strict=True)):
-        if own := [(pole, sensor) for pole, sensor in pairs if sensor == kind]:
-            poles = name_poles([name(pole) for pole, _ in own])
-            told = f"{sensor_name or 'sensor'}, range {range_m:g} m, on {poles}"
-            lines.append(told + (cost(own) if len(own) < len(pairs) else ""))
+        if of_kind := [(pole, sensor) for pole, sensor in pairs if sensor == kind]:
+            poles = name_poles([name(pole) for pole, _ in of_kind])
+            line = f"{sensor_name or 'sensor'}, range {range_m:g} m, on {poles}"
+            lines.append(line + (cost(of_kind) if len(of_kind) < len(pairs) else ""))
     return lines

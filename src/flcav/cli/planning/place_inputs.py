@@ -1,4 +1,4 @@
-"""The inputs of `flcav place`: tables of errors, poles and sensors, and the world in which they stand."""
+"""Inputs of `flcav place`: tables of errors, poles and sensors, and their town with its traffic."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -30,14 +30,14 @@ FACTORS = ("weight", "severity", "exposure")  # columns of errors whose product 
 ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "track")
 POLES = ("id", *AXES, "cost", "yaw_deg", "kind", "height_m")
 SENSORS = ("name", "range_m", "cost")
-REGISTERED = {MISS, FALSE_POSITIVE, FINAL_ERROR}  # kinds of errors; other rows are points of the user's own
-EVERY_M = 50.0  # between sites that are drawn where a town has none
-NEAREST_M, FARTHEST_M = 5.0, 1000.0  # between sites
+REGISTERED = {MISS, FALSE_POSITIVE, FINAL_ERROR}  # kinds of errors; other rows are user-defined points
+EVERY_M = 50.0  # default distance between sites along streets without poles
+NEAREST_M, FARTHEST_M = 5.0, 1000.0  # limits of that distance
 
 
 @dataclass(frozen=True)
 class Given:
-    """Errors, poles and sensors as the user gave them."""
+    """The E errors, P poles and S sensors that a user has given."""
 
     errors: Array  # (E, 3) world [m]
     weight: Array  # (E,)
@@ -45,24 +45,24 @@ class Given:
     ids: tuple[int | str, ...]  # (P,) of the poles
     poles: Array  # (P, 3) world [m]
     pole_cost: Array  # (P,)
-    names: tuple[str | None, ...]  # (S,) of the sensors; None: of --range
+    names: tuple[str | None, ...]  # (S,) of the sensors; None with --range
     ranges_m: Array  # (S,)
     sensor_cost: Array  # (S,)
     priced: bool  # whether anything has a cost
-    notes: tuple[str, ...] = ()  # sentences on what was assumed and what was not used
+    notes: tuple[str, ...] = ()  # sentences on assumptions and unused columns
 
     def count(self, covered: int | None = None) -> str:
-        """Return "11 errors", or of points that are the user's own "your 300 points"; "8 of" them that are covered."""
-        every = f"{'your ' if self.noun == 'point' else ''}{plural(len(self.errors), self.noun)}"
-        return every if covered is None else f"{covered} of {every}"
+        """Return the number of errors in words: "11 errors", "8 of 11 errors", or "your 300 points" for points."""
+        total = f"{'your ' if self.noun == 'point' else ''}{plural(len(self.errors), self.noun)}"
+        return total if covered is None else f"{covered} of {total}"
 
     @property
     def noun(self) -> str:
-        """Return what a row of the errors' table is called."""
+        """Return the noun for a row of the table of errors."""
         return "error" if {*self.kind.tolist()} <= REGISTERED else "point"
 
     def cost_of(self, placed: Placement) -> float | None:
-        """Return what a placement costs; None where nothing has a cost."""
+        """Return the cost of a placement; None where nothing has a cost."""
         if not self.priced:
             return None
         pairs = zip(placed.chosen, placed.sensors, strict=True)
@@ -70,19 +70,20 @@ class Given:
 
     @property
     def costs(self) -> NDArray[np.object_]:
-        """Return (P, S) `Fraction`: the cost of each sensor on each pole, of the decimals that were given."""
+        """Return the costs (P, S) of each sensor on each pole, as `Fraction`s of the decimals that were given."""
+        # Exact sums: a plan that costs exactly its budget must not exceed it by a rounding error.
         of_pole, of_sensor = (
-            np.array([*map(exact, own.tolist())], dtype=object) for own in (self.pole_cost, self.sensor_cost)
+            np.array([*map(exact, costs.tolist())], dtype=object) for costs in (self.pole_cost, self.sensor_cost)
         )
         return of_pole[:, None] + of_sensor
 
     def covered_by(self, placed: Placement, visible: csr_array | None) -> NDArray[np.bool_]:
-        """Return (E,) which errors a placement covers: within a sensor's range, and `visible` (P, E) from its pole."""
+        """Return a mask (E,) of the covered errors: within a sensor's range, and `visible` (P, E) from its pole."""
         covered = np.zeros(len(self.errors), np.bool_)
         for pole, sensor in zip(placed.chosen, placed.sensors, strict=True):
             near = find_covered(self.errors, self.poles[[pole]], self.ranges_m[[sensor]])
-            own = near if visible is None else near.multiply(visible[[pole]])
-            covered |= own.toarray()[0] > 0
+            seen = near if visible is None else near.multiply(visible[[pole]])
+            covered |= seen.toarray()[0] > 0
         return covered
 
 
@@ -93,8 +94,8 @@ class Sites:
     ids: tuple[int | str, ...]  # (P,)
     xyz: Array  # (P, 3) world [m]
     cost: Array | None  # (P,)
-    note: str  # a sentence on where they come from
-    degrees: Array | None = None  # (P, 2) latitude and longitude, where the user's table has them
+    note: str  # a sentence on their origin
+    degrees: Array | None = None  # (P, 2) latitude and longitude, if the user's table has them
 
 
 def read_given(
@@ -107,12 +108,14 @@ def read_given(
     town: Town | None = None,
     every_m: float | None = None,
 ) -> Given:
-    """Return the tables; raises `InputError` for files, columns, numbers, places, ids and factors that are wrong.
+    """Read the tables of errors, poles and sensors; without `poles`, candidate sites are those of `find_sites`.
 
-    Without a table of `poles` they are those of `find_sites`.
+    Without `sensors`, there is one kind of range `range_m` [m]. Raises `InputError` for wrong files, columns, numbers,
+    places, ids and factors.
     """
     placed = read_places(errors, "point", ERRORS, town)
-    mistakes, sites = placed.table, find_sites(town, every_m) if poles is None else _read_sites(poles, town)
+    mistakes = placed.table
+    sites = find_sites(town, every_m) if poles is None else _read_sites(poles, town)
     notes = [placed.note, sites.note]
     if town is not None:
         check_inside(town, placed.xyz, sites.xyz, (errors, poles or "poles"), (placed.degrees, sites.degrees))
@@ -144,14 +147,15 @@ def read_given(
 def find_sites(town: Town | None, every_m: float | None = None) -> Sites:
     """Return candidate sites of a town every `every_m` [m] along its streets.
 
-    Without `every_m` they are its poles and, numbered after these, sites every `EVERY_M` along the streets that have
-    none. Raises `InputError` without a town, for distances not from NEAREST_M to FARTHEST_M, and where there are none.
+    Without `every_m`, they are its poles and, numbered after these, sites every `EVERY_M` along streets without poles.
+    Raises `InputError` without a town, for a distance outside `NEAREST_M` to `FARTHEST_M`, and where there is no site.
     """
     if town is None:
         raise InputError("--poles: give a table of candidate sites, or --town, whose poles and streets have some")
     if every_m is not None and not NEAREST_M <= every_m <= FARTHEST_M:
         raise InputError(f"--every {every_m:g}: must be from {NEAREST_M:g} to {FARTHEST_M:g} m")
-    spacing, known = every_m or EVERY_M, town.poles.id.tolist()
+    spacing = every_m or EVERY_M
+    known = town.poles.id.tolist()
     drawn = draw_sites(town, spacing, bare=every_m is None and bool(known))
     sites = f"{plural(len(drawn), 'site')} every {spacing:g} m along"
     if every_m is None and known:
@@ -169,37 +173,38 @@ def find_sites(town: Town | None, every_m: float | None = None) -> Sites:
 
 
 def _read_sites(path: Path, town: Town | None) -> Sites:
-    found = read_places(path, "pole", (*POLES, "name"), town, MOUNT_M)
-    own = next((name for name in NAMES if name in found.table.column_names), None)
-    if own is None and not found.note:
-        raise InputError(f"{path}: column 'id' is missing; found {', '.join(found.table.column_names)}")
-    rows = found.table.num_rows
-    ids = tuple(range(1, rows + 1)) if own is None else _identify(found.table[own].to_pylist(), path, "poles", own)
-    cost = _costs(found.table, path) if "cost" in found.table.column_names else None
-    return Sites(ids, found.xyz, cost, found.note, found.degrees)
+    places = read_places(path, "pole", (*POLES, "name"), town, MOUNT_M)
+    table = places.table
+    column = next((name for name in NAMES if name in table.column_names), None)
+    if column is None and not places.note:
+        raise InputError(f"{path}: column 'id' is missing; found {', '.join(table.column_names)}")
+    numbered = tuple(range(1, table.num_rows + 1))
+    ids = numbered if column is None else _identify(table[column].to_pylist(), path, "poles", column)
+    cost = _costs(table, path) if "cost" in table.column_names else None
+    return Sites(ids, places.xyz, cost, places.note, places.degrees)
 
 
 def read_world(data: Path | None, town: str | None) -> tuple[Town | None, list[Trace]]:
-    """Return the town that is named, or else the dataset's, and the traffic of the dataset's scenes.
+    """Return the named town, or else the dataset's, and the traffic of the dataset's scenes.
 
-    Raises `InputError` where the dataset is of another town than the one that is named.
+    Raises `InputError` where the dataset was recorded in another town than the named one.
     """
     if data is None:
         return (None if town is None else load_town(town)), []
     dataset = Dataset.open(data)
     scenes = sorted({key.scene for key in dataset.keys})
     traces = [trace for scene in scenes if (trace := dataset.trace(scene)) is not None]
-    own = dataset.town()
+    recorded = dataset.town()
     if town is None:
-        return own, traces
+        return recorded, traces
     here = load_town(town)
-    if own is not None and own.name != here.name:
-        raise InputError(f"--town {town}: the traffic of {data} is that of {own.name}")
+    if recorded is not None and recorded.name != here.name:
+        raise InputError(f"--town {town}: the traffic of {data} is that of {recorded.name}")
     return here, traces
 
 
 def build_candidates(given: Given, visible: csr_array | None) -> Candidates:
-    """Return every sensor on every pole, which covers only what is `visible` (P, E) from there."""
+    """Return the candidates, every sensor on every pole; they cover only errors that are `visible` (P, E)."""
     return find_candidates(
         given.errors,
         given.poles,
@@ -219,10 +224,10 @@ def _read(path: Path, needed: Sequence[str], known: Sequence[str]) -> pa.Table:
 
 
 def _identify(names: Sequence[object], path: Path, what: str, column: str) -> tuple[int | str, ...]:
-    """Return the names of rows; raises `InputError` for one that lacks, is no text or number, or is there twice."""
+    """Return the names of rows; raises `InputError` for one that is missing, neither text nor number, or repeated."""
     first: dict[int | str, int] = {}
     for row, name in enumerate(names):
-        if name is None or name == "" or name != name:  # the last of a NaN
+        if name is None or name == "" or name != name:  # NaN differs from itself
             raise InputError(f"{path}: row {row + 1} has no {column}")
         if isinstance(name, bool) or not isinstance(name, int | str):
             raise InputError(f"{path}: row {row + 1}: {column} = {shorten(name)} is neither text nor a whole number")
@@ -237,7 +242,7 @@ def _costs(table: pa.Table, path: Path) -> Array:
 
 
 def _weigh(mistakes: pa.Table, path: Path, class_weights: Sequence[str]) -> Array:
-    """Return the weights of errors (E,): the product of their FACTORS and the factor of their class."""
+    """Return the weights (E,) of errors: the product of their `FACTORS` and the factor of their class."""
     given = [name for name in FACTORS if name in mistakes.column_names]
     factor = numbers(mistakes, given, path)
     if len(below := np.argwhere(factor < 0)):
@@ -258,13 +263,13 @@ def _weigh(mistakes: pa.Table, path: Path, class_weights: Sequence[str]) -> Arra
 
 def _parse_factors(class_weights: Sequence[str]) -> Mapping[str, float]:
     factors: dict[str, float] = {}
-    for said in class_weights:
-        name, sign, number = said.rpartition("=")
+    for text in class_weights:
+        name, sign, number = text.rpartition("=")
         try:
             factor = float(number) if sign and name else np.nan
         except ValueError:
             factor = np.nan
         if not (0 <= factor < np.inf) or name in factors:
-            raise InputError(f"--class-weight {said}: write CLASS=FACTOR, a number from 0 on, and each class once")
+            raise InputError(f"--class-weight {text}: write CLASS=FACTOR, a number from 0 on, and each class once")
         factors[name] = factor
     return factors

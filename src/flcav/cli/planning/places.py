@@ -1,4 +1,4 @@
-"""Places in users' tables: x, y and z in a town, x and y on its ground, or latitude and longitude."""
+"""Places in users' tables, given as x, y, z in a town, as x, y on its ground, or as latitude and longitude."""
 
 import re
 from collections.abc import Sequence
@@ -18,8 +18,8 @@ from flcav.world.map.town import Town
 
 AXES = ("x", "y", "z")
 LATITUDE, LONGITUDE = "latitude", "longitude"
-NAMES = ("id", "name")  # columns that are kept as they are written
-SPELLINGS = {  # words of a column's name, and what the column is
+NAMES = ("id", "name")  # columns whose spelling is kept
+SPELLINGS = {  # words in the name of a column, by its meaning
     LATITUDE: ("latitude", "latitud", "lat", "breite", "breitengrad", "ygcswgs"),
     LONGITUDE: (
         "longitude",
@@ -36,29 +36,29 @@ SPELLINGS = {  # words of a column's name, and what the column is
 }
 UNITS = ("m", "deg", "degree", "degrees", "metre", "metres", "meter", "meters")
 WORD = re.compile(r"[A-ZÄÖÜ]+(?![a-zäöüß])|[A-ZÄÖÜ]?[a-zäöüß]+")
-ALIKE = 0.75  # least similarity of an unknown column to a known one for which it is taken
+ALIKE = 0.75  # least similarity of a misspelt column to a known one
 
 
 @dataclass(frozen=True)
 class Places:
-    """A table of places: its columns by their known names, and where the places are."""
+    """A table of N places with the known names of its columns, and the positions of the places."""
 
     table: pa.Table
     xyz: Array  # (N, 3) world [m]
     degrees: Array | None  # (N, 2) latitude and longitude; None: the table has x and y
-    note: str  # a sentence on what was assumed and not used; "" where all is as flcav writes it
+    note: str  # a sentence on assumptions and unused columns; "" for a table as flcav writes it
 
 
 def read_places(path: Path, what: str, known: Sequence[str], town: Town | None, height_m: float = 0.0) -> Places:
-    """Return the places in a CSV or Parquet table; those without a height are `height_m` above the ground of `town`.
+    """Return the places in a CSV or Parquet table; without a height, they are `height_m` [m] above the town's ground.
 
-    Names of columns may be in capitals and with units. A table as flcav writes it, with x, y and z, has `known` columns
-    only; others of one with latitude and longitude, or without z, are not used. `what` a row is called: a noun.
+    Column names may have capitals and units. A table with x, y and z, as flcav writes it, has only `known` columns;
+    in other tables further columns are ignored. `what` is the noun for a row.
 
-    Raises `InputError` for files that are no such tables, columns that are missing, twice or look like a misspelt one,
-    places that are no numbers or not on Earth, and latitudes without a town.
+    Raises `InputError` for files that are no such tables, columns that are missing, repeated or misspelt, places that
+    are no numbers or not on Earth, and latitudes without a town.
     """
-    named = [each for name in NAMES for each in (name, name.upper(), name.capitalize())]
+    named = [spelling for name in NAMES for spelling in (name, name.upper(), name.capitalize())]
     table = _rename(read_input_table(path, (), named), path, known)
     geodetic = LATITUDE in table.column_names and LONGITUDE in table.column_names
     axes = (LATITUDE, LONGITUDE) if geodetic else AXES[:2]
@@ -73,7 +73,8 @@ def read_places(path: Path, what: str, known: Sequence[str], town: Town | None, 
             )
     if geodetic and town is None:
         raise InputError(f"{path}: has latitude and longitude; give --town, whose geo-reference says where they are")
-    own, flat = geodetic or "z" not in table.column_names, numbers(table, axes, path)
+    foreign = geodetic or "z" not in table.column_names
+    flat = numbers(table, axes, path)
     used = (*axes, *(name for name in known if not (geodetic and name in AXES)))
     left_out = [name for name in table.column_names if name not in used]
     for name in left_out:
@@ -82,24 +83,24 @@ def read_places(path: Path, what: str, known: Sequence[str], town: Town | None, 
             raise InputError(
                 f"{path}: unknown column '{name}' (did you mean '{close[0]}'?); known are {', '.join(known)}"
             )
-        if not own:
+        if not foreign:
             raise InputError(f"{path}: unknown column '{name}'; known are {', '.join(known)}")
-    if not own and "height_m" in table.column_names:
+    if not foreign and "height_m" in table.column_names:
         raise InputError(f"{path}: columns 'z' and 'height_m' both say how high places are; give one of them")
     heights = numbers(table, ("height_m",), path)[:, 0] if "height_m" in table.column_names else height_m
     if geodetic and town is not None:
         odd = np.flatnonzero((np.abs(flat) > (90, 180)).any(axis=1))
         if len(odd):
             latitude, longitude = flat[odd[0]]
-            said = f"latitude {latitude:g}, longitude {longitude:g}"
-            raise InputError(f"{path}: row {odd[0] + 1}: {said} is no place on Earth")
+            place = f"latitude {latitude:g}, longitude {longitude:g}"
+            raise InputError(f"{path}: row {odd[0] + 1}: {place} is no place on Earth")
         xyz = find_on_ground(town, *flat.T) + np.outer(np.broadcast_to(heights, len(flat)), (0, 0, 1))
-    elif own:
+    elif foreign:
         ground = np.zeros(len(flat)) if town is None else town.grounds(*flat.T)
         xyz = np.column_stack((flat, ground + heights))
     else:
         xyz = numbers(table, AXES, path)
-    if not own:
+    if not foreign:
         return Places(table, xyz, None, "")
     where = "level ground" if town is None else f"the ground of {town.name}"
     above = "on" if not np.any(heights) else "above" if "height_m" in table.column_names else f"{height_m:g} m above"
@@ -115,13 +116,13 @@ def _shown(name: str) -> str:
 
 
 def _rename(table: pa.Table, path: Path, known: Sequence[str]) -> pa.Table:
-    """Return the table with the known names of its columns, however they are spelt."""
+    """Return the table with its columns renamed to their known names."""
     meant: dict[str, str] = {}
     for name in table.column_names:
         words = [word.lower() for word in WORD.findall(name)]
         plain = "_".join(word for word in words if word not in UNITS)
         places = [what for what, spelt in SPELLINGS.items() if any(word in spelt for word in words)]
-        what = next((each for each in known if each in (name, name.strip().lower(), plain, f"{plain}_m")), None)
+        what = next((one for one in known if one in (name, name.strip().lower(), plain, f"{plain}_m")), None)
         what = what or (places[0] if len(places) == 1 else name)
         if what in meant:
             raise InputError(

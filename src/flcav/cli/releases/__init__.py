@@ -1,1 +1,1 @@
-"""The commands of `flcav release`: candidates, the parties' repositories and vehicles, roll-outs."""
+"""Commands of `flcav release`: candidates, repositories of both parties, vehicles, roll-outs."""

@@ -1,4 +1,4 @@
-"""`flcav release propose` and `verify`: a candidate, and its tests beside the network that drives."""
+"""`flcav release propose` and `verify`: a candidate, and its comparison with the driving network."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,7 +23,7 @@ AS_JSON = typer.Option(False, "--json", help="Print one JSON object.")
 
 
 def describe_candidate(folder: Path) -> "Candidate":
-    """Return the description of a candidate whose files are as it says."""
+    """Return the description of a candidate, after a check of its files against it."""
     from flcav.releases.candidate import check_files, read_candidate
 
     described = read_candidate(folder)
@@ -32,7 +32,7 @@ def describe_candidate(folder: Path) -> "Candidate":
 
 
 def tell_signatures(repository: Path, state: "StagedTargets") -> None:
-    """Print how many signatures a party's next metadata have."""
+    """Print the number of signatures of a party's next metadata."""
     more = "publish it" if state.complete else "another owner's is missing"
     echo(
         f"{repository}: {state.signatures} of {plural(state.threshold, 'signature')} of version {state.version}; {more}"

@@ -82,8 +82,8 @@ def sign(
         }
         directive = parse_config(Directive, values, "the directive")
     state = stage_release(repository, candidate, key, directive)
-    for each in key:
-        acknowledge(candidate, each)
+    for private in key:
+        acknowledge(candidate, private)
     draw_page(candidate, [repository])
     tell_signatures(repository, state)
 
@@ -151,11 +151,11 @@ def equip(
             check_is_file(path)
         roots = image_root.read_bytes(), director_root.read_bytes()
     if data is not None:
-        known = {each.name: each for each in list_drives(Dataset.open(data))}
-        own = known.get(next(iter(known)) if drive is None else drive)
-        if own is None:
+        known = {one.name: one for one in list_drives(Dataset.open(data))}
+        chosen = known.get(next(iter(known)) if drive is None else drive)
+        if chosen is None:
             raise InputError(f"--drive {drive}: is not in {data}, which has {', '.join([*known][:5])}")
-        recorded = RecordedDrive(str(data.resolve()), own.scene, own.agent)
+        recorded = RecordedDrive(str(data.resolve()), chosen.scene, chosen.agent)
     equip_vehicle(folder, roots, recorded)
     echo(f"{folder}: follows the releases of its fleet")
 
@@ -174,6 +174,6 @@ def status(
     found = [read_repository_status(folder, task) for folder in repository]
     if candidate is not None:
         draw_page(candidate, repository)
-    yield {"repositories": [each.as_json() for each in found]}
-    for each in found:
-        yield "\n".join(each.lines())
+    yield {"repositories": [shown.as_json() for shown in found]}
+    for shown in found:
+        yield "\n".join(shown.lines())

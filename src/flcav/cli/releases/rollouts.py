@@ -1,4 +1,4 @@
-"""`flcav release shadow`, `rollout`, `deliver`, `rehearse`, `rollback`: who gets a release when, what stops it."""
+"""`flcav release shadow`, `rollout`, `deliver`, `rehearse`, `rollback`: staged roll-out of a release to a fleet."""
 
 from pathlib import Path
 
@@ -174,10 +174,11 @@ def deliver(
     found = deliver_release(links, links.vehicle, described.release, size, settings, ledger, described.task)
     if out is not None:
         ledger.save(out)
-    yield {"vehicles": [asdict(each) for each in found], "bytes": size}
-    for each in found:
-        said = f"has it at {each.at_s:.2f} s" if each.at_s is not None else f"has it not: {each.reason}"
-        yield f"{each.vehicle}: {said}, {plural(each.attempts, 'attempt')}, {each.bytes / 1e6:.2f} MB"
+    yield {"vehicles": [asdict(delivery) for delivery in found], "bytes": size}
+    for delivery in found:
+        at_s = delivery.at_s
+        arrival = f"has it at {at_s:.2f} s" if at_s is not None else f"has it not: {delivery.reason}"
+        yield f"{delivery.vehicle}: {arrival}, {plural(delivery.attempts, 'attempt')}, {delivery.bytes / 1e6:.2f} MB"
     down = {link: ledger.used_mb(link, direction="down") for link in ("wireless", "wireline")}
     yield f"downlink: {down['wireless']:.2f} MB wireless, {down['wireline']:.2f} MB wireline"
 

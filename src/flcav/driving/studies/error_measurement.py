@@ -1,6 +1,6 @@
-"""Measurement of the networks' errors on drives: recall, errors of position, and of forecasts over four seconds.
+"""Measurement of the networks' errors on drives: recall, position errors, and forecast errors over four seconds.
 
-The vehicle is driven by the truth, and the networks are compared with it; `errors.ErrorModel` is what is found.
+Ground truth drives the vehicle, and the networks' output is compared with it; the result is an `errors.ErrorModel`.
 """
 
 from collections import Counter, defaultdict
@@ -21,9 +21,9 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.world.snapshot import Snapshot
 
-MATCH_M = 2.5
-ONE_SIGMA = 0.6827  # share of a normal distribution within one standard deviation: outliers do not widen that
-HORIZON = slice(0, len(TIMES_S), 2)
+MATCH_M = 2.5  # greatest distance between a detection and its road user
+ONE_SIGMA = 0.6827  # a quantile in place of the standard deviation, since outliers do not widen it
+HORIZON = slice(0, len(TIMES_S), 2)  # (H,) of `TIMES_S` at which forecasts are compared
 
 
 def _by_class() -> defaultdict[str, Counter[str]]:
@@ -34,14 +34,13 @@ def _by_class() -> defaultdict[str, Counter[str]]:
 class Tally:
     """Counts and errors over drives."""
 
-    pairs: list[tuple[str, float, bool, float, float, float]] = field(
-        default_factory=list
-    )  # class, distance, found, errors
+    # class, distance [m], whether detected, errors of x, y [m] in the ego frame and of yaw [rad]
+    pairs: list[tuple[str, float, bool, float, float, float]] = field(default_factory=list)
     false_positives: int = 0
     frames: int = 0
     lights: Counter[str] = field(default_factory=Counter)
     weather: defaultdict[str, Counter[str]] = field(default_factory=_by_class)
-    tracks: list[tuple[str, float, Array]] = field(default_factory=list)  # motion, variance, errors (H, 2) at HORIZON
+    tracks: list[tuple[str, float, Array]] = field(default_factory=list)  # motion, variance [m^2], errors (H, 2) [m]
 
     def add(self, other: "Tally") -> None:
         """Add the counts of another drive."""
@@ -55,7 +54,7 @@ class Tally:
 
 
 class Comparing:
-    """Perception by the networks, compared with the truth, by which the vehicle is driven."""
+    """Ground-truth perception that also counts the networks' errors at every step."""
 
     def __init__(self, staged: StagedScenario, seed: int, tally: Tally) -> None:
         self._networks, self._truth = NetworkPerception(staged, seed), TruePerception(staged.scenario.weather)
@@ -65,7 +64,7 @@ class Comparing:
 
     def look(self, snapshot: Snapshot) -> Seen:
         """Return the truth, and count the networks' errors against it."""
-        told = self._networks.look(snapshot)
+        self._networks.look(snapshot)
         self._compare(snapshot)
         self._remember(snapshot)
         if self._networks.lights_read_s == snapshot.time_s:
@@ -74,13 +73,12 @@ class Comparing:
             for link, letter in self._networks.heads.items():
                 right = letter is not None and (letter == "G") == (letters.get(link) in ("G", "g"))
                 self._tally.lights["unread" if letter is None else "right" if right else "wrong"] += 1
-        assert told is not None
         return self._truth.look(snapshot)
 
     def _compare(self, snapshot: Snapshot) -> None:
         _, boxes, local = find_in_field(snapshot, self._networks.scene)
-        found, own = self._networks.found, snapshot.row(EGO)
-        yaw = float(snapshot.trace.yaw[0, own])
+        found = self._networks.found
+        yaw = float(snapshot.trace.yaw[0, snapshot.row(EGO)])
         free = np.ones(len(found), np.bool_)
         for row in np.argsort(np.hypot(*local.T)).tolist():
             away = np.hypot(*(found.center[:, :2] - boxes.center[row, :2]).T)
@@ -93,16 +91,17 @@ class Comparing:
             free[best] = False
             apart_x, apart_y = (found.center[best, :2] - boxes.center[row, :2]).tolist()
             x, y = rotate(apart_x, apart_y, -yaw)
-            turn = float(wrap_angle(2 * (found.yaw[best] - boxes.yaw[row]))) / 2  # either way round
+            # Errors of heading are modulo pi: tracking corrects boxes that are detected the wrong way round.
+            turn = float(wrap_angle(2 * (found.yaw[best] - boxes.yaw[row]))) / 2
             self._tally.pairs.append((label, distance, True, float(x), float(y), turn))
         rows = find_around(snapshot, 80.0)
         everyone = snapshot.trace.position[0, rows, :2]
-        lonely = [np.hypot(*(everyone - each[:2]).T).min(initial=np.inf) > 3.0 for each in found.center[free]]
+        lonely = [np.hypot(*(everyone - center[:2]).T).min(initial=np.inf) > 3.0 for center in found.center[free]]
         self._tally.false_positives += int(sum(lonely))
         self._tally.frames += 1
 
     def _remember(self, snapshot: Snapshot) -> None:
-        """Note forecasts, and the errors of those whose horizon is over."""
+        """Keep the present forecasts, and record the errors of those whose horizon has passed."""
         trace, tick = snapshot.trace, round(snapshot.time_s * 10)
         for name, place in zip(trace.actor.tolist(), trace.position[0, :, :2]):
             self._places[name, tick] = place
@@ -117,12 +116,12 @@ class Comparing:
                     name = str(trace.actor[rows[int(away.argmin())]])
                     self._forecasts.append((snapshot.time_s, name, motion, variance, followed.path[i, HORIZON]))
         last = TIMES_S[HORIZON][-1]
-        over = [each for each in self._forecasts if each[0] + last <= snapshot.time_s + 1e-6]
+        over = [forecast for forecast in self._forecasts if forecast[0] + last <= snapshot.time_s + 1e-6]
         self._forecasts = self._forecasts[len(over) :]
         for time_s, name, motion, variance, path in over:
             ticks = [round(10 * (time_s + float(t))) for t in TIMES_S[HORIZON]]
-            places = [self._places.get((name, each)) for each in ticks]
-            if all(each is not None for each in places):
+            places = [self._places.get((name, tick)) for tick in ticks]
+            if all(place is not None for place in places):
                 self._tally.tracks.append((motion, variance, path - np.array(places)))
 
 
@@ -137,8 +136,8 @@ def measure_errors(
     jobs = [(scenario, seed, loop) for scenario in scenarios for seed in seeds]
     whole = Tally()
     with process_pool(processes, begin_worker) as pool:
-        for done, own in enumerate(pool.map(tally_drive, *zip(*jobs)), start=1):
-            whole.add(own)
+        for done, tally in enumerate(pool.map(tally_drive, *zip(*jobs)), start=1):
+            whole.add(tally)
             progress(done, len(jobs), "")
     return summarise_tally(whole)
 
@@ -146,12 +145,12 @@ def measure_errors(
 def tally_drive(scenario: DrivingScenario, seed: int, loop: Loop) -> Tally:
     """Return the counts of the networks' errors in one drive."""
     tally = Tally()
-    drive_scenario(scenario, seed, lambda staged, own: Comparing(staged, own, tally), loop)
+    drive_scenario(scenario, seed, lambda staged, number: Comparing(staged, number, tally), loop)
     return tally
 
 
 def summarise_tally(tally: Tally) -> ErrorModel:
-    """Return the error model of the counts; shares have half a success and half a failure added (Jeffreys prior)."""
+    """Return the error model of a tally; recalls are posterior means under the Jeffreys prior (half a count each)."""
     detected: dict[str, tuple[float, ...]] = {}
     sd: dict[str, tuple[float, float, float]] = {}
     for name in CLASSES:
@@ -165,14 +164,14 @@ def summarise_tally(tally: Tally) -> ErrorModel:
         sd[name] = (x, y, yaw)
     total = max(tally.lights.total(), 1)
     counted = tally.weather.items()
-    off = [each[2][0] / np.sqrt(each[1]) for each in tally.tracks]
+    off = [errors[0] / np.sqrt(variance) for _, variance, errors in tally.tracks]
     factor = float(np.quantile(np.abs(off), ONE_SIGMA)) ** 2 if off else 1.0
     return ErrorModel(
         detected=detected,
         sd=sd,
         false_positives=float(tally.false_positives) / max(tally.frames, 1),
         lights=(tally.lights["right"] / total, tally.lights["wrong"] / total),
-        weather={name: {each: n / own.total() for each, n in own.items()} for name, own in counted},
+        weather={name: {read: n / counts.total() for read, n in counts.items()} for name, counts in counted},
         spread_factor=factor,
         growth={motion: _growth(tally, motion, factor) for motion in MOTIONS},
         seen=len(tally.pairs),
@@ -181,11 +180,11 @@ def summarise_tally(tally: Tally) -> ErrorModel:
 
 
 def _growth(tally: Tally, motion: str, factor: float) -> tuple[float, ...]:
-    """Return the standard deviation at `TIMES_S` that forecasts have beyond that of their tracks."""
-    own = [each for each in tally.tracks if each[0] == motion]
-    if not own:
+    """Return the standard deviation [m] of forecasts at `TIMES_S` in excess of that of their tracks."""
+    tracks = [track for track in tally.tracks if track[0] == motion]
+    if not tracks:
         return (0.0,) * len(TIMES_S)
-    off = np.abs(np.array([each[2] for each in own])).transpose(1, 0, 2).reshape(len(TIMES_S[HORIZON]), -1)
-    variance = factor * float(np.median([each[1] for each in own]))
+    off = np.abs(np.array([errors for _, _, errors in tracks])).transpose(1, 0, 2).reshape(len(TIMES_S[HORIZON]), -1)
+    variance = factor * float(np.median([variance for _, variance, _ in tracks]))
     excess = np.sqrt(np.maximum(np.quantile(off, ONE_SIGMA, axis=1) ** 2 - variance, 0.0))
     return tuple(np.interp(TIMES_S, TIMES_S[HORIZON], excess).tolist())

@@ -1,8 +1,8 @@
-"""What roadside sensors on poles give a driver: road users that are hidden without them, precision, and safer drives.
+"""Benefit of roadside sensors on poles for driving: occlusion, detection precision and closed-loop safety.
 
-The article argues for road sensors with what a vehicle cannot see (Wang et al., IEEE Network 37(3), 2023). Counted are
-cars and vans in the field of the vehicle's detector; hidden are those that no ray reaches (`seen.share_seen`). In
-closed loop the same drives are repeated with the detections of poles and without them.
+The article motivates road sensors by a vehicle's occlusions (Wang et al., IEEE Network 37(3), 2023). Cars and vans in
+the field of the vehicle's detector are counted; one that no ray reaches is hidden (`seen.share_seen`). In closed loop,
+the same drives are run with and without the detections of the poles.
 """
 
 from collections.abc import Callable, Sequence
@@ -33,17 +33,17 @@ from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.trace import Trace
 
-INSTANTS = 40
+INSTANTS = 40  # of recorded traffic
 
 
 @dataclass(frozen=True)
 class Hidden(Record):
-    """Shares of the cars around vehicles that are hidden, with Wilson's interval; 0 cars give no shares."""
+    """Shares of the cars around vehicles that are hidden, with Wilson's intervals; None without cars."""
 
     cars: int
     vehicle: Estimate | None  # from the vehicle
-    poles: Estimate | None  # from every pole, or out of its range
-    both: Estimate | None
+    poles: Estimate | None  # from all poles: occluded or out of range
+    both: Estimate | None  # from the vehicle and all poles
 
     def lines(self) -> list[str]:
         """Return the shares in words."""
@@ -56,7 +56,11 @@ class Hidden(Record):
 
 
 def find_hidden(scene: Scene, own: int, sites: Sequence[Array], range_m: float) -> tuple[Boxes, NDArray[np.bool_]]:
-    """Return the cars in the field of the vehicle in row `own`, and (N, 2) whether hidden from it, from every site."""
+    """Return the cars in the detector field of the vehicle in row `own`, and flags (N, 2) whether they are hidden.
+
+    The flags are for the vehicle and for all sites. Boxes are in the world frame, `sites` are positions (3,) [m] with a
+    range of `range_m` [m].
+    """
     trace, i = scene.trace, scene.index
     rows = np.flatnonzero(trace.present[i] & np.isin(trace.category, CARS))
     rows = rows[rows != own]
@@ -74,7 +78,7 @@ def find_hidden(scene: Scene, own: int, sites: Sequence[Array], range_m: float) 
 
 
 def summarise_hidden(flags: Sequence[NDArray[np.bool_]]) -> Hidden:
-    """Return the shares of the flags (N, 2) of all instants."""
+    """Return the shares of hidden cars by the flags (N, 2) of all instants."""
     joined = np.concatenate([np.zeros((0, 2), np.bool_), *flags])
     n = len(joined)
     if not n:
@@ -84,9 +88,10 @@ def summarise_hidden(flags: Sequence[NDArray[np.bool_]]) -> Hidden:
 
 
 def count_hidden(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Sequence[float]) -> Hidden:
-    """Return the road users hidden from connected vehicles ("cav0", ...) in recorded traffic, and from sites (P, 3).
+    """Return the shares of cars hidden from connected vehicles ("cav0", ...) and from sites (P, 3) in recorded traffic.
 
-    Looked at are about `INSTANTS` instants. Without connected vehicles every car that drives is one.
+    About `INSTANTS` instants are evaluated. Without connected vehicles every moving car counts as one. `sites` are
+    positions in the world frame [m], `ranges_m` their ranges [m].
     """
     flags = []
     for scene in look_at_instants(town, traces, INSTANTS):
@@ -95,16 +100,16 @@ def count_hidden(town: Town, traces: Sequence[Trace], sites: Array, ranges_m: Se
         if not names.any():
             driving = np.linalg.norm(trace.velocity[i, :, :2], axis=1) > 1.0
             names = trace.present[i] & np.isin(trace.category, CARS) & driving
-        for own in np.flatnonzero(names).tolist():
-            flags.append(_hidden_of(scene, own, sites, ranges_m))
+        for vehicle in np.flatnonzero(names).tolist():
+            flags.append(_hidden_of(scene, vehicle, sites, ranges_m))
     return summarise_hidden(flags)
 
 
-def _hidden_of(scene: Scene, own: int, sites: Array, ranges_m: Sequence[float]) -> NDArray[np.bool_]:
-    """Return the flags of the cars around one vehicle, of sites that have a range each."""
-    _, hidden = find_hidden(scene, own, [], 0.0)
+def _hidden_of(scene: Scene, vehicle: int, sites: Array, ranges_m: Sequence[float]) -> NDArray[np.bool_]:
+    """Return the flags (N, 2) of the cars around one vehicle, for sites with individual ranges."""
+    _, hidden = find_hidden(scene, vehicle, [], 0.0)
     for site, range_m in zip(sites, ranges_m, strict=True):
-        hidden[:, 1] &= find_hidden(scene, own, [site], range_m)[1][:, 1]
+        hidden[:, 1] &= find_hidden(scene, vehicle, [site], range_m)[1][:, 1]
     return hidden
 
 
@@ -116,12 +121,12 @@ GAINS = {
     "hard_brakes": "hard brakes",
     "score": "driving score",
 }
-OVERLAP = 0.3  # bird's-eye IoU of a found car: what braking needs, when boxes are half a second old
+OVERLAP = 0.3  # bird's-eye IoU of a detected car: enough for braking, with messages that are half a second old
 
 
 @dataclass
 class FusionTally:
-    """Detections of the cars around by the vehicle and by poles, look by look."""
+    """Detections by the vehicle alone and with poles, the true cars, and the latencies, step by step."""
 
     scenario: list[str] = field(default_factory=list)
     own: list[Boxes] = field(default_factory=list)
@@ -132,7 +137,7 @@ class FusionTally:
 
 
 class Cooperative:
-    """Cooperative perception by vehicle and roadside units; the detections of both are compared with the truth."""
+    """Cooperative perception by vehicle and roadside units, which tallies its detections and the true cars."""
 
     def __init__(self, staged: StagedScenario, seed: int, poles: Sequence[int], tally: FusionTally) -> None:
         self._units = RoadUnits(staged.town, poles, seed)
@@ -141,13 +146,13 @@ class Cooperative:
 
     def look(self, snapshot: Snapshot) -> Seen:
         """Return the cooperative perception at this instant."""
-        told = self._networks.look(snapshot)
+        seen = self._networks.look(snapshot)
         if snapshot.time_s - self._looked_s >= SPIN_S - 1e-6:
             self._looked_s = snapshot.time_s
-            own = snapshot.row(EGO)
+            ego = snapshot.row(EGO)
             sites = list(self._units.sites.values())
-            targets, hidden = find_hidden(self._networks.scene, own, sites, RANGE_M)
-            place = (*snapshot.trace.position[0, own, :2].tolist(), float(snapshot.trace.yaw[0, own]))
+            targets, hidden = find_hidden(self._networks.scene, ego, sites, RANGE_M)
+            place = (*snapshot.trace.position[0, ego, :2].tolist(), float(snapshot.trace.yaw[0, ego]))
             self._tally.scenario.append(self._scenario)
             self._tally.own.append(keep_in_field(self._networks.own, place))
             self._tally.fused.append(keep_in_field(self._networks.found, place))
@@ -155,35 +160,35 @@ class Cooperative:
             self._tally.hidden.append(hidden)
             self._tally.latency_s += self._units.latency_s
             self._units.latency_s.clear()
-        return told
+        return seen
 
 
 def keep_in_field(boxes: Boxes, place: tuple[float, float, float]) -> Boxes:
-    """Return the cars, world frame, in the field of the detector of a vehicle at x, y [m] and yaw [rad]."""
+    """Return the cars (world frame) in the detector field of a vehicle at `place`: x, y [m], yaw [rad]."""
     x, y = rotate(boxes.center[:, 0] - place[0], boxes.center[:, 1] - place[1], -place[2])
     return boxes[(boxes.label == "Car") & (x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])]
 
 
 @dataclass(frozen=True)
 class Precision(Record):
-    """AP of the cars in the vehicle's field, hidden ones too, with intervals over scenarios."""
+    """AP of the cars in the vehicle's field, hidden ones included, with bootstrap intervals over scenarios."""
 
     vehicle: Estimate  # alone
-    fused: Estimate  # with what poles send
-    gain: Estimate  # of the second over the first, of the same looks
+    fused: Estimate  # with the messages of poles
+    gain: Estimate  # paired difference
 
     def line(self) -> str:
-        """Return it in words."""
+        """Return the precision in words."""
         both = f"{self.vehicle.describe()}, with the poles {self.fused.describe()}"
         return f"AP of the vehicle alone {both}, with less without {self.gain.describe(sign=True)}"
 
 
 def measure_precision(tally: FusionTally) -> Precision | None:
-    """Return AP of the vehicle alone and with poles by the looks of a tally; None where there are no cars."""
+    """Return the AP of the vehicle alone and with poles for a tally; None without cars."""
     if not sum(map(len, tally.targets)):
         return None
     none = [Boxes.empty()] * len(tally.targets)
-    own, fused = (match(each, tally.targets, none, OVERLAP, "bev") for each in (tally.own, tally.fused))
+    own, fused = (match(detections, tally.targets, none, OVERLAP, "bev") for detections in (tally.own, tally.fused))
 
     def estimate(measure: Callable[[NDArray[np.int64]], Array]) -> Estimate:
         value = float(measure(np.ones((1, len(none)), np.int64))[0])
@@ -200,9 +205,9 @@ def measure_precision(tally: FusionTally) -> Precision | None:
 
 @dataclass(frozen=True)
 class ClosedLoopGain(Record):
-    """Gain of roadside sensors in closed loop, over the same drives with and without them."""
+    """Benefit of roadside sensors in closed loop, by the same drives with and without them."""
 
-    poles: tuple[int, ...]
+    poles: tuple[int, ...]  # numbers in the town
     hidden: Hidden
     precision: Precision | None  # None where there are no cars
     latency_s: float | None  # mean age of a message on arrival; None where none arrived
@@ -216,20 +221,20 @@ class ClosedLoopGain(Record):
             lines.append(self.precision.line())
         late = "no message arrived" if self.latency_s is None else f"messages are {self.latency_s:.3f} s old on arrival"
         for name, drives in (("without poles", self.without), ("with poles", self.with_poles)):
-            ttc, near = (
-                float(np.mean([getattr(own, each) for own in drives])) for each in ("least_ttc_s", "near_share")
-            )
-            faults, score = sum(own.faults for own in drives), float(np.mean([own.score for own in drives]))
-            reds = plural(sum(own.red_lights for own in drives), "red light")
+            ttc = float(np.mean([drive.least_ttc_s for drive in drives]))
+            near = float(np.mean([drive.near_share for drive in drives]))
+            faults = sum(drive.faults for drive in drives)
+            score = float(np.mean([drive.score for drive in drives]))
+            reds = plural(sum(drive.red_lights for drive in drives), "red light")
             lines.append(
                 f"{name}: least time to collision {ttc:.2f} s, below 1.5 s for {near:.1%} of the time, "
                 f"{plural(faults, 'collision')} at fault, {reds} passed, driving score {score:.2f}"
             )
-        names = [own.scenario for own in self.without]
+        names = [drive.scenario for drive in self.without]
         if len(set(names)) > 1:
-            gaps = {each: paired_difference(self.without, self.with_poles, names, each) for each in GAINS}
-            told = ", ".join(f"{words} {gaps[each].describe(sign=True)}" for each, words in GAINS.items())
-            lines.append(f"with less without, paired: {told}")
+            gaps = {measure: paired_difference(self.without, self.with_poles, names, measure) for measure in GAINS}
+            changes = ", ".join(f"{words} {gaps[measure].describe(sign=True)}" for measure, words in GAINS.items())
+            lines.append(f"with less without, paired: {changes}")
         return [*lines, late]
 
 
@@ -241,12 +246,13 @@ def measure_pole_gain(
     progress: Report = ignore_progress,
 ) -> ClosedLoopGain:
     """Return the benefit of roadside units on poles of the scenarios' town; raises `InputError` for an unknown pole."""
-    tally, without, with_poles = FusionTally(), list[DriveResult](), list[DriveResult]()
+    tally = FusionTally()
+    without, with_poles = list[DriveResult](), list[DriveResult]()
     pairs = [(scenario, seed) for scenario in scenarios for seed in seeds]
     for done, (scenario, seed) in enumerate(pairs, start=1):
         without.append(drive_scenario(scenario, seed, NetworkPerception, loop))
         with_poles.append(
-            drive_scenario(scenario, seed, lambda staged, own: Cooperative(staged, own, poles, tally), loop)
+            drive_scenario(scenario, seed, lambda staged, number: Cooperative(staged, number, poles, tally), loop)
         )
         progress(done, len(pairs), scenario.name)
     late = float(np.mean(tally.latency_s)) if tally.latency_s else None

@@ -58,8 +58,8 @@ class MeteredGrid(LinkGrid):
     Every message to a node is a downlink entry of the ledger, every reply an uplink entry. A reply over the budget is
     neither passed on nor entered: `BudgetExceeded` is raised instead. Nodes in `account.outages` of a round are
     replaced by an error with the reason. No message reaches an absent node; of an interrupted update, the transmitted
-    bytes are entered; replies before training, such as keys, arrive. A node whose update will be interrupted is told so
-    with the request, which stands for the acknowledgement that it would miss later.
+    bytes are entered; replies before training, such as keys, arrive. The request to a node whose update will be
+    interrupted says so, which stands for the acknowledgement that it would miss later.
     """
 
     def __init__(self, grid: Grid, account: Account, names: Mapping[int, str]) -> None:

@@ -1,4 +1,4 @@
-"""Records of the clock of rounds: work and times of each client, and why its update did not arrive."""
+"""Records of the clock of rounds: work and times of the clients, and the reasons of missing updates."""
 
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
@@ -25,13 +25,13 @@ class ClientTiming:
     server: str  # edge server at the start of the round, e.g. "pole3"
     round: int
     start_s: float  # its edge server starts to send the model
-    download_s: float  # duration; until it was dropped, if it was
-    compute_s: float
-    upload_s: float
-    end_s: float  # its update has arrived, or it was dropped
-    downloaded_bytes: int  # received by it
+    download_s: float  # duration, up to a drop
+    compute_s: float  # duration
+    upload_s: float  # duration
+    end_s: float  # arrival of its update, or drop
+    downloaded_bytes: int
     uploaded_bytes: int
-    dropped: str  # why its update did not arrive, e.g. "left the town"; empty where it did
+    dropped: str  # reason why its update did not arrive, e.g. "left the town"; empty where it did
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Simulated clock of federated rounds: transfers over links whose rates change as vehicles move, and computing.
+"""Simulated clock of federated rounds: transfers over links with time-varying rates, and computation.
 
 All rates are constant between two events (an instant of the trace, the end of a transfer or of a computation), so that
 the transferred bytes are the exact integral of the rates over time.
@@ -109,6 +109,7 @@ class ClientPhases:
         else:
             rates = shared_rates_bps(self.received[self.instant], self.server, transfers, self.links.radio)
         speed = np.where(self.phase == Phase.COMPUTE, 1.0, rates)  # (K,) bit/s; for computing, seconds per second
+        # An outage is timed from its first event without a rate, so that later events do not restart the timer.
         self.stalled_since[~(transfers & (speed == 0))] = np.inf
         self.stalled_since[transfers & (speed == 0) & np.isinf(self.stalled_since)] = self.time_s
         rows = np.flatnonzero(active)

@@ -67,7 +67,7 @@ def path_loss_db(
     TR 37.885, Table 6.2.1-1. Distances below `NEAREST_M` count as that. Raises ValueError for the state NLOS on a
     highway, which the report does not define.
 
-    >>> path_loss_db([50.0, 100.0], State.NLOS, 5.9).round(1)
+    >>> path_loss_db([50.0, 100.0], PathState.NLOS, 5.9).round(1)
     array([102.4, 111.4])
     """
     distance = np.maximum(np.asarray(distance_m, dtype=np.float64), NEAREST_M)
@@ -142,7 +142,7 @@ THERMAL_DBM_HZ = -174.0  # thermal noise at 290 K
 
 
 class Radio(Config):
-    """A V2X radio: carrier, power, receiver, and what it makes of a signal. Both ends are alike (a unit of UE type)."""
+    """A V2X radio: carrier, power, receiver, spectral efficiency. Both ends are alike (a roadside unit of UE type)."""
 
     environment: Environment = "urban"
     frequency_ghz: float = Field(default=5.9, ge=0.5, le=100)

@@ -42,7 +42,7 @@ class RadioLinks:
 
     @property
     def present(self) -> Mask:
-        """Return (T, V) whether each vehicle is in the town."""
+        """Return a mask (T, V) of the vehicles in the town."""
         return self.state[:, :, 0] >= 0
 
     @property
@@ -52,9 +52,9 @@ class RadioLinks:
 
     @property
     def rate_bps(self) -> Array:
-        """Return the rates (T, V, U) [bit/s] of vehicles that have a unit's whole band, without interference.
+        """Return the rates (T, V, U) [bit/s] of vehicles with a unit's whole band and without interference.
 
-        Measured rates are what they are.
+        Measured rates, if any, are returned unchanged.
         """
         if self.measured_bps is not None:
             return self.measured_bps[:, :, None]
@@ -226,20 +226,20 @@ def find_sight(
 
 
 def _occlude(walls: Assembly, starts: Array, ends: Array) -> Mask:
-    """Return (S,) whether a wall intersects the segments from `starts` to `ends` (S, 3) [m]."""
+    """Return a mask (S,) of the segments from `starts` to `ends` (S, 3) [m] that intersect a wall."""
     length = np.linalg.norm(ends - starts, axis=1)
     directions = (ends - starts) / np.maximum(length, 1e-9)[:, None]
     return walls.find_occluded(*(array.astype(np.float32) for array in (starts, directions, length)))
 
 
 class Wireline(Config):
-    """A cable between an edge server and the cloud, the same in both directions, used by nobody else."""
+    """A dedicated wireline link between an edge server and the cloud, the same in both directions."""
 
     rate_mbps: float = Field(default=1000.0, gt=0)
     latency_s: float = Field(default=0.01, ge=0, le=3600)
 
     def seconds(self, count: int) -> float:
-        """Return the time that a message of `count` bytes takes [s]; raises `InputError` for a negative count.
+        """Return the transmission time [s] of a message of `count` bytes; raises `InputError` for a negative count.
 
         >>> Wireline(rate_mbps=100, latency_s=0.02).seconds(1_000_000)
         0.1

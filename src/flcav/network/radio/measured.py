@@ -1,8 +1,8 @@
 """Measured throughput of vehicles (CSV), in place of the radio model.
 
-A table has a row per vehicle and time: `vehicle`, `time_s` [s], `mbps` [Mbit/s], and optionally `link`, wireless (also
-where it is missing) or wireline. A rate holds until the vehicle's next row, the last one as long as the longest before
-it; before the first and after the last a vehicle is not there. All of it repeats when the table ends.
+A table has a row per vehicle and time: `vehicle`, `time_s` [s], `mbps` [Mbit/s], and optionally `link`, wireless (the
+default) or wireline. A rate holds until the vehicle's next row, and the last one as long as the longest before it;
+before the first and after the last rate a vehicle is absent. The table repeats when it ends.
 """
 
 from collections.abc import Mapping, Sequence
@@ -22,7 +22,7 @@ from flcav.storage.columns import find_columns
 from flcav.storage.files import sha256
 from flcav.storage.records import read_csv
 
-NAMES: Mapping[str, Sequence[str]] = {  # other names of a column, as `find_columns` reads them
+NAMES: Mapping[str, Sequence[str]] = {  # alternative names of columns for `find_columns`
     "vehicle": ("vehicle_id", "veh", "vehicles", "ue", "ue_id", "node", "client", "car", "id", "name"),
     "time_s": ("time", "t", "timestamp", "seconds", "time_sec", "sec", "time_stamp"),
     "mbps": (
@@ -32,8 +32,8 @@ NAMES: Mapping[str, Sequence[str]] = {  # other names of a column, as `find_colu
     "link": ("link_type", "link_name"),
 }
 MOST_MBPS, MOST_S = 1e6, 1e10
-REPEATED_S = 6 * 3600.0  # for which a table is repeated: a round that takes longer ends there
-UNIT = "measured"  # the one unit of measured links
+REPEATED_S = 6 * 3600.0  # for which a table is repeated; a longer round ends there
+UNIT = "measured"  # name of the single unit of measured links
 
 
 @dataclass(frozen=True)
@@ -44,20 +44,20 @@ class Throughput:
     rates: Mapping[
         str, Mapping[str, tuple[Array, Array]]
     ]  # by link and vehicle: times (T,) [s] and rates (T,) [Mbit/s]
-    taken: tuple[str, ...] = ()  # how columns of other names were read, a sentence each
+    taken: tuple[str, ...] = ()  # a sentence for each column that was read under another name
 
     def mean_mbps(self, vehicle: str, link: str = "wireless") -> float:
-        """Return the mean rate of a vehicle on a link over the time that it was measured [Mbit/s].
+        """Return the time-averaged rate of a vehicle on a link [Mbit/s].
 
-        Raises `InputError` where it was not measured.
+        Raises `InputError` for a vehicle without measurements.
         """
         time_s, mbps = self.find(vehicle, link)
         return float(np.average(mbps, weights=_lasting(time_s)))
 
     def find(self, vehicle: str, link: str = "wireless") -> tuple[Array, Array]:
-        """Return the times [s] and rates [Mbit/s] of a vehicle, "region/vehicle", or of its name without the region.
+        """Return the times (T,) [s] and rates (T,) [Mbit/s] of a vehicle, named "region/vehicle" or only "vehicle".
 
-        Raises `InputError` where it was not measured.
+        Raises `InputError` for a vehicle without measurements.
         """
         known = self.rates[link]
         for name in (vehicle, vehicle.rpartition("/")[2]):
@@ -67,14 +67,14 @@ class Throughput:
 
 
 def load_throughput(path: Path | str, version: str | None = None) -> Throughput:
-    """Return the throughput in a CSV file; raises `InputError`, naming row and value, where it holds none.
+    """Return the throughput in a CSV file; raises `InputError` with row and value where the file is not valid.
 
-    version: SHA-256 of the file that is wanted; another one is refused.
+    With `version`, the SHA-256 of the expected file, another file is refused.
     """
-    found = sha256(Path(path)) if Path(path).is_file() else ""
-    if version not in (None, found):
+    digest = sha256(Path(path)) if Path(path).is_file() else ""
+    if version not in (None, digest):
         raise InputError(f"{path}: the measured rates were changed while the run was under way")
-    return _load(str(path), found)
+    return _load(str(path), digest)
 
 
 @lru_cache(maxsize=8)
@@ -97,17 +97,18 @@ def _load(path: str, _version: str) -> Throughput:
             raise InputError(f"{path}: row {row}: vehicle is empty")
         if wire not in LINKS:
             raise InputError(f"{path}: row {row}: link = {shorten(link)} must be {' or '.join(LINKS)}")
-        own, time_s = rows[wire].setdefault(name, {}), _number(time, "time_s", -MOST_S, MOST_S, f"{path}: row {row}")
-        if time_s in own:
+        series = rows[wire].setdefault(name, {})
+        time_s = _number(time, "time_s", -MOST_S, MOST_S, f"{path}: row {row}")
+        if time_s in series:
             raise InputError(f"{path}: row {row}: '{name}' has another row of {wire} at {time_s:g} s")
-        own[time_s] = _number(rate, "mbps", 0.0, MOST_MBPS, f"{path}: row {row}")
+        series[time_s] = _number(rate, "mbps", 0.0, MOST_MBPS, f"{path}: row {row}")
     if not rows[LINKS[0]]:
         raise InputError(f"{path}: has no wireless rates")
-    start = min(time for vehicles in rows.values() for own in vehicles.values() for time in own)
+    start = min(time for vehicles in rows.values() for series in vehicles.values() for time in series)
     rates = {
         link: {
-            name: (np.array(sorted(own)) - start, np.array([own[time] for time in sorted(own)]))
-            for name, own in vehicles.items()
+            name: (np.array(sorted(series)) - start, np.array([series[time] for time in sorted(series)]))
+            for name, series in vehicles.items()
         }
         for link, vehicles in rows.items()
     }
@@ -115,24 +116,25 @@ def _load(path: str, _version: str) -> Throughput:
 
 
 def link_measured(measured: Throughput, radio: Radio, vehicles: Sequence[str], region: str = "") -> RadioLinks:
-    """Return the measured wireless links of vehicles, "cav0" of the `region`, to one unit, repeated for `REPEATED_S`.
+    """Return the measured wireless links of vehicles to a single unit, repeated for `REPEATED_S`.
 
-    Nobody shares a band: a rate is what was measured. Raises `InputError` for a vehicle that was not measured.
+    Vehicles do not share a band: the rates are used as measured. Raises `InputError` for a vehicle without
+    measurements.
 
     Args:
         measured: rates of the vehicles.
-        radio: settings that the links are given, and that nothing is computed from.
-        vehicles: names of the vehicles, without their region.
-        region: their region; "": the names in the table are theirs.
+        radio: settings stored with the links; the rates do not depend on them.
+        vehicles: names of the vehicles without their region, such as "cav0".
+        region: region of the vehicles; "" if the table has no regions.
     """
     prefix = f"{region}/" if region else ""
-    own = [measured.find(prefix + name) for name in vehicles]
-    ends = [times[-1] + _lasting(times)[-1] for times, _ in own]
+    series = [measured.find(prefix + name) for name in vehicles]
+    ends = [times[-1] + _lasting(times)[-1] for times, _ in series]
     period_s = max(ends)
-    time_s = np.unique(np.concatenate([*(times for times, _ in own), ends, [0.0]]))
+    time_s = np.unique(np.concatenate([*(times for times, _ in series), ends, [0.0]]))
     time_s = time_s[time_s < period_s]
-    mbps = np.full((len(time_s), len(own)), np.nan)
-    for column, ((times, rates), end) in enumerate(zip(own, ends)):
+    mbps = np.full((len(time_s), len(series)), np.nan)
+    for column, ((times, rates), end) in enumerate(zip(series, ends)):
         latest = np.searchsorted(times, time_s, side="right") - 1
         there = (latest >= 0) & (time_s < end)
         mbps[there, column] = rates[latest[there]]
@@ -154,7 +156,7 @@ def link_measured(measured: Throughput, radio: Radio, vehicles: Sequence[str], r
 
 
 def _lasting(time_s: Array) -> Array:
-    """Return how long each rate holds (T,) [s], the last as long as the longest before it; a single one 1 s."""
+    """Return the durations (T,) [s] of rates that begin at `time_s`; the last is the longest of the others, or 1 s."""
     gaps = np.diff(time_s)
     return np.append(gaps, gaps.max(initial=0.0) or 1.0)
 

@@ -71,18 +71,18 @@ class LinkSummary:
 
     vehicle: str
     unit: str
-    mean_mbps: float
+    mean_mbps: float  # [Mbit/s]
     least_mbps: float
     most_mbps: float
     nearest_m: float
     farthest_m: float
-    los: float  # fractions of the instants in each state
-    nlosv: float
-    nlos: float
+    los: float  # fraction of the instants in line of sight
+    nlosv: float  # blocked by vehicles
+    nlos: float  # blocked by buildings
 
 
 def summarise_links(links: RadioLinks) -> tuple[LinkSummary, ...]:
-    """Return a summary of every link whose vehicle is in the town at some instant, vehicle by vehicle."""
+    """Return a summary of every link of the vehicles that are in the town at some instant."""
     rates = links.rate_bps / 1e6
     summaries = []
     for v, vehicle in enumerate(links.vehicle):
@@ -105,21 +105,21 @@ FINEST_M = 0.5  # least step of the grid
 
 @dataclass(frozen=True)
 class Coverage:
-    """Median rates on a grid of X times Y places in a town, each served by the unit of least path loss."""
+    """Median rates on a grid of X times Y cells in a town, served by the unit of least path loss."""
 
     unit: tuple[str, ...]  # (U,)
     site: Array  # (U, 3) [m, world]
     x: Array  # (X,) centres of the cells [m, world]
     y: Array  # (Y,) [m, world]
-    rate_bps: Array  # (Y, X)
+    rate_bps: Array  # (Y, X) [bit/s]
     state: NDArray[np.int8]  # (Y, X) `PathState` LOS or NLOS, to the serving unit
 
 
 def cover_town(town: Town, units: Mapping[str, Array], radio: Radio, step_m: float = 2.0) -> Coverage:
     """Return the radio coverage of a town by roadside units, on a grid.
 
-    Rates are those of a vehicle alone in the band, without shadowing, which is their median over it. Raises
-    `InputError` as `links.check_units`, and for a step below `FINEST_M`.
+    Rates are those of a vehicle alone in the band, without shadowing: the median over shadowing. Raises `InputError` as
+    `links.check_units`, and for a step below `FINEST_M`.
 
     Args:
         town: the town.

@@ -311,7 +311,7 @@ class ObjectsOutcomes:
     ) -> Outcomes:
         """Return the matches of each class and kind of overlap (`KEPT`), by frame, and the number of hidden objects.
 
-        asked: the classes and the range that count (None: the network's own), see `detect_frames`. Raises `InputError`
+        asked: the classes and the range that count, see `detect_frames`; None: the network's. Raises `InputError`
         where there are no frames, or one has no LiDAR.
         """
         read = frame_reader(data, network.config.foreground)

@@ -210,8 +210,8 @@ class SignsOutcomes:
         """Return the first configuration with the classes and sizes of all; raises `InputError` for none in common."""
         classes = tuple(name for name in configs[0].classes if all(name in config.classes for config in configs))
         if not classes or len({config.labels for config in configs}) > 1:
-            told = "; ".join(map(self.describe_targets, configs))
-            raise InputError(f"the networks look for nothing in common: {told}")
+            targets = "; ".join(map(self.describe_targets, configs))
+            raise InputError(f"the networks look for nothing in common: {targets}")
         return replace(configs[0], classes=classes, smallest_px=max(config.smallest_px for config in configs))
 
     def outcomes(
@@ -224,18 +224,19 @@ class SignsOutcomes:
     ) -> Outcomes:
         """Return detections and ground truth of each image, flattened, with the counts per image.
 
-        asked: a configuration of the classes and sizes that count; None: the network's own.
+        asked: a configuration with the classes and sizes that count; None: that of the network.
         """
-        own = asked or network.config
-        config = replace(network.config, classes=own.classes, smallest_px=own.smallest_px)
+        counted = asked or network.config
+        config = replace(network.config, classes=counted.classes, smallest_px=counted.smallest_px)
         recorded = _last_asked_for(data, config, tuple(frames))
-        number = np.array([[*own.classes, name].index(name) for name in network.config.classes])  # the last: no class
+        # Classes that do not count get the number after the last one.
+        number = np.array([[*counted.classes, name].index(name) for name in network.config.classes])
         found, truths = [], []
         for done, sample in enumerate(recorded, start=1):
             truths.append(SignTruth(sample.boxes, sample.label, sample.ignore))
             seen = detect_in_picture(network, sample.picture, threshold=LOWEST_SCORE)
             label = number[seen.label]
-            kept = label < len(own.classes)
+            kept = label < len(counted.classes)
             found.append(SignDetections(seen.box[kept], label[kept], seen.score[kept]))
             progress(done, len(recorded), "")
         arrays = {

@@ -227,14 +227,16 @@ class TrajectoryOutcomes:
     ) -> Outcomes:
         """Return the displacement errors of each sample [m], see `compute_errors`.
 
-        asked: a configuration by whose samples the network is tested, with as many of its likeliest modes; None: its
-        own.
+        asked: a configuration whose samples and number of modes (the likeliest ones) are tested; None: that of the
+        network.
         """
-        own, wanted = network.config, asked or network.config
-        samples = samples_of(data, replace(own, cameras=wanted.cameras and (own.cameras or wanted.cameras)), frames)
-        samples = Samples(data, samples.columns, own.cameras)
+        config = network.config
+        wanted = asked or config
+        cameras = wanted.cameras and (config.cameras or wanted.cameras)
+        samples = samples_of(data, replace(config, cameras=cameras), frames)
+        samples = Samples(data, samples.columns, config.cameras)
         paths, probabilities = predict_paths(network, samples, progress)
-        if wanted.modes < own.modes:
+        if wanted.modes < config.modes:
             likeliest = np.argsort(-probabilities, axis=1, kind="stable")[:, : wanted.modes]
             paths = np.take_along_axis(paths, likeliest[:, :, None, None], axis=1)
             probabilities = np.take_along_axis(probabilities, likeliest, axis=1)

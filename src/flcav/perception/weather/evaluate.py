@@ -184,8 +184,8 @@ class WeatherOutcomes:
         """Return the first configuration with the classes that all have; raises `InputError` for none in common."""
         classes = tuple(name for name in configs[0].classes if all(name in config.classes for config in configs))
         if not classes:
-            told = "; ".join(map(self.describe_targets, configs))
-            raise InputError(f"the networks look for nothing in common: {told}")
+            targets = "; ".join(map(self.describe_targets, configs))
+            raise InputError(f"the networks look for nothing in common: {targets}")
         return replace(configs[0], classes=classes)
 
     def outcomes(
@@ -198,8 +198,8 @@ class WeatherOutcomes:
     ) -> Outcomes:
         """Return the true class ("truth") and the predicted class ("named") of each image, as indices.
 
-        asked: a configuration of the classes whose images count (None: the network's own); another class that is
-        predicted has the number of these classes as its index.
+        asked: a configuration with the classes whose images count; None: that of the network. Predictions of other
+        classes have the number of these classes as their index.
         """
         classes = (asked or network.config).classes
         samples = label_pictures(data, classes, frames)

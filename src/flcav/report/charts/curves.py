@@ -1,6 +1,6 @@
 """Charts of the article's Fig. 3a: the three-layer graph, and learning curves with their points and bands.
 
-The graph joins tasks, networks, modalities and vehicles, a column each (Wang et al., IEEE Network 37(3), 2023).
+The graph joins tasks, networks, modalities and vehicles in four columns (Wang et al., IEEE Network 37(3), 2023).
 """
 
 from collections.abc import Sequence
@@ -15,12 +15,12 @@ from flcav.report import style
 
 COLUMNS = {"task": "tasks", "network": "networks", "modality": "modalities", "vehicle": "vehicles"}
 COLOURS = {"task": style.ORANGE, "network": style.BLUE, "modality": style.GREEN, "vehicle": style.MUTED}
-GAP = 3.0  # between columns, where a node's row is 1 high
+GAP = 3.0  # between columns; rows of nodes are 1 apart
 Node = tuple[str, str]  # kind, name
 NAME_HEIGHT = 0.11  # of the axes: two lines of text
 SERIES_COLOURS = (style.ORANGE, style.BLUE, style.GREEN, style.PURPLE, style.VERMILLION)
 Route = Sequence[tuple[int, int]]  # edge rounds, cloud rounds, at each x
-MOST_TICKS = 14  # that fit below the picture's own curves
+MOST_TICKS = 14  # number of rounds that fit below the curves
 
 
 @style.styled
@@ -33,7 +33,7 @@ def three_layers(graph: nx.Graph) -> Figure:
 
 
 def draw_layers(axes: Axes, graph: nx.Graph) -> None:
-    """Draw nodes by kind in columns, and edges; an edge to a vehicle is as wide as the quality of its data."""
+    """Draw nodes in columns by kind, and edges, whose width grows with the quality of a vehicle's data."""
     places = layout(graph)
     for one, other, edge in graph.edges(data=True):
         (x0, y0), (x1, y1) = sorted((places[one], places[other]))
@@ -60,19 +60,20 @@ def _draw_node(axes: Axes, graph: nx.Graph, node: Node, x: float, y: float) -> N
 
 
 def _note(graph: nx.Graph, node: Node) -> str:
-    """Return the number written beside a node's name: weight, model or sample size, uplink; of no uplink, the edge."""
-    kind, own = node[0], graph.nodes[node]
+    """Return the label next to a node's name: task weight, model or sample size, uplink, or else the edge server."""
+    kind, attributes = node[0], graph.nodes[node]
     if kind == "task":
         return f" · {next(iter(graph[node].values()))['weight']:.2g}"
     if kind == "network":
-        return f"\n{own['model_mb']:g} MB"
+        return f"\n{attributes['model_mb']:g} MB"
     if kind == "modality":
-        return f"\n{own['sample_mb']:g} MB/sample"
-    return f" · {own['uplink_mbps']['wireless']:g} Mbit/s" if own["uplink_mbps"] else f" · {own['edge']}"
+        return f"\n{attributes['sample_mb']:g} MB/sample"
+    uplink = attributes["uplink_mbps"]
+    return f" · {uplink['wireless']:g} Mbit/s" if uplink else f" · {attributes['edge']}"
 
 
 def layout(graph: nx.Graph) -> dict[Node, tuple[float, float]]:
-    """Return the position (x, y) of every node: a column per kind, centred, sorted by the barycentres of neighbours."""
+    """Return the position (x, y) of every node: a centred column per kind, sorted by the barycentres of neighbours."""
     columns = [[node for node, kind in graph.nodes(data="kind") if kind == column] for column in COLUMNS]
     tallest = max(map(len, columns))
     heights: dict[Node, float] = {}
@@ -95,9 +96,9 @@ class Curve:
     name: str  # written at its end
     x: Sequence[float]
     accuracy: Sequence[float]  # at each x
-    low: Sequence[float]  # band
+    low: Sequence[float]  # lower end of the band
     high: Sequence[float]
-    points: Sequence[tuple[float, float]]  # x, accuracy: what it was fitted to
+    points: Sequence[tuple[float, float]]  # x and accuracy of the fitted points
 
 
 @style.styled
@@ -124,9 +125,9 @@ def draw_power_curves(axes: Axes, curves: Sequence[Curve]) -> None:
 
 
 def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
-    """Draw accuracy along `route` (pretrained, edge rounds, cloud rounds): least, middle and most samples of `curves`.
+    """Draw accuracy along `route` (pretrained, edge rounds, cloud rounds).
 
-    `curves` has one for each number of samples, ascending.
+    `curves` are by ascending number of samples; of more than three, the first, middle and last are drawn.
     """
     if len(curves) > 3:
         curves = [curves[0], curves[len(curves) // 2], curves[-1]]
@@ -139,7 +140,7 @@ def draw_own_curves(axes: Axes, curves: Sequence[Curve], route: Route) -> None:
             axes.axvline(places_of[0] - 0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
             middle = (places_of[0] + places_of[-1]) / 2
             axes.text(middle, 0.02, stage, transform=axes.get_xaxis_transform(), ha="center", fontsize=style.SMALL)
-    step = 1 if len(route) <= MOST_TICKS else 2  # every second number of rounds, where all would touch
+    step = 1 if len(route) <= MOST_TICKS else 2  # every second number of rounds, where labels would touch
     named = [place for place, (edge, cloud) in enumerate(route) if (cloud or edge) % step == 0]
     axes.set_xticks(named, [str(route[place][1] or route[place][0]) for place in named])
     axes.set(xlabel="rounds of the stage; 0: pretrained", ylabel="AP50")

@@ -12,9 +12,9 @@ from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
 from flcav.storage.records import select
 
-WIDTH = 3.8  # [inch] of a figure that a phone shows
-TALLEST = 2.0  # height of a map in widths: a higher one is drawn narrower
-ACROSS = 2  # entries of a map's key in a line
+WIDTH = 3.8  # of a figure on a phone [inch]
+TALLEST = 2.0  # greatest height of a map, in widths; a higher map is drawn narrower
+ACROSS = 2  # entries of a map's legend per line
 EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
@@ -25,10 +25,10 @@ def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
     It has a title, coordinates, a scale bar, and the names of the streets that have one.
     """
     x_low, y_low, x_high, y_high = scene.town.bounds
-    bar = 0.9 if scene.heat else 0.0  # [inch] beside the map
-    beside = 0.9 + bar  # coordinates on both sides
+    bar = 0.9 if scene.heat else 0.0  # width of the colour bar [inch]
+    margins = 0.9 + bar  # coordinates on both sides
     high = width_in * min((y_high - y_low) / (x_high - x_low), TALLEST)
-    figure = style.canvas(width_in + beside, high + 1.7)
+    figure = style.canvas(width_in + margins, high + 1.7)
     axes = figure.add_subplot()
     maps.draw_errors(axes, scene)
     maps.draw_street_names(axes, scene)
@@ -40,12 +40,12 @@ def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
 
 @style.styled
 def before_after(sweep: clouds.ComparedSweep, extent: clouds.Extent = EXTENT) -> Figure:
-    """Return one sweep twice, one above the other, with the detections of each of two networks."""
+    """Return a sweep with the detections of a network before training, and below it with those after training."""
     figure = style.canvas(WIDTH, 2 * WIDTH)
-    for axes, found in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
-        clouds.draw_detections(axes, sweep, found, extent)
-        axes.set_title(found.title, fontweight="bold", pad=20)
-        style.key(axes, clouds.key(found), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
+    for axes, detections in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
+        clouds.draw_detections(axes, sweep, detections, extent)
+        axes.set_title(detections.title, fontweight="bold", pad=20)
+        style.key(axes, clouds.key(detections), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
         axes.set(xlabel="metres to the right", ylabel="metres ahead")
     return figure
 
@@ -54,7 +54,7 @@ def before_after(sweep: clouds.ComparedSweep, extent: clouds.Extent = EXTENT) ->
 def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figure:
     """Return a measure on validation frames after every round, and below it on test frames after every stage.
 
-    For the rows see `runs.draw_by_round` and `runs.draw_tested`.
+    Rows are as for `runs.draw_by_round` and `runs.draw_tested`.
     """
     figure = style.canvas(WIDTH, 1.35 * WIDTH)
     above, below = figure.subplots(2, height_ratios=(3, 2))
@@ -65,7 +65,7 @@ def by_round(rounds: Sequence[Row], tested: Sequence[Row], measure: str) -> Figu
 
 @style.styled
 def megabytes(rows: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
-    """Return the traffic of each stage on each link, against the budgets (link -> MB)."""
+    """Return the traffic of each stage on each link against the budgets by link [MB]."""
     figure = style.canvas(WIDTH, 0.55 * WIDTH)
     runs.draw_megabytes(figure.add_subplot(), rows, budgets)
     return figure
@@ -73,7 +73,7 @@ def megabytes(rows: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
 
 @style.styled
 def gains(costs: Sequence[ArmCost]) -> Figure:
-    """Return a measure against the uplink of arms, a panel per task."""
+    """Return the measures of arms against their uplink [MB], a panel per task."""
     tasks = dict.fromkeys(cost.task for cost in costs)
     figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(tasks))
     for axes, task in zip(figure.subplots(len(tasks), squeeze=False)[:, 0], tasks, strict=True):
@@ -85,7 +85,7 @@ def gains(costs: Sequence[ArmCost]) -> Figure:
 
 @style.styled
 def arms(towns: Mapping[str, Mapping[str, Estimate]], label: str = "AP50 (95 % interval)") -> Figure:
-    """Return a forest plot of AP50, or of what `label` says, by arm, a panel per town."""
+    """Return a forest plot of a measure, named by `label`, by arm, with a panel per town."""
     figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
     panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
     for axes, (town, rows) in zip(panels, towns.items(), strict=True):
@@ -115,9 +115,9 @@ def overview(
     maps.draw_errors(axes, scene)
     axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
     style.key(left, axes.get_legend_handles_labels()[0], ncols=ACROSS)
-    for axes, found in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
-        clouds.draw_detections(axes, sweep, found, EXTENT)
-        axes.set_title(found.title, fontweight="bold")
+    for axes, detections in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
+        clouds.draw_detections(axes, sweep, detections, EXTENT)
+        axes.set_title(detections.title, fontweight="bold")
         axes.set(xticks=[], yticks=[0, 20, 40])
     middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
     style.key(middle, clouds.key(), columnspacing=0.8)

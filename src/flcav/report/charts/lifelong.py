@@ -1,4 +1,4 @@
-"""Lifelong learning: a measure on each condition, by round of one run and by condition over seeds."""
+"""Charts of lifelong learning: the measure on each condition, by round of a run, and by condition over seeds."""
 
 from collections.abc import Mapping, Sequence
 
@@ -12,20 +12,20 @@ from flcav.statistics.estimates import Estimate
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY)  # of conditions, in turn
 ARM_COLOURS = (style.BLUE, style.ORANGE, style.MUTED)  # of arms, in turn
-APART = 0.06  # of arms along the horizontal axis
+APART = 0.06  # horizontal distance of arms
 
 
 def draw_lifelong(run: Run) -> dict[str, Figure]:
-    """Return the chart of each task of a run by the name of its picture; none where it has no lifelong learning."""
+    """Return the chart of each task of a run by the name of its picture; empty without lifelong learning."""
     arms = {task: [arm for arm in run.lifelong or () if arm.task == task] for task in run.recipe.tasks}
-    return {f"lifelong_{task.replace(':', '_')}": draw_rounds(own) for task, own in arms.items() if own}
+    return {f"lifelong_{task.replace(':', '_')}": draw_rounds(of_task) for task, of_task in arms.items() if of_task}
 
 
 @style.styled
 def draw_rounds(arms: Sequence[LifelongArm]) -> Figure:
-    """Return a measure on validation frames of each condition from when it comes, by round: a panel per arm.
+    """Return the measure on validation frames of each condition by round, from its beginning: a panel per arm.
 
-    Points at the beginning of a condition are of the network that drives there. Dashes: what a condition can reach.
+    The first point of a condition is that of the network before training there; the dashed line is the reachable score.
     """
     figure = style.canvas(6.4, 0.6 + 1.8 * len(arms))
     panels = figure.subplots(len(arms), sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -37,9 +37,9 @@ def draw_rounds(arms: Sequence[LifelongArm]) -> Figure:
                 colour = COLOURS[arm.conditions.index(condition) % len(COLOURS)]
                 rounds = start + np.arange(len(scores))
                 panel.plot(rounds, scores, color=colour, marker="o", markersize=3, linewidth=1.2)
-            length = max(len(each.passed[number].scores[passed.condition]) for each in arms)
-            own = COLOURS[number % len(COLOURS)]
-            panel.hlines(passed.reachable, start, start + length - 1, color=own, linestyle="dashed", linewidth=0.8)
+            length = max(len(other.passed[number].scores[passed.condition]) for other in arms)
+            colour = COLOURS[number % len(COLOURS)]
+            panel.hlines(passed.reachable, start, start + length - 1, color=colour, linestyle="dashed", linewidth=0.8)
             start += length
         panel.set(title=arm.arm, ylabel=arm.measure)
         panel.grid(axis="y")
@@ -55,9 +55,9 @@ def draw_rounds(arms: Sequence[LifelongArm]) -> Figure:
 
 @style.styled
 def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measure: str) -> Figure:
-    """Return a measure with its interval on each condition, a panel each: pretrained, and after each condition.
+    """Return the measure with its interval on each condition (a panel), pretrained and after each condition.
 
-    found: by condition, in their order, and arm.
+    `found` is by tested condition, in order, and by arm: pretrained, then after each condition.
     """
     conditions = [*found]
     figure = style.canvas(2.4 * len(conditions), 3.2)
@@ -65,9 +65,9 @@ def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measu
     for number, (panel, (condition, arms)) in enumerate(zip(panels, found.items(), strict=True)):
         for place, ((arm, means), colour) in enumerate(zip(arms.items(), ARM_COLOURS, strict=False)):
             at = np.arange(len(means)) + APART * (place - (len(arms) - 1) / 2)
-            panel.plot(at, [each.mean for each in means], color=colour, marker="o", markersize=3, label=arm)
-            for x, each in zip(at.tolist(), means, strict=True):
-                style.interval(panel, x, each, color=colour, linewidth=1.0)
+            panel.plot(at, [estimate.mean for estimate in means], color=colour, marker="o", markersize=3, label=arm)
+            for x, estimate in zip(at.tolist(), means, strict=True):
+                style.interval(panel, x, estimate, color=colour, linewidth=1.0)
         panel.axvspan(number + 0.5, number + 1.5, color=style.SIDEWALK, zorder=0)
         panel.set_xticks(range(len(conditions) + 1), ["start", *conditions], rotation=40, ha="right")
         panel.set(title=f"tested in {condition}")

@@ -1,4 +1,4 @@
-"""Non-IID data: what each vehicle of a region was dealt."""
+"""Chart of non-IID data: labels of each vehicle by class, as a partition dealt them."""
 
 from collections.abc import Mapping
 
@@ -22,21 +22,27 @@ def draw_partitions(run: Run) -> dict[str, Figure]:
 
 @style.styled
 def draw_dealt(dealt: Mapping[str, Partitioned]) -> Figure:
-    """Return stacked bars of each vehicle's labels by class: a panel per partition, by its title."""
-    figure = style.canvas(6.4, 0.8 + 0.5 * len(dealt) + 0.17 * sum(len(each.vehicles) for each in dealt.values()))
-    ratios = [len(each.vehicles) + 1 for each in dealt.values()]
+    """Return stacked bars of the vehicles' labels by class: a panel per partition, by title."""
+    figure = style.canvas(
+        6.4, 0.8 + 0.5 * len(dealt) + 0.17 * sum(len(partition.vehicles) for partition in dealt.values())
+    )
+    ratios = [len(partition.vehicles) + 1 for partition in dealt.values()]
     panels = figure.subplots(len(dealt), squeeze=False, gridspec_kw={"height_ratios": ratios})[:, 0]
-    classes = sorted({label for each in dealt.values() for own in each.vehicles.values() for label in own.labels})
+    classes = sorted(
+        {label for partition in dealt.values() for vehicle in partition.vehicles.values() for label in vehicle.labels}
+    )
     colours = dict(zip(classes or [SAMPLES], _colours(max(len(classes), 1)), strict=True))
-    for panel, (title, each) in zip(panels, dealt.items(), strict=True):
-        names = [name.rpartition("/")[2] for name in each.vehicles]
+    for panel, (title, partition) in zip(panels, dealt.items(), strict=True):
+        names = [name.rpartition("/")[2] for name in partition.vehicles]
         left = np.zeros(len(names))
         for label, colour in colours.items():
-            held = [own.labels.get(label, 0) if classes else own.samples for own in each.vehicles.values()]
+            held = [
+                vehicle.labels.get(label, 0) if classes else vehicle.samples for vehicle in partition.vehicles.values()
+            ]
             panel.barh(names, held, left=left, color=colour, height=0.7)
             left += held
         panel.invert_yaxis()
-        panel.set(title=f"{title}: by {each.by}")
+        panel.set(title=f"{title}: by {partition.by}")
         panel.grid(axis="x")
     panels[-1].set(xlabel="labels" if classes else SAMPLES)
     style.key(figure, [Patch(color=colour, label=label) for label, colour in colours.items()], ncols=4)
@@ -44,5 +50,14 @@ def draw_dealt(dealt: Mapping[str, Partitioned]) -> Figure:
 
 
 def _colours(count: int) -> list[str]:
-    own = [style.BLUE, style.ORANGE, style.GREEN, style.VERMILLION, style.PURPLE, style.SKY, style.MUTED, style.RULE]
-    return [own[number % len(own)] for number in range(count)]
+    palette = [
+        style.BLUE,
+        style.ORANGE,
+        style.GREEN,
+        style.VERMILLION,
+        style.PURPLE,
+        style.SKY,
+        style.MUTED,
+        style.RULE,
+    ]
+    return [palette[number % len(palette)] for number in range(count)]

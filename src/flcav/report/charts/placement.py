@@ -1,4 +1,4 @@
-"""Charts of placement: what sensors cover, and what vehicles learn from each pole against what predicts it."""
+"""Charts of sensor placement: coverage of errors, and gains of vehicles by pole against their predictors."""
 
 from collections.abc import Mapping, Sequence
 
@@ -8,14 +8,14 @@ from matplotlib.figure import Figure
 from flcav.report import style
 
 SEED_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION)
-SEED_MARKERS = ("o", "s", "^")  # after so many seeds as there are colours the next one
+SEED_MARKERS = ("o", "s", "^")  # the next one once all colours are used
 
 
 @style.styled
 def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[float, float]]]]) -> Figure:
-    """Return gain in AP50 against a predictor, a row of panels per choice of frames.
+    """Return the gain in AP50 against predictors, with a row of panels per choice of frames.
 
-    panels: by (frames, predictor) the points (predictor, gain) of each seed, a point for every pole.
+    `panels` has, by (frames, predictor) and seed, a point (predictor, gain) for every pole.
     """
     rows, columns = (list(dict.fromkeys(key[axis] for key in panels)) for axis in (0, 1))
     figure = style.canvas(3.6 * len(columns), 2.6 * len(rows) + 0.4)
@@ -41,26 +41,26 @@ def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[floa
 def draw_cover(
     shares: Mapping[str, Sequence[float]], kinds: Sequence[str], around: Mapping[str, Sequence[float | None]]
 ) -> Figure:
-    """Return shares of errors covered against the number of sensors, and errors around a pole by kind of scenario.
+    """Return the shares of covered errors against the number of sensors, and errors around a pole by kind of scenario.
 
-    The shares are of all errors, and of those that sensors on all poles together cover. shares: by town, of 1, 2, ...
-    sensors. around: by town, mean number of errors in reach of a pole of each of `kinds`;
-    None where the town has no such pole.
+    `shares` are by town, for 1, 2, ... sensors; they are drawn relative to all errors, and to those in reach of any
+    pole. `around` has by town the mean number of errors in reach of a pole for each of `kinds`, None without such a
+    pole.
     """
     figure = style.canvas(12.0, 3.4)
     left, middle, right = figure.subplots(1, 3)
     others = iter(style.OTHER_COLOURS)
     colours = {town: style.TOWN_COLOURS.get(town) or next(others) for town in shares}
-    for town, own in shares.items():
-        for axes, most in ((left, 1.0), (middle, own[-1] or 1.0)):
-            covered = [0.0, *(share / most for share in own)]
-            axes.plot(range(len(own) + 1), covered, "o-", color=colours[town], markersize=4, label=town)
+    for town, covered_by in shares.items():
+        for axes, most in ((left, 1.0), (middle, covered_by[-1] or 1.0)):
+            covered = [0.0, *(share / most for share in covered_by)]
+            axes.plot(range(len(covered_by) + 1), covered, "o-", color=colours[town], markersize=4, label=town)
     for row, (town, means) in enumerate(around.items()):
         known = [(place, mean) for place, mean in enumerate(means) if mean is not None]
         places = [place + (row - (len(around) - 1) / 2) * 0.16 for place, _ in known]
         right.bar(places, [mean for _, mean in known], width=0.14, color=colours[town])
-    for axes, of in ((left, "errors"), (middle, "errors in reach")):
-        axes.set(xlim=(0, None), ylim=(0, 1.02), xlabel="sensors, placed best", ylabel=f"share of {of} covered")
+    for axes, base in ((left, "errors"), (middle, "errors in reach")):
+        axes.set(xlim=(0, None), ylim=(0, 1.02), xlabel="sensors, placed best", ylabel=f"share of {base} covered")
     right.set_xticks(range(len(kinds)), kinds)
     right.set_ylabel("errors in reach of a pole, mean")
     for axes in (left, middle, right):

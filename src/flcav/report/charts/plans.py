@@ -34,7 +34,7 @@ class StageTraffic(TypedDict):
 
 @style.styled
 def megabytes(parts: Sequence[StageTraffic], links: Mapping[str, Mapping[str, float]]) -> Figure:
-    """Return a stacked bar per link, a part per task (colour) and stage (shade), against the budget [MB]."""
+    """Return a stacked bar per link, with parts by task (colour) and stage (shade), against the budget [MB]."""
     tasks = list(dict.fromkeys(row["task"] for row in parts))
     colours = dict(zip(tasks, TASKS, strict=False))
     figure = style.canvas(WIDTH, 0.72 * WIDTH + 0.1 * len(tasks))
@@ -65,7 +65,7 @@ def megabytes(parts: Sequence[StageTraffic], links: Mapping[str, Mapping[str, fl
 
 @style.styled
 def best_by_budget(sweep: Mapping[str, Sequence[BudgetPoint]], measure: str) -> Figure:
-    """Return the optimal objective, called `measure`, against the budgets, scaled together and one at a time."""
+    """Return the optimal objective, named `measure`, against the budgets, scaled together and one at a time."""
     figure = style.canvas(WIDTH, 0.8 * WIDTH)
     axes = figure.add_subplot()
     widths = dict(zip(LINKS, (5.0, 1.6, 1.6), strict=True))  # so that coinciding lines are both visible
@@ -88,14 +88,14 @@ def best_by_budget(sweep: Mapping[str, Sequence[BudgetPoint]], measure: str) -> 
 
 @dataclass(frozen=True)
 class StageReached:
-    """A number after a stage: prediction, mean over seeds with its interval, and value by seed."""
+    """A figure after a stage: prediction, mean over seeds with its interval, and values by seed."""
 
     predicted: float
     trained: MeanOverSeeds
     seeds: tuple[float, ...]
 
 
-ByStage = Mapping[str, StageReached]  # of each of `STAGES`
+ByStage = Mapping[str, StageReached]  # by `STAGES`
 
 
 @dataclass(frozen=True)
@@ -110,13 +110,13 @@ class PlansReached:
 def predicted_and_realised(budgets: Mapping[str, PlansReached], place: str) -> Figure:
     """Return AP50 of both plans after each stage in `place`, predicted and trained, and their paired differences.
 
-    A row of axes for each of the `budgets`, by name.
+    There is a row of axes for each of `budgets`, by name.
     """
     figure = style.canvas(9.0, 0.6 + 3.3 * len(budgets))
     rows = figure.subplots(len(budgets), 2, width_ratios=(3, 2), squeeze=False, sharey="col")
-    for (name, own), (left, right) in zip(budgets.items(), rows, strict=True):
-        _draw_ap(left, own.ap, f"budgets {name}: AP50, {place}")
-        _draw_differences(right, own.differences)
+    for (name, plans), (left, right) in zip(budgets.items(), rows, strict=True):
+        _draw_ap(left, plans.ap, f"budgets {name}: AP50, {place}")
+        _draw_differences(right, plans.differences)
     handles = [
         Line2D([], [], color=colour, marker="o", label=PLAN_NAMES[name]) for name, colour in PLAN_COLOURS.items()
     ]
@@ -133,12 +133,12 @@ def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], title: str) -> None:
     for side, (name, colour) in zip((-ASIDE, ASIDE), PLAN_COLOURS.items(), strict=True):
         places = [number + side for number in range(len(STAGES))]
         reached = [ap[name][stage] for stage in STAGES]
-        predicted = [each.predicted for each in reached]
+        predicted = [figures.predicted for figures in reached]
         axes.plot(places, predicted, color=colour, linestyle=(0, (3, 2)), marker="D", mfc="white")
-        axes.plot(places, [each.trained.mean for each in reached], color=colour, marker="o", linewidth=1.8)
-        for place, each in zip(places, reached, strict=True):
-            style.interval(axes, place, each.trained, color=colour, linewidth=1)
-            for seed in each.seeds:
+        axes.plot(places, [figures.trained.mean for figures in reached], color=colour, marker="o", linewidth=1.8)
+        for place, figures in zip(places, reached, strict=True):
+            style.interval(axes, place, figures.trained, color=colour, linewidth=1)
+            for seed in figures.seeds:
                 axes.plot(place, seed, ".", color=colour, alpha=0.5)
     axes.set_xticks(range(len(STAGES)), list(STAGES.values()))
     axes.set_title(title, fontweight="bold")
@@ -147,11 +147,11 @@ def _draw_ap(axes: Axes, ap: Mapping[str, ByStage], title: str) -> None:
 
 def _draw_differences(axes: Axes, differences: ByStage) -> None:
     for place, stage in enumerate(STAGES):
-        each = differences[stage]
-        style.interval(axes, place, each.trained, color=style.INK, linewidth=1.2)
-        axes.plot(place, each.trained.mean, "o", color=style.INK)
-        axes.plot(place - ASIDE, each.predicted, "D", color=style.MUTED, mfc="white")
-        for seed in each.seeds:
+        figures = differences[stage]
+        style.interval(axes, place, figures.trained, color=style.INK, linewidth=1.2)
+        axes.plot(place, figures.trained.mean, "o", color=style.INK)
+        axes.plot(place - ASIDE, figures.predicted, "D", color=style.MUTED, mfc="white")
+        for seed in figures.seeds:
             axes.plot(place + ASIDE, seed, ".", color=style.MUTED)
     axes.axhline(0, color=style.MUTED, linewidth=0.8)
     axes.set_xticks(range(len(STAGES)), list(STAGES.values()))

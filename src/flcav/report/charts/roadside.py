@@ -8,16 +8,16 @@ from matplotlib.figure import Figure
 from flcav.report import style
 
 ARM_COLOURS = (style.MUTED, style.SKY, style.BLUE)  # of the arms of a comparison, in their order
-WIDTHS = (5.0, 3.0, 1.3)  # of their lines: where they lie on each other, all are seen
+WIDTHS = (5.0, 3.0, 1.3)  # of their lines, so that coinciding lines are all visible
 
 
 @style.styled
 def draw_recall(
     edges_m: Sequence[float], lines: Mapping[str, Sequence[float | None]], unseen: Sequence[str], within_m: float
 ) -> Figure:
-    """Return recall against distance, a line per town: shares in the intervals between `edges_m`, None without cars.
+    """Return recall against distance, a line per town: shares in intervals between `edges_m` [m], None without cars.
 
-    Lines of the towns `unseen` are solid, others dotted; a rule marks `within_m`.
+    Lines of towns in `unseen` are solid, others dotted; a vertical line marks `within_m` [m].
     """
     figure = style.canvas(6.4, 3.4)
     axes = figure.subplots()
@@ -25,10 +25,10 @@ def draw_recall(
     colours = iter(style.OTHER_COLOURS)
     for town, shares in lines.items():
         values = np.array([np.nan if share is None else share for share in shares])
-        own = style.TOWN_COLOURS.get(town) or next(colours)
+        colour = style.TOWN_COLOURS.get(town) or next(colours)
         solid = town in unseen
         label = town if solid else f"{town} (trained there)"
-        axes.plot(middle, values, "o-" if solid else "o:", color=own, markersize=4, label=label)
+        axes.plot(middle, values, "o-" if solid else "o:", color=colour, markersize=4, label=label)
     axes.axvline(within_m, color=style.RULE, linewidth=1)
     axes.set(xlim=(0, within_m + 1), ylim=(0, 1.02), xlabel="distance from the pole [m]", ylabel="recall")
     axes.grid(axis="y")
@@ -38,9 +38,9 @@ def draw_recall(
 
 @style.styled
 def draw_errors(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float, float, float]]]]) -> Figure:
-    """Return AP50 against the size of an error, a panel per kind of error and a line per arm.
+    """Return AP50 against the size of an error, with a panel per kind of error and a line per arm.
 
-    A point is (size, mean, lowest, highest over seeds).
+    A point is (size, mean, least, greatest over seeds).
     """
     columns = 3
     rows = -(-len(panels) // columns)
@@ -63,13 +63,13 @@ def draw_errors(panels: Mapping[str, Mapping[str, Sequence[tuple[float, float, f
 
 @style.styled
 def draw_ranges(edges_m: Sequence[float], shares: Mapping[str, Sequence[float | None]]) -> Figure:
-    """Return recall against distance, a line per sensor: shares in the intervals of `edges_m`, None without cars."""
+    """Return recall against distance, a line per sensor: shares in intervals of `edges_m` [m], None without cars."""
     figure = style.canvas(6.4, 3.6)
     axes = figure.subplots()
     middle = (np.array(edges_m[:-1]) + np.array(edges_m[1:])) / 2
     colours = (style.SKY, style.GREEN, style.BLUE, style.INK, style.ORANGE, style.VERMILLION)
-    for number, (name, own) in enumerate(shares.items()):
-        drawn = np.array([np.nan if share is None else share for share in own])
+    for number, (name, recall) in enumerate(shares.items()):
+        drawn = np.array([np.nan if share is None else share for share in recall])
         axes.plot(middle, drawn, "o-", color=colours[number % len(colours)], markersize=4, label=name)
     axes.set(xlim=(0, edges_m[-1]), ylim=(0, 1.02), xlabel="distance from the pole [m]", ylabel="share of cars found")
     axes.grid(axis="y")

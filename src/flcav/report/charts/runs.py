@@ -13,15 +13,15 @@ from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
 from flcav.storage.records import select
 
-LINE, TALL = 0.07, 0.13  # height of a name, as a fraction of the axis: of rounds, and of tests, which is lower
+LINE, TALL = 0.07, 0.13  # height of a name as a fraction of the axis: in charts of rounds, and of tests
 STAGES = {PRETRAIN: "pretraining", EDGE: "edge FL", CLOUD: "cloud FL"}  # in their order
 
 
 def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
     """Draw the measure on validation frames after every round, a line per town.
 
-    `rounds` are the validation scores of `tabulate`. Round 0, of the pretrained network, stands before round 1 of edge
-    FL. All stages are equally wide, whatever their number of rounds.
+    `rounds` are the validation scores of `tabulate`. Round 0 is the pretrained network, before round 1 of edge FL. All
+    stages have the same width.
     """
     places = _places(rounds)
     lines = {
@@ -44,7 +44,8 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
     `tested` are rows of `tabulate`, one per stage and region.
     """
     stages = [stage for stage in STAGES if select(tested, stage=stage)]
-    towns, ends = list(dict.fromkeys(row.region for row in tested)), {}
+    towns = list(dict.fromkeys(row.region for row in tested))
+    ends = {}
     colours = {town: _colour(town, towns) for town in towns}
     for number, town in enumerate(towns):
         aside = 0.5 + 0.12 * (number - (len(towns) - 1) / 2)  # keeps intervals of towns apart
@@ -68,7 +69,7 @@ def _name_ends(
     height: float,
     column: Callable[[float], float] = int,
 ) -> None:
-    """Write the name of each line beside its end (x, y), without overlaps within a column of x, such as a stage."""
+    """Write the name of each line next to its end (x, y), without overlaps within a column of x, such as a stage."""
     low, top = axes.get_ylim()
     for at in dict.fromkeys(column(x) for x, _ in ends.values()):
         near = {name: end for name, end in ends.items() if column(end[0]) == at}
@@ -87,13 +88,13 @@ def _name_ends(
 
 
 def _colour(town: str, towns: Iterable[str]) -> str:
-    """Return the colour of a town: of `style.TOWN_COLOURS`, or else one of `style.OTHER_COLOURS` in turn."""
+    """Return the colour of a town: that of `style.TOWN_COLOURS`, or else the next of `style.OTHER_COLOURS`."""
     others = [name for name in dict.fromkeys(towns) if name not in style.TOWN_COLOURS]
     return style.TOWN_COLOURS.get(town) or style.OTHER_COLOURS[others.index(town) % len(style.OTHER_COLOURS)]
 
 
 def _places(rounds: Sequence[Row]) -> dict[str, dict[int, float]]:
-    """Return the x of every round, by stage; the n-th stage spans [n, n + 1]."""
+    """Return the x of every round by stage; stage n, from 0, spans [n, n + 1]."""
     numbers = {stage: sorted({row.round or 0 for row in rounds if _stage_of(row) == stage}) for stage in STAGES}
     taken = {stage: known for stage, known in numbers.items() if known}
     return {
@@ -107,7 +108,7 @@ def _stage_of(row: Row) -> str:
 
 
 def _mark_stages(axes: Axes, places: Mapping[str, Mapping[int, float]]) -> None:
-    """Write the stages' names above, draw their borders, and number the first and last round of each."""
+    """Write the stages' names above the axes, draw their borders, and number their first and last rounds."""
     for start, stage in enumerate(places):
         axes.text(start + 0.5, 1.02, STAGES[stage], transform=axes.get_xaxis_transform(), ha="center")
         if start:
@@ -126,9 +127,9 @@ def _draw_interval(axes: Axes, x: float, reached: Estimate, colour: str) -> None
 
 
 def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]) -> None:
-    """Draw a stacked bar of the uplink of each link, a part per stage, against a line at the link's budget [MB].
+    """Draw a stacked bar of each link's uplink [MB], with a part per stage and a line at the link's budget [MB].
 
-    `rows` are those of `tabulate` about an arm.
+    `rows` are the rows of an arm from `tabulate`.
     """
     spent = {link: select(rows, quantity=f"arms.spent.{link}.mb") for link in budgets}
     stages = list(dict.fromkeys(row.stage for of_link in spent.values() for row in of_link))
@@ -159,7 +160,7 @@ def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
     palette = cycle((style.BLUE, *style.OTHER_COLOURS, style.VERMILLION))
     colours = dict(zip((cost.arm for cost in costs), palette, strict=False))
     most = max(cost.uplink_mb for cost in costs)
-    at: dict[str, float] = {}  # by arm; bars at the same megabytes stand side by side
+    at: dict[str, float] = {}  # by arm; intervals at the same megabytes are drawn side by side
     for cost in costs:
         colour = colours[cost.arm]
         near = [x for x in at.values() if abs(x - cost.uplink_mb) < most / 50]
@@ -175,7 +176,7 @@ def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
 
 
 def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> None:
-    """Draw AP50 against uplink megabytes: a line per name, with the interval of each point."""
+    """Draw AP50 with intervals against uplink [MB], a line per name."""
     colours = (style.BLUE, *style.OTHER_COLOURS)
     for number, (name, points) in enumerate(lines.items()):
         colour = colours[number % len(colours)]
@@ -191,13 +192,13 @@ def draw_arms(axes: Axes, town: str, rows: Mapping[str, Estimate]) -> None:
     """Draw the forest plot of a town: mean and interval of each arm, with the numbers."""
     colour = _colour(town, [town])
     for y, ap in enumerate(rows.values()):
-        said = f"{ap.mean:.3f}"
+        text = f"{ap.mean:.3f}"
         if ap.low is not None and ap.high is not None:
-            said += f"  ({ap.low:.3f}–{ap.high:.3f})"
+            text += f"  ({ap.low:.3f}–{ap.high:.3f})"
             axes.plot([ap.low, ap.high], [y, y], color=colour, linewidth=2)
         axes.plot(ap.mean, y, "s", color=colour, markersize=6)
         axes.annotate(
-            said,
+            text,
             (1.0, y),
             (6, 0),
             xycoords=axes.get_yaxis_transform(),

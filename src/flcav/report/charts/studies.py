@@ -1,4 +1,4 @@
-"""Charts of studies: confusion matrices, bars of average precision, and final displacement errors."""
+"""Charts of studies: confusion matrices, bars of average precision, final displacement errors, and costs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,16 +15,16 @@ from flcav.statistics.seeds import MeanOverSeeds
 SHADES = LinearSegmentedColormap.from_list("shares", ["white", style.BLUE])
 SIDE_IN, LABELS_IN = 3.6, 1.1
 PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
-ABREAST = 3  # panels side by side, at most
+ABREAST = 3  # greatest number of panels side by side
 PREDICTOR_COLOURS = (style.RULE, style.BLUE, style.SKY)
 THICK = 0.26
 
 
 @style.styled
 def confusions(counts: Mapping[str, NDArray[np.int64]], classes: Sequence[str]) -> Figure:
-    """Return confusion matrices, a panel per title; a cell is the share of its row's class predicted as its column's.
+    """Return confusion matrices, a panel per title; a cell is the share of the row's class predicted as the column's.
 
-    `counts`: (classes, classes) numbers of pictures by title; a class without pictures is an empty row.
+    `counts` are numbers of pictures (classes, classes) by title; a class without pictures is an empty row.
     """
     names = [name.replace("_", " ") for name in classes]
     figure = style.canvas(SIDE_IN * len(counts) + LABELS_IN, SIDE_IN + LABELS_IN)
@@ -47,17 +47,17 @@ def confusions(counts: Mapping[str, NDArray[np.int64]], classes: Sequence[str]) 
 
 @dataclass(frozen=True)
 class Bar:
-    """One number of a test, drawn as a bar with a dot per seed."""
+    """A figure of a test, drawn as a bar with a dot per seed."""
 
     name: str
     mean: float  # over seeds
-    seeds: tuple[float, ...]  # its value by seed
+    seeds: tuple[float, ...]  # values by seed
     targets: int | None = None  # number of targets; None: a mean over the other bars
 
 
 @style.styled
 def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precision at IoU 0.5") -> Figure:
-    """Return a panel per title with a bar per number and a dot per seed; axes span [0, 1] and all values."""
+    """Return a panel per title with a bar per figure and a dot per seed; axes span [0, 1] and all values."""
     every = [value for bars in panels.values() for bar in bars for value in (bar.mean, *bar.seeds)]
     rows = max(len(bars) for bars in panels.values())
     columns = min(len(panels), ABREAST)
@@ -80,12 +80,12 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
     return figure
 
 
-Panels = Mapping[str, Mapping[str, Sequence[Bar]]]  # test -> slice, with its number of samples -> bars
+Panels = Mapping[str, Mapping[str, Sequence[Bar]]]  # bars by test and slice, named with its number of samples
 
 
 @style.styled
 def path_errors(panels: Panels) -> Figure:
-    """Return a panel per test with the final displacement error of each predictor in each slice, a dot per seed."""
+    """Return a panel per test with the final displacement errors [m] of predictors by slice, and a dot per seed."""
     figure = style.canvas(8.6, 3.3)
     axes_of = figure.subplots(1, len(panels), sharex=True, squeeze=False)[0]
     for number, (axes, (test, slices)) in enumerate(zip(axes_of, panels.items(), strict=True)):
@@ -124,7 +124,7 @@ def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
 def costs(
     panels: Mapping[str, Mapping[str, tuple[float, MeanOverSeeds]]], cost: str, measure: str, front: Sequence[str]
 ) -> Figure:
-    """Return a panel per title with a measure against its cost, named points with intervals; `front` joins some."""
+    """Return a panel per title with a measure against its cost: named points with intervals, joined along `front`."""
     figure = style.canvas(PANEL_IN * len(panels), 3.6)
     for axes, (title, points) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         best = sorted((points[name][0], points[name][1].mean) for name in front)

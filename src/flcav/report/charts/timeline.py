@@ -1,4 +1,4 @@
-"""Timeline of federated rounds: what every client, and the wireline, did when."""
+"""Timeline of federated rounds: transfers and computation of every client, and of the wireline."""
 
 from collections.abc import Sequence
 
@@ -18,7 +18,10 @@ COLOURS = {"download": style.SKY, "compute": style.RULE, "upload": style.BLUE, W
 
 @style.styled
 def timeline_of_rounds(records: Sequence[RoundTiming], width_in: float = 7.2) -> Figure:
-    """Return the rounds as bars over time, a row per client and one for the wireline; raises ValueError for none."""
+    """Return the rounds as bars over time, with a row per client and one for the wireline.
+
+    Raises ValueError without rounds.
+    """
     if not records:
         raise ValueError("a timeline needs at least one round")
     seen = {client.client for record in records for client in record.clients}

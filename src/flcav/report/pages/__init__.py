@@ -1,1 +1,1 @@
-"""HTML pages of a run and of a plan."""
+"""HTML pages of runs, plans, releases and drives."""

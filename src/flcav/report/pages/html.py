@@ -10,9 +10,9 @@ from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: str = "report.html.j2") -> str:
     """Return the page about `results` as HTML, with style and pictures embedded.
 
-    `pictures` are PNG files by name, as `run_page.draw` or `plan_page` names them; the page leaves out missing ones.
-    `template`: report.html.j2 about a run, plan.html.j2 about a plan, release.html.j2 about a release. Raises
-    `jinja2.UndefinedError` where `results` lack a value that the page shows.
+    `pictures` are PNG files by name, as in `run_page.draw` or `plan_page`; missing ones are left out. `template` is
+    report.html.j2 for a run, plan.html.j2 for a plan, release.html.j2 for a release. Raises `jinja2.UndefinedError`
+    where `results` lack a value of the page.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader("flcav", "report"), PackageLoader("flcav", "runs/extras")]),

@@ -1,4 +1,4 @@
-"""The HTML page about a plan: transfers, budgets and their sweep, comparison with simpler plans, and vehicles."""
+"""HTML page of a plan: transfers, budgets and their sweep, comparison with simpler plans, and vehicles."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
@@ -19,7 +19,7 @@ from flcav.report.charts import curves, plans
 from flcav.report.pages import html
 
 STAGES = {"samples": "samples", "edge_rounds": "edge rounds", "cloud_rounds": "cloud rounds"}
-SHOWN = 6  # tasks with a colour of their own; the others are drawn together
+SHOWN = 6  # number of tasks with separate colours; the others are drawn together
 BETTER = {  # effect of more megabytes on the objective
     "weighted": {"verb": "lower the weighted error", "gain": "weighted error saved"},
     "max-min": {"verb": "lower the largest error", "gain": "largest error saved"},
@@ -34,7 +34,7 @@ BASELINE_NAMES = {
 
 
 def plan_page(compared: PlanComparison, graph: nx.Graph | None = None) -> str:
-    """Return the page as self-contained HTML; `graph`: the three-layer graph that the problem was made from, if any."""
+    """Return the page as self-contained HTML; `graph` is the three-layer graph of the problem, if it has one."""
     results = plan_results(compared)
     pictures = {
         "megabytes": plans.megabytes(results["parts"], results["links"]),
@@ -53,7 +53,7 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
             "budget_mb": getattr(problem.budgets_mb, link),
             "used_mb": getattr(plan.used_mb, f"{link}_mb"),
             "share": getattr(plan.used_mb, f"{link}_mb") / getattr(problem.budgets_mb, link),
-            "more": [asdict(each) for each in compared.savings if each.link == link],
+            "more": [asdict(saving) for saving in compared.savings if saving.link == link],
         }
         for link in LINKS
     }
@@ -88,7 +88,8 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
 
 def _terms(problem: Problem, plan: Allocation) -> dict[str, str]:
     """Return the terms that the page defines, with their definitions."""
-    measure, saved = MEASURES[problem.objective], "gained" if problem.objective == "area" else "saved"
+    measure = MEASURES[problem.objective]
+    saved = "gained" if problem.objective == "area" else "saved"
     terms = {"error": TERMS["error"], measure: explain_objective(problem, plan.objective), "budget": TERMS["budget"]}
     terms[saved] = TERMS["saved"]
     used = (
@@ -119,7 +120,7 @@ def _stage_prices(problem: Problem, task: AllocationTask, row: TaskAllocation) -
 
 
 def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
-    """Return a row per vehicle: its samples and rounds of all tasks, and how long it sends and trains [s]."""
+    """Return a row per vehicle: samples and rounds of all tasks, uplink [MB], and time of sending and training [s]."""
     rows: dict[str, dict[str, Any]] = {}
     for task in problem.tasks:
         for share in shares.get(task.name, ()):
@@ -129,7 +130,7 @@ def _vehicles(problem: Problem, shares: Shares) -> list[dict[str, Any]]:
             row["mb"] += share.wireless_mb
             row["busy_s"] += share.busy_s
             row["parts"].append({"task": task.name, "samples": share.samples, "rounds": len(share.rounds)})
-    most = {task: max(len(share.rounds) for share in own) for task, own in shares.items()}
+    most = {task: max(len(share.rounds) for share in of_task) for task, of_task in shares.items()}
     for row in rows.values():
         row["missed"] = sum(most[part["task"]] - part["rounds"] for part in row["parts"])
     return list(rows.values())
@@ -157,10 +158,10 @@ def _proof(values: Mapping[str, Any]) -> str:
 def _link(name: str, link: Mapping[str, Any], verb: str) -> str:
     """Return the sentence on the use of a budget and on the gain of a larger one."""
     used = f"{link['used_mb']:,.0f} of {link['budget_mb']:,.0f} MB of the {name} budget are used"
-    if not any(each["saved"] for each in link["more"]):
-        most = max(each["added"] for each in link["more"])
+    if not any(step["saved"] for step in link["more"]):
+        most = max(step["added"] for step in link["more"])
         return f"{used}; up to {most:.0%} more of it would not {verb}."
-    by = " or ".join(f"{each['saved']:.2g} ({each['added']:.0%} more)" for each in link["more"])
+    by = " or ".join(f"{step['saved']:.2g} ({step['added']:.0%} more)" for step in link["more"])
     return f"{used}; more of it would {verb} by {by}."
 
 

@@ -1,4 +1,4 @@
-"""The HTML page about a release: what changed, for whom, the evidence, who acknowledged it, and all hashes."""
+"""HTML page of a release: changes, evidence, operational domain, acknowledgements, and hashes."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
@@ -28,7 +28,7 @@ GROUPS = {
     "bias": "Mean signed errors [m, rad]",
     "variance": "Variances: logarithm of these errors in predicted standard deviations",
 }
-WEAK = "not judged"  # of which the driving network reaches next to nothing, or in too few scenes
+WEAK = "not judged"  # guards on which the driving network scores near zero, or with too few scenes
 PARTIES = ("provider", "customer")
 MEANINGS = {"kept": "kept", "lost": "lost", "open": "not told"}
 STATES = {"kept": "held", "lost": "did-not-hold", "open": "undecided"}  # classes of style
@@ -42,12 +42,12 @@ def release_page(
 ) -> str:
     """Return the page as self-contained HTML.
 
-    hashes: SHA-256 of the candidate's files by name. acknowledgements: the parties' signatures so far.
+    `hashes` are the SHA-256 of the candidate's files by name, `acknowledgements` the parties' signatures so far.
     """
     groups = {
-        title: [_row(each) for each in verification.guards if each.by == by]
+        title: [_row(guard) for guard in verification.guards if guard.by == by]
         for by, title in GROUPS.items()
-        if any(each.by == by for each in verification.guards)
+        if any(guard.by == by for guard in verification.guards)
     }
     whole = None if verification.whole is None else _row(verification.whole)
     every = [row for rows in groups.values() for row in rows]
@@ -63,33 +63,33 @@ def release_page(
         "left": sorted(left, key=lambda row: row["spare"]),
         "domain": None if verification.domain is None else _domain(verification),
         "hashes": hashes,
-        "acknowledgements": [asdict(each) for each in acknowledgements],
-        "missing": [party for party in PARTIES if party not in {each.party for each in acknowledgements}],
-        "complete": bool(acknowledgements) and all(len(each.keys) >= each.threshold for each in acknowledgements),
-        "spent": [{**each.model_dump(), "mb": each.bytes / 1e6} for each in candidate.spent],
+        "acknowledgements": [asdict(signed) for signed in acknowledgements],
+        "missing": [party for party in PARTIES if party not in {signed.party for signed in acknowledgements}],
+        "complete": bool(acknowledgements) and all(len(signed.keys) >= signed.threshold for signed in acknowledgements),
+        "spent": [{**spent.model_dump(), "mb": spent.bytes / 1e6} for spent in candidate.spent],
     }
     return html.render(values, {}, "release.html.j2")
 
 
-def _row(each: Comparison) -> dict[str, Any]:
-    name = WORDS.get(each.name, each.name.replace("_", " ").replace(" x ", " × "))
-    change = each.candidate - each.driving
+def _row(guard: Comparison) -> dict[str, Any]:
+    name = WORDS.get(guard.name, guard.name.replace("_", " ").replace(" x ", " × "))
+    change = guard.candidate - guard.driving
     return {
-        **asdict(each),
+        **asdict(guard),
         "name": name,
         "change": change,
-        "word": WEAK if each.spare is None else MEANINGS[each.judgement],
-        "state": STATES[each.judgement],
+        "word": WEAK if guard.spare is None else MEANINGS[guard.judgement],
+        "state": STATES[guard.judgement],
     }
 
 
 def _scale(verification: CandidateVerification) -> dict[str, float] | None:
-    """Return the places of the interval, the mean, 0 and the margin on a bar, in percent of its width."""
+    """Return the positions of interval, mean and margin on a bar with 0 in its middle, in percent of its width."""
     whole = verification.whole
     if whole is None:
         return None
     ends = (whole.low, whole.high, -verification.margin, verification.margin)
-    reach = 1.25 * max(abs(each) for each in ends)
+    reach = 1.25 * max(abs(end) for end in ends)
     place = {
         "low": whole.low,
         "mean": whole.candidate - whole.driving,

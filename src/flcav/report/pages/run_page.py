@@ -1,4 +1,4 @@
-"""The HTML page and the pictures of a run, from its results and the files of its steps."""
+"""HTML page and pictures of a run, from its results and the files of its steps."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -40,11 +40,11 @@ from flcav.storage.files import write_bytes
 from flcav.storage.records import select
 
 OBJECTS = "objects"
-SHOWN_ROUNDS = 3  # of a region's timeline
+SHOWN_ROUNDS = 3  # number of rounds in a timeline
 
 
 class DrawSection(Protocol):
-    """A function that draws the pictures of a section."""
+    """Interface of functions that draw the pictures of a section."""
 
     def __call__(self, run: Run, /) -> dict[str, Figure]:
         """Return the pictures by name."""
@@ -52,9 +52,9 @@ class DrawSection(Protocol):
 
 
 def write_report(run: Run, out: Path | str) -> Path:
-    """Draw a run's pictures in `out`/pictures, write `out`/report.html, and return its path; `out` is the run's folder.
+    """Write pictures/*.png and report.html of a run to its folder `out`, and return the path of the page.
 
-    Raises `InputError` where the folders of its steps are gone.
+    Raises `InputError` where the folders of its steps are missing.
     """
     out = Path(out)
     pictures = draw(run, out / WORK)
@@ -66,7 +66,7 @@ def write_report(run: Run, out: Path | str) -> Path:
 
 
 def page(run: Run) -> dict[str, Any]:
-    """Return the values of the page, for its template."""
+    """Return the values of the page for its template."""
     recipe, main = run.recipe, run.arms[MAIN]
     first = recipe.with_role("federate")[0]
     return {
@@ -97,7 +97,7 @@ def page(run: Run) -> dict[str, Any]:
         "sections": run.list_sections(),
         "costs": _list_costs(run),
         "home": list_home_costs(run),
-        "statistics": [(stage.task, each) for stage in main.stages for each in stage.statistics or ()],
+        "statistics": [(stage.task, scores) for stage in main.stages for scores in stage.statistics or ()],
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
         "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
     }
@@ -108,8 +108,9 @@ def _list_costs(run: Run) -> Sequence[ArmCost]:
 
 
 def draw(run: Run, work: Path) -> dict[str, bytes]:
-    """Return the pictures as PNG files by name: maps, rounds by task and on the clock, and others."""
-    main, drawn = run.arms[MAIN], {}
+    """Return the pictures as PNG files by name: maps, measures by round, timelines, traffic and others."""
+    main = run.arms[MAIN]
+    drawn = {}
     scenes = [(placed, scene) for placed in main.placed if (scene := _map(run, work, placed)) is not None]
     for placed, scene in scenes:
         drawn[f"map_{placed.region}"] = figures.town_map(scene)
@@ -122,7 +123,7 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
         drawn |= load_named("chart", section.chart, {section.chart: section.chart}, DrawSection)(run)
     budgets = {link: use.budget_mb for link, use in main.links.items()}
     drawn["megabytes"] = figures.megabytes(select(rows, arm=MAIN), budgets)
-    if costs := [each for each in _list_costs(run) if each.gain_per_mb is not None]:
+    if costs := [cost for cost in _list_costs(run) if cost.gain_per_mb is not None]:
         drawn["gain"] = figures.gains(costs)
     sweep = _sweep(work, run.steps, run) if (work / LOOK).is_dir() else None
     if sweep is not None:
@@ -133,8 +134,9 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
 
 
 def _timelines(run: Run, work: Path) -> dict[str, Figure]:
-    """Return the first rounds of stage II of each arm on a network, by `_list_timelines`."""
-    task, names, drawn = next(iter(run.recipe.tasks)), run.steps, {}
+    """Return the timelines of the first rounds of stage II, as listed by `_list_timelines`; empty without a network."""
+    task, names = next(iter(run.recipe.tasks)), run.steps
+    drawn = {}
     for name, (arm, region) in _list_timelines(run).items():
         path = work / names.edge(arm, region, task) / f"{CLOCK}-{region}.parquet"
         records = load_rounds(path)[:SHOWN_ROUNDS] if path.exists() else ()
@@ -144,8 +146,9 @@ def _timelines(run: Run, work: Path) -> dict[str, Figure]:
 
 
 def _list_timelines(run: Run) -> dict[str, tuple[str, str]]:
-    """Return arm and region of each federation of the first task, by the name of its picture; shared ones once."""
-    task, names, listed = next(iter(run.recipe.tasks)), run.steps, {}
+    """Return arm and region of the stage-II federations of the first task, by picture; arms may share a federation."""
+    task, names = next(iter(run.recipe.tasks)), run.steps
+    listed = {}
     for arm, result in run.arms.items():
         for stage in result.stages:
             if stage.stage == EDGE and stage.region:
@@ -159,7 +162,7 @@ def _file_name(task: str) -> str:
 
 
 def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
-    """Return a region's errors and poles; None where its town, its poles or the tasks of the placement are missing."""
+    """Return the map of a region's errors and poles; None without a town, poles, or tasks of the placement."""
     names, tasks = run.steps, run.recipe.placement.tasks
     if not tasks:
         return None

@@ -1,4 +1,4 @@
-"""Bird's-eye view of a frame: points coloured by height, radar echoes, boxes, tracks, and the agent; ahead is up."""
+"""Bird's-eye view of a frame: points coloured by height, radar echoes, boxes, tracks and the agent, heading up."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,14 +25,14 @@ from flcav.world.shapes import SHAPES
 
 HEIGHTS_M = Normalize(0.0, 4.0, clip=True)
 SEDAN = next(shape for shape in SHAPES["car"] if shape.name == "sedan")
-MOVED_M = 1.0  # actors that move less are not drawn with a path
-STANDING_M_S = 0.5  # range rates up to this count as none
+MOVED_M = 1.0  # paths of actors that move less are not drawn
+STANDING_M_S = 0.5  # smaller range rates count as zero
 HEIGHT_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64)))
 
 
 @dataclass(frozen=True)
 class BirdseyeView:
-    """Content of the view: everything in the agent's frame, heights above ground."""
+    """Content of the view, in the agent's frame, with heights above ground."""
 
     points: NDArray  # (N, 3) x, y, height [m]
     truth: Boxes
@@ -41,14 +41,14 @@ class BirdseyeView:
     range_m: float = 50.0  # half the side of the square shown
     predictions: Boxes | None = None
     agent_size: tuple[float, float] | None = None  # length, width of a vehicle [m]; None is a pole
-    echoes: NDArray | None = None  # (E, 3) x, y and measured range rate [m/s, positive: receding] of radar echoes
-    tracks: Sequence[NDArray] = ()  # (T, 2) x, y of an actor over the scene, for each actor that moved
+    echoes: NDArray | None = None  # (E, 3) x, y [m] and range rate [m/s, positive: receding] of radar echoes
+    tracks: Sequence[NDArray] = ()  # paths (T, 2) x, y [m] of the moving actors over the scene
 
 
 def view_frame(dataset: Dataset | None, frame: Frame, *, range_m: float, tracks: bool = False) -> BirdseyeView:
-    """Return the view of a frame of `dataset`, `range_m` [m] to each side; with `tracks` its actors' paths as well.
+    """Return the view of a frame, `range_m` [m] to each side; with `tracks`, it has the actors' paths over the scene.
 
-    Without a dataset the ground is at the world's z = 0, and there are no paths.
+    Without a dataset the ground is at z = 0 of the world, and there are no paths.
     """
     agent_from_world = inverse(frame.world_from_agent)
     clouds = [transform_points(frame.agent_from_sensor[name], cloud[:, :3]) for name, cloud in frame.lidar.items()]
@@ -74,15 +74,16 @@ def view_frame(dataset: Dataset | None, frame: Frame, *, range_m: float, tracks:
 
 def _locate_echoes(frame: Frame) -> NDArray | None:
     """Return x, y [m, agent frame] and range rate [m/s] of all radar echoes (E, 3); None without radar."""
-    found = []
+    located = []
     for name, echoes in frame.radar.items():
         positions = echoes[:, :1] * compute_echo_directions(echoes)
-        found.append(np.column_stack((transform_points(frame.agent_from_sensor[name], positions)[:, :2], echoes[:, 3])))
-    return np.concatenate(found) if found else None
+        places = transform_points(frame.agent_from_sensor[name], positions)[:, :2]
+        located.append(np.column_stack((places, echoes[:, 3])))
+    return np.concatenate(located) if located else None
 
 
 def _collect_paths(dataset: Dataset, frame: Frame, agent_from_world: NDArray) -> list[NDArray]:
-    """Return the path (T, 2) [m, agent frame now] of each actor that the agent's frames of the scene show moving."""
+    """Return the paths (T, 2) [m, present agent frame] of the actors that move in the agent's frames of the scene."""
     path: dict[str, list[NDArray]] = {}
     for number, key in enumerate(dataset.keys):
         if (key.scene, key.agent) == (frame.scene, frame.agent):
@@ -157,7 +158,7 @@ def _draw_points(axes: Axes, points: NDArray) -> None:
 
 
 def _by_range_rate(echoes: NDArray | None) -> list[tuple[str, NDArray]]:
-    """Return the positions of approaching, receding and other radar echoes, with the colour of each kind."""
+    """Return the positions (N, 2) of approaching, receding and other radar echoes with their colours."""
     if echoes is None:
         return []
     rate = echoes[:, 2]

@@ -1,4 +1,4 @@
-"""Camera images with projected points and boxes, and with the annotated actors and signs."""
+"""Camera pictures with projected points and boxes, and with annotated actors and signs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,7 +26,7 @@ DISTANCES_M = Normalize(0, 60, clip=True)
 DISTANCE_COLOURS = ListedColormap(colormaps["turbo"](np.linspace(0.08, 0.92, 64))[::-1])
 ONE_IN, SHEET_IN = 8.0, 12.0  # width of a figure of one picture, and of several
 TITLE_IN = 0.32
-ONE_ROW = 3
+ONE_ROW = 3  # greatest number of cameras in a single row
 KINDS: Mapping[str, tuple[str, tuple[str, ...]]] = {  # name in the legend -> colour, categories
     "cars and vans": (style.BLUE, ("car", "van")),
     "trucks and buses": (style.PURPLE, ("truck", "bus")),
@@ -37,7 +37,7 @@ SIGNS = ("signs and lights", style.ORANGE)
 
 
 def show_view(axes: Axes, view: CameraView) -> None:
-    """Show the picture of a view; `axes` are in its pixels."""
+    """Show the picture of a view; the coordinates of `axes` are pixels, with (0, 0) at the centre of the first."""
     height, width = view.picture.shape[:2]
     axes.imshow(view.picture)
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
@@ -45,7 +45,7 @@ def show_view(axes: Axes, view: CameraView) -> None:
 
 
 def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView) -> ScalarMappable:
-    """Draw the points (N, >=3) inside the picture, coloured by distance; return the mappable of a colour bar."""
+    """Draw the points (N, >=3) [m] inside the picture, coloured by distance; return the mappable of a colour bar."""
     shown = points[view.shows(points[:, :3]), :3]
     distance = np.linalg.norm(shown, axis=1)
     order = np.argsort(-distance, kind="stable")
@@ -56,9 +56,9 @@ def points_on_picture(axes: Axes, points: NDArray[np.float32], view: CameraView)
 
 
 def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *, width: float = 1.0) -> None:
-    """Draw the edges of boxes (in the points' frame) as far as they are in front of the camera.
+    """Draw the edges of boxes, in the frame that `view` projects from, as far as they are in front of the camera.
 
-    A tick on the ground through the front shows the heading of each box.
+    A tick on the ground through the front shows the heading of a box.
     """
     corners = boxes.corners()
     foot, front = corners[:, :4].mean(axis=1), corners[:, (0, 3)].mean(axis=1)
@@ -77,26 +77,27 @@ def boxes_on_picture(axes: Axes, boxes: Boxes, view: CameraView, colour: str, *,
 
 @dataclass(frozen=True)
 class CameraShot:
-    """The picture of one camera with the annotations that it shows."""
+    """The picture of one camera with its visible annotations."""
 
     name: str
     view: CameraView  # projects points of the world frame
     boxes: Boxes  # (N,) of the visible actors, world frame, at the time of the picture
-    track: NDArray[np.str_]  # (N,) track of each of `boxes`
+    track: NDArray[np.str_]  # (N,) tracks of `boxes`
     signs: SignViews | None  # None for an infrared camera
 
 
 def make_shot(frame: Frame, camera: str) -> CameraShot:
     """Return the picture and the visible annotations of a frame's camera, by its true calibration.
 
-    Boxes are moved from the LiDAR spin to the time of the picture where their velocity is known. A thermal image
-    becomes grey, warm is bright.
+    Boxes with known velocity are moved from the time of the LiDAR spin to that of the picture. A thermal image becomes
+    grey, with warm pixels bright.
     """
     picture = frame.images[camera].rgb if camera in frame.images else thermal_grey(frame.infrared[camera])
     calibration, seen = frame.calibration, frame.annotations
-    late_s = calibration.offset_ms.get(camera, 0.0) / 1000  # after the LiDAR spin, which boxes are of
+    late_s = calibration.offset_ms.get(camera, 0.0) / 1000  # after the LiDAR spin, the time of the boxes
     boxes = replace(seen.boxes, center=seen.boxes.center + late_s * np.nan_to_num(seen.velocity))
-    camera_from_world, shows = inverse(frame.world_from_sensor(camera)), seen.views[camera].pixels != 0
+    camera_from_world = inverse(frame.world_from_sensor(camera))
+    shows = seen.views[camera].pixels != 0
     return CameraShot(
         name=camera,
         view=CameraView(picture, camera_from_world, calibration.intrinsics[camera], calibration.distortion[camera]),
@@ -107,9 +108,9 @@ def make_shot(frame: Frame, camera: str) -> CameraShot:
 
 
 def arrange_cameras(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
-    """Return the cameras in rows: those that look ahead from left to right, and below them those that look back.
+    """Return the cameras in rows: those that look ahead, from left to right, and below them those that look back.
 
-    Up to `ONE_ROW` cameras are in one row.
+    Up to `ONE_ROW` cameras form a single row.
     """
     yaw = {}
     for name in cameras:
@@ -122,7 +123,7 @@ def arrange_cameras(frame: Frame, cameras: Sequence[str]) -> list[list[str]]:
 
 @style.styled
 def camera_sheet(title: str, rows: Sequence[Sequence[CameraShot]], *, boxes: bool) -> Figure:
-    """Return the pictures in rows as one figure; `boxes`: also boxes of actors and rectangles of signs."""
+    """Return the pictures in rows as one figure; with `boxes`, it shows boxes of actors and rectangles of signs."""
     shots = [shot for row in rows for shot in row]
     width = ONE_IN if len(shots) == 1 else SHEET_IN
     aspects = [[shot.view.picture.shape[1] / shot.view.picture.shape[0] for shot in row] for row in rows]
@@ -133,12 +134,12 @@ def camera_sheet(title: str, rows: Sequence[Sequence[CameraShot]], *, boxes: boo
     for band, row, ratios in zip(bands, rows, aspects, strict=True):
         free = round(widest - sum(ratios), 6)
         grid = band.add_gridspec(1, len(row) + (free > 0), width_ratios=[*ratios, *([free] if free > 0 else [])])
-        for column, each in enumerate(row):
+        for column, shot in enumerate(row):
             axes = band.add_subplot(grid[column])
-            show_view(axes, each.view)
-            axes.set_title(f"{title} · {each.name}" if each is shots[0] else each.name)
+            show_view(axes, shot.view)
+            axes.set_title(f"{title} · {shot.name}" if shot is shots[0] else shot.name)
             if boxes:
-                _draw_truth(axes, each)
+                _draw_truth(axes, shot)
     if boxes:
         style.key(figure, _key(shots))
     return figure
@@ -153,7 +154,7 @@ def _draw_truth(axes: Axes, shot: CameraShot) -> None:
 
 
 def _key(shots: Sequence[CameraShot]) -> list[Patch]:
-    """Return the legend: colours with numbers of objects; an object in two pictures counts once."""
+    """Return the legend: colours with numbers of objects; an object in several pictures counts once."""
     label = np.concatenate([shot.boxes.label for shot in shots])
     track = np.concatenate([shot.track for shot in shots])
     found = [(name, colour, set(track[np.isin(label, kinds)])) for name, (colour, kinds) in KINDS.items()]
@@ -166,7 +167,7 @@ def _key(shots: Sequence[CameraShot]) -> list[Patch]:
 
 
 def thermal_grey(image: NDArray[np.uint16]) -> NDArray[np.uint8]:
-    """Return a thermal image (H, W) as a grey picture (H, W, 3), warm is bright, with a partly equalised histogram."""
+    """Return a thermal image (H, W) as a grey picture (H, W, 3), warm pixels bright, its histogram partly equalised."""
     rank = np.searchsorted(np.sort(image.ravel()), image) / image.size
     low, high = np.percentile(image, (30, 99.8))
     grey = 255 * (0.45 * rank + 0.55 * np.clip((image - low) / max(high - low, 1.0), 0, 1))

@@ -1,4 +1,4 @@
-"""Point clouds seen from above, with boxes and matched detections; a real frame beside its image."""
+"""Point clouds in bird's-eye view, with boxes and matched detections; a real frame with its camera image."""
 
 from dataclasses import dataclass
 
@@ -17,19 +17,19 @@ from flcav.report.pictures.camera import boxes_on_picture, show_view
 from flcav.sensors.frame import Frame
 from flcav.world.map.relief import Relief
 
-GROUND_M = 0.25  # returns less than this above the ground are drawn as ground
+GROUND_M = 0.25  # returns below this height are drawn as ground
 Extent = tuple[float, float, float]  # shown behind (negative), ahead, aside [m]
 EXTENT = (0.0, 60.0, 22.0)  # of a real frame
 
 
 @dataclass(frozen=True)
 class MatchedDetections:
-    """Detections of one network in a sweep, matched with the sweep's targets by the caller."""
+    """Detections of one network in a sweep, matched with the sweep's targets."""
 
     title: str
-    boxes: Boxes  # (N,) without those of neutral objects
-    hit: NDArray[np.bool_]  # (N,) matched with a target; else a false positive
-    found: NDArray[np.bool_]  # (M,) targets that a detection matched; else missed
+    boxes: Boxes  # (N,) without detections of neutral objects
+    hit: NDArray[np.bool_]  # (N,) whether matched with a target; otherwise a false positive
+    found: NDArray[np.bool_]  # (M,) whether a target was matched; otherwise missed
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ class ComparedSweep:
 
 
 def read_sweep(frame: Frame, lidar: str, relief: Relief | None) -> tuple[NDArray[np.float32], float]:
-    """Return the points of a vehicle's sweep and the z of the ground among them, as `ComparedSweep` has them."""
+    """Return the points of a vehicle's sweep and the z of the ground, for `ComparedSweep`."""
     points = frame.lidar[lidar]
     if relief is None:
         return points, -float(frame.agent_from_sensor[lidar][2, 3])
@@ -53,7 +53,7 @@ def read_sweep(frame: Frame, lidar: str, relief: Relief | None) -> tuple[NDArray
 
 
 def on_page(xy: NDArray) -> NDArray:
-    """Return points (..., 2), x ahead and y left, in page coordinates: to the right, up."""
+    """Return points (..., 2), x ahead and y to the left, in page coordinates (right, up)."""
     return np.stack((-xy[..., 1], xy[..., 0]), axis=-1)
 
 
@@ -70,7 +70,7 @@ def draw_points(axes: Axes, points: NDArray[np.float32], ground_m: float, extent
 def draw_boxes(
     axes: Axes, boxes: Boxes, colour: str, *, fill: float = 0.0, width: float = 1.2, dashed: bool = False
 ) -> None:
-    """Draw the footprints of `boxes`, filled with opacity `fill`, each with a tick in its heading."""
+    """Draw the footprints of `boxes`, filled with opacity `fill`, with ticks in the direction of their headings."""
     ahead = heading_vectors(boxes.yaw)
     tip = boxes.center[:, :2] + ahead * (boxes.size[:, :1] / 2 + 0.6)
     ticks = on_page(np.stack((boxes.center[:, :2], tip), axis=1))
@@ -105,9 +105,9 @@ def key(found: MatchedDetections | None = None) -> list[Patch]:
 def real_frame(
     name: str, points: NDArray[np.float32], view: CameraView, cars: Boxes, hit: NDArray[np.bool_], found: Boxes
 ) -> Figure:
-    """Return a real frame's cloud from above beside its image, with the labelled cars and the detections.
+    """Return a real frame's point cloud from above, next to its image, with the labelled cars and the detections.
 
-    `hit` (cars,): which cars were found at IoU 0.5.
+    `hit` (cars,) flags the cars that were detected at IoU 0.5.
     """
     figure = style.canvas(11.0, 4.9)
     above, ahead = figure.subplots(1, 2, width_ratios=(1, 1.55))

@@ -1,4 +1,4 @@
-"""The radio coverage of a town: rate by place, the edge of the line of sight, units, and the drives of vehicles."""
+"""Map of a town's radio coverage: rate by place, areas without line of sight, units, and drives of vehicles."""
 
 from typing import Any
 
@@ -24,7 +24,7 @@ from flcav.world.map.town import Town
 
 Array = NDArray[np.float64]
 
-STEPS = 8  # of the rate's colours
+STEPS = 8  # number of colours of the rate
 MARKS: dict[PathState, tuple[str, dict[str, Any]]] = {
     PathState.LOS: ("line of sight", {"color": "white", "markeredgecolor": style.INK}),
     PathState.NLOSV: ("behind a vehicle", {"color": style.ORANGE, "markeredgecolor": style.INK}),
@@ -36,9 +36,9 @@ EVERY_S = 2.0  # between two marks of a drive
 
 @style.styled
 def coverage_map(town: Town, coverage: Coverage, paths: Array | None = None, links: RadioLinks | None = None) -> Figure:
-    """Return the map of a town coloured by rate, with the units and, where given, the drives of vehicles.
+    """Return the map of a town coloured by rate, with the units and, if given, the drives of vehicles.
 
-    `paths` (T, V, 2) [m, world] are those of `links`; a mark has the state at the unit that serves best there.
+    `paths` (T, V, 2) [m, world] belong to `links`; marks show the state of the link to the unit of least loss.
     """
     x_low, y_low, x_high, y_high = town.bounds
     figure = style.canvas(7.2, 7.2 * (y_high - y_low) / (x_high - x_low) + 0.8)
@@ -68,7 +68,7 @@ def coverage_map(town: Town, coverage: Coverage, paths: Array | None = None, lin
 
 
 def _draw_rates(axes: Axes, coverage: Coverage) -> tuple[ListedColormap, BoundaryNorm]:
-    """Draw the rates, hatched without line of sight; return the colours and what they stand for [Mbit/s]."""
+    """Draw the rates, hatched without line of sight; return the colours and their norm [Mbit/s]."""
     rate = coverage.rate_bps / 1e6
     levels = np.linspace(0.0, max(float(np.ceil(rate.max())), 1.0), STEPS + 1)
     colours = ListedColormap(colormaps["YlGnBu"](np.linspace(0.05, 0.85, STEPS)))
@@ -100,8 +100,8 @@ def _draw_drives(axes: Axes, paths: Array, links: RadioLinks) -> None:
     marked = np.flatnonzero(np.diff(slots, prepend=-1.0) > 0)
     for v, vehicle in enumerate(links.vehicle):
         axes.plot(*paths[:, v].T, color=style.INK, linewidth=1.0, alpha=0.6, zorder=5)
-        for each, (_, look) in MARKS.items():
-            rows = marked[state[marked, v] == each]
+        for path_state, (_, look) in MARKS.items():
+            rows = marked[state[marked, v] == path_state]
             axes.plot(*paths[rows, v].T, "o", markersize=5, markeredgewidth=0.7, zorder=5, **look)
         first = np.flatnonzero(links.present[:, v])
         if len(first):

@@ -1,4 +1,4 @@
-"""Predictions of a network drawn on its input, by a function for each kind of mark, for every task."""
+"""Drawing of a network's predictions on its input, for all tasks, by kind of mark."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -21,9 +21,9 @@ from flcav.report.pictures.clouds import draw_boxes, on_page
 from flcav.report.pictures.predicted_paths import paths_key, paths_on_map
 
 WIDTH_IN = 8.0
-ABOVE_IN = 6.5  # side of a cloud seen from above
+ABOVE_IN = 6.5  # side of a cloud in bird's-eye view
 MAP_IN = 7.2  # side of a map
-BARS_IN = 3.6  # width of bars beside the input
+BARS_IN = 3.6  # width of bars next to the input
 COLOURS = {  # of classes with a customary colour
     "Car": style.BLUE,
     "Pedestrian": style.VERMILLION,
@@ -37,7 +37,7 @@ BOX: dict[str, Any] = {"facecolor": "none", "linewidth": 1.4}
 
 @dataclass(frozen=True)
 class Panels:
-    """The axes that marks are drawn into."""
+    """The axes for marks."""
 
     seen: Axes  # the picture, the cloud from above, or the map
     ahead: tuple[Axes, CameraView] | None  # above a cloud: a camera's picture of the same scene
@@ -45,23 +45,23 @@ class Panels:
 
 @style.styled
 def draw(finding: Finding) -> Figure:
-    """Return the network's input with all marks; bars are beside it, a camera's picture of the scene above a cloud.
+    """Return the network's input with all marks, bars next to it, and a camera's picture of the scene above a cloud.
 
-    Clouds and maps are seen from above, ahead of the observer is up. In a camera's picture the cloud is coloured by
-    distance, and boxes are drawn by their edges.
+    Clouds and maps are in bird's-eye view, with the observer's heading up. In a camera's picture the cloud is coloured
+    by distance, and boxes are drawn by their edges.
     """
     shares = [mark for mark in finding.marks if isinstance(mark, Bars)]
     view = finding.view() if finding.seen.ndim == 2 else None
     width, height = _size(finding.seen, view)
     figure = style.canvas(width + BARS_IN * len(shares), height)
-    own: FigureBase = figure
+    body: FigureBase = figure
     if shares:
         ratios = (width, *(BARS_IN for _ in shares))
-        own, *beside = figure.subfigures(1, 1 + len(shares), width_ratios=ratios, squeeze=False)[0]
-        for page, mark in zip(beside, shares, strict=True):
+        body, *side = figure.subfigures(1, 1 + len(shares), width_ratios=ratios, squeeze=False)[0]
+        for page, mark in zip(side, shares, strict=True):
             show_bars(page.add_subplot(), mark)
     captions = " · ".join(mark.caption for mark in finding.marks)
-    panels = _show(own, finding.seen, view, f"{finding.path.name} · {captions}" if captions else finding.path.name)
+    panels = _show(body, finding.seen, view, f"{finding.path.name} · {captions}" if captions else finding.path.name)
     handles: list[Artist] = []
     for mark in finding.marks:
         if not isinstance(mark, Bars):
@@ -69,7 +69,7 @@ def draw(finding: Finding) -> Figure:
     if finding.seen.ndim == 2:
         _frame_from_above(panels.seen, finding.marks)
     if handles:
-        style.key(own, handles)
+        style.key(body, handles)
     return figure
 
 
@@ -85,7 +85,7 @@ def _size(seen: NDArray[Any], view: CameraView | None) -> tuple[float, float]:
 
 
 def _show(page: FigureBase, seen: NDArray[Any], view: CameraView | None, title: str) -> Panels:
-    """Show the input; for a map, which its mark draws, only add the axes."""
+    """Show the input; a map is drawn by its mark, and only gets axes."""
     if view is None:
         axes = page.subplots()
         axes.set_title(title)
@@ -128,7 +128,7 @@ def _cloud_from_above(axes: Axes, points: NDArray[np.float32]) -> None:
 def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:
     """Set the limits of a cloud's axes so that all boxes are inside, and add a scale bar."""
     boxes = [mark.boxes for mark in marks if isinstance(mark, CloudBoxes)]
-    corners = [on_page(each.corners()[..., :2]).reshape(-1, 2) for each in boxes]
+    corners = [on_page(group.corners()[..., :2]).reshape(-1, 2) for group in boxes]
     across, up = np.concatenate([np.zeros((0, 2)), *corners]).T
     aside, ahead = (float(np.max(ends, initial=least) + 2) for ends, least in ((np.abs(across), 28), (up, 52)))
     behind = float(np.min(up - 2, initial=-6))
@@ -137,7 +137,7 @@ def _frame_from_above(axes: Axes, marks: Iterable[Mark]) -> None:
 
 
 def show_bars(axes: Axes, bars: Bars) -> None:
-    """Draw a bar per class, that of the predicted class in colour."""
+    """Draw a bar per class, with the predicted class in colour."""
     names, best = list(bars.share), bars.caption
     colours = [style.BLUE if name == best else style.RULE for name in names]
     drawn = axes.barh(names, list(bars.share.values()), color=colours)
@@ -149,12 +149,12 @@ def show_bars(axes: Axes, bars: Bars) -> None:
 
 
 def boxes_in_picture(axes: Axes, mark: PictureBoxes) -> None:
-    """Draw the rectangles on a picture that `axes` show; each names its class and score."""
+    """Draw rectangles with class and score on the picture shown by `axes`."""
     width = max(axes.get_xlim())
     for (x1, y1, x2, y2), name, score in zip(mark.box.tolist(), mark.label, mark.score, strict=True):
         colour = COLOURS.get(str(name), style.BLUE)
         axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=1.4))
-        right = x1 > 0.7 * width  # the name stays within the picture
+        right = x1 > 0.7 * width  # keeps the name within the picture
         axes.annotate(
             f"{name.replace('_', ' ')} {score:.2f}",
             (x2 if right else x1, y1),
@@ -174,19 +174,19 @@ def _draw_picture_boxes(panels: Panels, seen: NDArray[Any], mark: PictureBoxes) 
 
 def _draw_cloud_boxes(panels: Panels, seen: NDArray[Any], mark: CloudBoxes) -> list[Artist]:
     handles: list[Artist] = []
-    for name, own in _by_class(mark.boxes).items():
+    for name, of_class in _by_class(mark.boxes).items():
         colour = COLOURS.get(name, style.PURPLE)
-        draw_boxes(panels.seen, own, colour, width=1.4)
+        draw_boxes(panels.seen, of_class, colour, width=1.4)
         if panels.ahead is not None:
-            boxes_on_picture(panels.ahead[0], own, panels.ahead[1], colour)
-        handles.append(Patch(edgecolor=colour, label=f"{len(own)} {name}", **BOX))
+            boxes_on_picture(panels.ahead[0], of_class, panels.ahead[1], colour)
+        handles.append(Patch(edgecolor=colour, label=f"{len(of_class)} {name}", **BOX))
     return handles
 
 
 def _by_class(boxes: Boxes) -> dict[str, Boxes]:
     """Return the boxes by class, classes with a colour in `COLOURS` first."""
-    found = set(boxes.label.tolist())
-    names = [name for name in COLOURS if name in found] + sorted(found - COLOURS.keys())
+    present = set(boxes.label.tolist())
+    names = [name for name in COLOURS if name in present] + sorted(present - COLOURS.keys())
     return {name: boxes[boxes.label == name] for name in names}
 
 

@@ -1,4 +1,4 @@
-"""The map of a town with registered errors, candidate poles and the chosen ones."""
+"""Map of a town with registered errors, candidate poles and chosen poles."""
 
 import textwrap
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -42,17 +42,17 @@ KINDS = {
     "false_positive": ("false positive", FALSE_POSITIVE),
     "final_error": ("final error", FINAL_ERROR),
 }
-CROWDED = 30  # poles: of more than these, only the chosen ones and those of rules are numbered
-LONGEST = 3  # characters of an id for which a pole's mark has room
+CROWDED = 30  # number of poles above which only the chosen ones and those of rules are numbered
+LONGEST = 3  # greatest length of an id that fits a pole's mark
 LINE_EM = 0.52  # width of a character of the lines below a map, in ems
-CELL_M = 2.0  # of the map of the errors' density
-BLUR_M = 12.0  # standard deviation of its smoothing: half of a crossing
+CELL_M = 2.0  # cell size of the map of error density
+BLUR_M = 12.0  # standard deviation of its smoothing: half the width of a crossing
 HEAT = LinearSegmentedColormap.from_list("heat", ["#fff3e0", "#f6b26b", "#c0392b"])
 BARS_M = (10, 20, 50, 100, 200, 500, 1000, 2000)  # lengths of scale bars
-TURNED = 1e-3  # of a map's axes against east and north, above which its frame has no latitudes
-ROOM = 0.75  # of a name's length that a street has at least: the name may reach into its junctions
-DENSE = 120  # errors: more than these are drawn smaller
-DENSEST, MOST_VISIBLE = "densest traffic", "most visible objects"  # what the poles of conventional rules have
+TURNED = 1e-3  # rotation of the axes against east and north above which latitudes are left out
+ROOM = 0.75  # least ratio of a street's length to that of its name, which may reach into junctions
+DENSE = 120  # number of errors above which they are drawn smaller
+DENSEST, MOST_VISIBLE = "densest traffic", "most visible objects"  # conventional rules of placement
 HALO = [patheffects.withStroke(linewidth=2.5, foreground="white")]
 
 
@@ -62,22 +62,22 @@ class ErrorMap:
 
     town: Town
     errors: Array  # (E, 3) world [m]
-    kind: NDArray[np.str_]  # (E,) a key of KINDS, or a kind of a user's own
-    poles: Mapping[str, Array]  # candidate sites by id: (3,) world [m]
-    chosen: Mapping[str, float] = field(default_factory=dict)  # poles with a sensor: its range [m] by the pole's id
+    kind: NDArray[np.str_]  # (E,) a key of KINDS, or a user-defined kind
+    poles: Mapping[str, Array]  # candidate sites (3,) world [m] by id
+    chosen: Mapping[str, float] = field(default_factory=dict)  # range [m] of the sensors on chosen poles, by id
     covered: NDArray[np.bool_] | None = None  # (E,) whether a sensor covers the error; None: not shown
     viewsheds: Mapping[str, Viewshed] = field(default_factory=dict)  # of chosen poles, shown in place of their range
-    notes: Sequence[str] = ()  # lines on the placement, written below the map; by default the chosen poles
-    conventional: Mapping[str, Collection[str]] = field(default_factory=dict)  # ids of a rule's poles by what they have
-    zones: Mapping[str, float] = field(default_factory=dict)  # errors per hectare within `zone_m` of a pole, by its id
+    notes: Sequence[str] = ()  # lines on the placement below the map; by default the chosen poles
+    conventional: Mapping[str, Collection[str]] = field(default_factory=dict)  # ids of poles by conventional rule
+    zones: Mapping[str, float] = field(default_factory=dict)  # errors per hectare within `zone_m` of poles, by id
     zone_m: float = 0.0
     heat: bool = False  # whether to show the density of the errors
     title: str = ""  # above the map
-    noun: str = "error"  # what a place is called: "error", or "point" of the user's own
+    noun: str = "error"  # name of a place: "error", or "point" for user-defined places
 
 
 def poles_of(town: Town) -> dict[str, Array]:
-    """Return a town's candidate sites by id."""
+    """Return a town's candidate sites (3,) [m, world] by id."""
     return {str(number): xyz for number, xyz in zip(town.poles.id, town.poles.position, strict=True)}
 
 
@@ -98,9 +98,9 @@ def draw_town(axes: Axes, town: Town) -> None:
 
 
 def draw_coordinates(axes: Axes, town: Town) -> None:
-    """Draw the coordinates of the world frame [m] below and to the left of a map, latitude and longitude opposite.
+    """Draw coordinates of the world frame [m] below and to the left of a map, latitude and longitude opposite.
 
-    The latter are left out where the axes of the town's geo-reference are turned.
+    The latter are left out where the axes of the town's geo-reference are rotated.
     """
     for axis, side in ((axes.xaxis, "bottom"), (axes.yaxis, "left")):
         axis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10]))
@@ -135,7 +135,7 @@ def _map_linearly(
 
 
 def draw_street_names(axes: Axes, scene: ErrorMap) -> None:
-    """Write the names of the town's streets along them, once each, where there is room and no sensor."""
+    """Write the names of the town's streets along them, once per street, where there is room and no sensor."""
     figure = axes.figure.get_figure(root=True)
     metres_per_pt = (scene.town.bounds[2] - scene.town.bounds[0]) / (72 * figure.get_figwidth())
     taken = [scene.poles[number][:2] for number in scene.chosen]
@@ -155,9 +155,10 @@ def draw_street_names(axes: Axes, scene: ErrorMap) -> None:
 
 
 def draw_errors(axes: Axes, scene: ErrorMap) -> None:
-    """Draw the town, errors, zones and poles; write below what is placed, and the poles of conventional rules.
+    """Draw the town, errors, zones and poles, with lines below about the chosen poles and those of conventional rules.
 
-    A chosen pole is drawn with its viewshed or its range, a pole of a rule as a square, a covered error in blue.
+    A chosen pole is drawn with its viewshed or range, a pole of a conventional rule as a square, a covered error in
+    blue.
     """
     draw_town(axes, scene.town)
     if scene.heat and len(scene.errors):
@@ -174,7 +175,7 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
         axes.text(x, y - scene.zone_m, f"{per_hectare:.0f}/ha", ha="center", va="center_baseline", **look)
     _plot_poles(axes, scene)
     placed = scene.notes or ([f"placed: {name_poles(scene.chosen)}"] if scene.chosen else ())
-    rules = [f"{rule}: {name_poles(own)}" for rule, own in scene.conventional.items() if own]
+    rules = [f"{rule}: {name_poles(ids)}" for rule, ids in scene.conventional.items() if ids]
     width_pt = axes.figure.get_figure(root=True).get_figwidth() * 72 * axes.get_position().width
     wide = max(int(width_pt / (LINE_EM * style.SMALL)), 20)
     lines = [line for note in (*placed, *rules) for line in textwrap.wrap(note, wide, subsequent_indent="    ")]
@@ -182,46 +183,51 @@ def draw_errors(axes: Axes, scene: ErrorMap) -> None:
 
 
 def name_poles(ids: Collection[str]) -> str:
-    """Return "pole 2" or "poles 2, 3"."""
+    """Return ids of poles in words: "pole 2" or "poles 2, 3"."""
     return f"pole{'' if len(ids) == 1 else 's'} {', '.join(ids)}"
 
 
 def draw_reach(axes: Axes, at: Array, range_m: float, viewshed: Viewshed | None) -> None:
-    """Draw the range of a sensor `at` (3,) on the ground, filled where its viewshed is; all of it without one."""
-    reach = np.sqrt(max(range_m**2 - at[2] ** 2, 0.0))  # of the sphere, at ground level
+    """Draw the range of a sensor `at` (3,) [m] on the ground, filled within its viewshed, or entirely without one."""
+    reach = np.sqrt(max(range_m**2 - at[2] ** 2, 0.0))  # radius of the range's sphere at ground level
     look: dict[str, Any] = {"edgecolor": style.BLUE, "zorder": 1.5}
     if viewshed is None:
         axes.add_patch(Circle(tuple(at[:2]), reach, facecolor=style.BLUE, alpha=0.10, linewidth=0, zorder=1.5))
         axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, linewidth=1.2, **look))
         return
     axes.add_patch(Circle(tuple(at[:2]), reach, fill=False, linewidth=0.6, linestyle=":", **look))
-    smooth = gaussian_filter(viewshed.seen.astype(np.float64), 1.0)  # poles and lamps hide specks
+    smooth = gaussian_filter(viewshed.seen.astype(np.float64), 1.0)  # removes specks behind poles and lamps
     area = (viewshed.x, viewshed.y, smooth)
     axes.contourf(*area, [0.5, 1.5], colors=[style.BLUE], alpha=0.2, zorder=1.5)
     axes.contour(*area, [0.5], colors=[style.BLUE], linewidths=0.8, zorder=1.5)
 
 
 def _plot_errors(axes: Axes, scene: ErrorMap) -> None:
-    """Plot the errors by kind, of those with known coverage the covered ones in blue."""
+    """Plot the errors by kind, the covered ones in blue."""
     covered = np.zeros(len(scene.errors), np.bool_) if scene.covered is None else scene.covered
-    own_kinds = [kind for kind in dict.fromkeys(scene.kind.tolist()) if kind not in KINDS]
-    looks = KINDS | {kind: (kind, OTHERS[i % len(OTHERS)]) for i, kind in enumerate(own_kinds)}
+    other_kinds = [kind for kind in dict.fromkeys(scene.kind.tolist()) if kind not in KINDS]
+    looks = KINDS | {kind: (kind, OTHERS[i % len(OTHERS)]) for i, kind in enumerate(other_kinds)}
     rest = "" if scene.covered is None else ", uncovered"
     crowd = {"markersize": 3.5} if len(scene.errors) > DENSE else {}
     states = ((rest, ~covered, {}), (", covered", covered, {"color": style.BLUE}))
     for state, chosen, colour in states:
         for kind, (label, look) in looks.items():
-            if (own := (scene.kind == kind) & chosen).any():
-                name = f"{label}{state} ({own.sum()})"
+            if (of_kind := (scene.kind == kind) & chosen).any():
+                name = f"{label}{state} ({of_kind.sum()})"
                 axes.plot(
-                    *scene.errors[own, :2].T, linestyle="none", label=name, zorder=5.5, **{**look, **colour, **crowd}
+                    *scene.errors[of_kind, :2].T,
+                    linestyle="none",
+                    label=name,
+                    zorder=5.5,
+                    **{**look, **colour, **crowd},
                 )
 
 
 def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
-    """Plot the poles, with their ids in their marks; of a crowd only the chosen ones and those of rules have ids."""
-    ruled = {number for own in scene.conventional.values() for number in own}
-    crowded, known = len(scene.poles) > CROWDED, {*axes.get_legend_handles_labels()[1]}
+    """Plot the poles with their ids; of more than `CROWDED`, only the chosen ones and those of rules have ids."""
+    ruled = {number for ids in scene.conventional.values() for number in ids}
+    crowded = len(scene.poles) > CROWDED
+    known = {*axes.get_legend_handles_labels()[1]}
     for number, (x, y, _) in scene.poles.items():
         chosen = number in scene.chosen
         small = crowded and not chosen and number not in ruled
@@ -252,7 +258,7 @@ def _plot_poles(axes: Axes, scene: ErrorMap) -> None:
 
 
 def draw_density(axes: Axes, scene: ErrorMap) -> None:
-    """Draw the errors per hectare, smoothed by a Gaussian of BLUR_M, with a colour bar."""
+    """Draw the density of errors per hectare, smoothed by a Gaussian of `BLUR_M`, with a colour bar."""
     x_low, y_low, x_high, y_high = scene.town.bounds
     columns, rows = (max(round(size / CELL_M), 1) for size in (x_high - x_low, y_high - y_low))
     counts = np.histogram2d(

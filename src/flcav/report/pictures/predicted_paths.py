@@ -1,6 +1,6 @@
 """Predicted paths on the map: modes with their probability as opacity, ground truth, and constant velocity.
 
-The first mode, the single prediction, is the thickest.
+The first mode is the single prediction, with the thickest line.
 """
 
 from typing import Any
@@ -23,7 +23,7 @@ PREDICTED, TRUTH, PLAIN = style.BLUE, style.INK, style.ORANGE
 
 
 def paths_on_map(axes: Axes, layers: NDArray[np.bool_], paths: Paths) -> None:
-    """Draw the map (layers, H, W) around the observer with the predicted paths; ahead of the observer is up."""
+    """Draw the map (layers, H, W) around the observer with the predicted paths, the observer's heading up."""
     reach, observer = paths.reach_m, np.array(paths.observer)
     axes.set(xlim=(-reach, reach), ylim=(-reach, reach), aspect="equal")
     axes.imshow(_ground(layers), extent=(-reach, reach, -reach, reach), interpolation="antialiased")
@@ -68,7 +68,7 @@ def _draw_user(axes: Axes, user: RoadUser, observer: Array) -> None:
 
 
 def _on_page(points: Array, observer: Array) -> Array:
-    """Return the points (N, 2) of the world as distances to the right of the observer and ahead of it."""
+    """Return world points (N, 2) in page coordinates: distances to the right of the observer and ahead of it [m]."""
     x, y = (points - observer[:2]).T
     cos, sin = np.cos(observer[2]), np.sin(observer[2])
     return np.stack((sin * x - cos * y, cos * x + sin * y), axis=1)

@@ -1,7 +1,7 @@
-"""A scene as a Rerun recording: map, agents with their sensors' data, actors and their tracks.
+"""Rerun recording of a scene: map, agents with the data of their sensors, actors and their tracks.
 
-All spatial entities are below `world` (ENU, z up): an agent is `world/agents/<agent>`, its sensors are below it. There
-are two timelines: `spin`, and `time` of the simulation.
+All spatial entities are children of `world` (ENU, z up): an agent is `world/agents/<agent>`, its sensors are children
+of it. There are two timelines: `spin`, and the simulation's `time`.
 """
 
 from collections import defaultdict
@@ -34,8 +34,8 @@ Array = NDArray[np.float64]
 LIDAR_COLOURS = colormaps["turbo"]
 RADAR_COLOURS = colormaps["coolwarm"]
 RADAR_M_S = 15.0  # radial speed at the ends of the colour scale
-STEP_M = 2.0  # along a line of the map on slopes
-BEHIND_M = (-28.0, 0.0, 16.0)  # initial viewpoint, agent's frame
+STEP_M = 2.0  # greatest distance between the points of a line on slopes
+BEHIND_M = (-28.0, 0.0, 16.0)  # initial viewpoint in the agent's frame
 AGENTS = "world/agents"
 
 
@@ -46,7 +46,7 @@ def log_scene(
     town: Town | None,
     progress: Report = ignore_progress,
 ) -> None:
-    """Log the frames `selected` of one scene into a `rerun.RecordingStream`, with the map of its town, if known."""
+    """Log the `selected` frames of one scene to a `rerun.RecordingStream`, with the map of its town, if known."""
     recording.set_log_time_enabled(False)
     recording.set_log_tick_enabled(False)
     recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
@@ -66,9 +66,9 @@ def log_scene(
 
 
 def blueprint(spin: Sequence[Frame]) -> rrb.Blueprint:
-    """Return the initial layout of the viewer: the world from above and behind an agent, with its cameras beside.
+    """Return the initial layout of the viewer: the world from above and behind an agent, next to its cameras.
 
-    The agent is the first of the frames `spin` that has cameras, or the first of all.
+    The agent is the first one of the frames `spin` with a camera, or the first of all.
     """
     frame = next((frame for frame in spin if frame.images or frame.infrared), spin[0])
     behind, agent = frame.world_from_agent @ (*BEHIND_M, 1.0), frame.world_from_agent[:3, 3]
@@ -91,13 +91,13 @@ def _log_map(recording: rr.RecordingStream, layers: MapLayers, relief: Relief | 
     lines = {name: ([np.vstack((ring, ring[:1])) for ring in rings], hue) for name, (rings, hue) in outlines.items()}
     lines["lanes"] = [lane.centre_line for lane in layers.lanes if lane.kind != "walkingarea"], (35, 60, 80)
     lines["markings"] = [marking.line for marking in layers.markings], (235, 235, 235)
-    for name, (own, colour) in lines.items():
-        strips = [_lay_on_ground(line, relief) for line in own]
+    for name, (of_layer, colour) in lines.items():
+        strips = [_lay_on_ground(line, relief) for line in of_layer]
         recording.log(f"world/map/{name}", rr.LineStrips3D(strips, colors=colour, radii=0.05), static=True)
 
 
 def _lay_on_ground(line: Array, relief: Relief | None) -> Array:
-    """Return a line (K, 2) [m] on the ground, (K', 3): on a relief with a corner every `STEP_M` or less."""
+    """Return a line (K, 2) [m] laid on the ground (K', 3) [m]; on a relief with a point at least every `STEP_M`."""
     if relief is None:
         return np.column_stack((line, np.zeros(len(line))))
     dense = shapely.get_coordinates(shapely.segmentize(shapely.linestrings(line), STEP_M))
@@ -169,7 +169,7 @@ def _log_rectangles(recording: rr.RecordingStream, path: str, frame: Frame, came
 
 
 def _log_boxes(recording: rr.RecordingStream, path: str, boxes: Array, labels: list[str], colours: list) -> None:
-    from_corner = boxes.reshape(-1, 4) + 0.5  # Rerun's first pixel begins, ours has its centre at 0
+    from_corner = boxes.reshape(-1, 4) + 0.5  # Rerun has the first pixel's corner at 0, flcav its centre
     rectangles = rr.Boxes2D(
         array=from_corner, array_format=rr.Box2DFormat.XYXY, labels=labels, colors=colours, show_labels=False
     )
@@ -177,7 +177,7 @@ def _log_boxes(recording: rr.RecordingStream, path: str, boxes: Array, labels: l
 
 
 def _log_actors(recording: rr.RecordingStream, spin: list[Frame], tracks: dict[str, list[Array]]) -> None:
-    """Log the actors that any agent's annotations hold, and the track of each up to this spin."""
+    """Log the actors in the annotations of all agents, and their tracks up to this spin."""
     actors: dict[str, Boxes] = {}
     for frame in spin:
         for i, track in enumerate(frame.annotations.track.tolist()):

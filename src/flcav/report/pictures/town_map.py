@@ -1,4 +1,4 @@
-"""The map of a town: streets with their markings, buildings, trees, signs, lights, and numbered poles."""
+"""Map of a town: streets with their markings, buildings, trees, signs, lights, and numbered poles."""
 
 from collections.abc import Iterable
 from typing import Any
@@ -28,8 +28,8 @@ TREES, CROWN = "#9fb98a", "#86a371"
 CLUTTER = "#b3a999"
 LAMP = "#f2c94c"
 WIDE_IN = 10.0
-SUN = np.array([0.35, -0.5])  # offset of a shadow [m] for SHADOW metres of height
-SHADOW = 5.0
+SUN = np.array([0.35, -0.5])  # offset of a shadow x, y [m] for a height of `SHADOW`
+SHADOW = 5.0  # [m]
 
 
 @style.styled
@@ -95,20 +95,20 @@ def symbols(town: Town) -> list[tuple[str, dict[str, Any], Array]]:
 
 
 def shadow(house: Array, height: float) -> Array:
-    """Return the outline (K, 2) of a house and its shadow on the ground: their convex hull."""
+    """Return the convex hull (K, 2) [m] of a house's outline (4, 2) [m] and its shadow, for a `height` [m]."""
     both = MultiPoint(np.concatenate((house, house + SUN * height / SHADOW)))
     return shapely.get_coordinates(both.convex_hull)
 
 
 def footprint(x: float, y: float, yaw: float, length: float, width: float) -> Array:
-    """Return the corners (4, 2) of a rectangle with centre (x, y) and heading `yaw` [m, rad]."""
+    """Return the corners (4, 2) [m] of a rectangle with centre x, y [m], heading `yaw` [rad], length and width [m]."""
     corners = np.array([(-1, -1), (1, -1), (1, 1), (-1, 1)]) / 2 * (length, width)
     cos, sin = heading_vectors(yaw)
     return corners @ np.array([[cos, sin], [-sin, cos]]) + (x, y)
 
 
 def discs(axes: Axes, at: Array, diameter: Array, colour: str, edge: str = "none") -> None:
-    """Draw discs at (N, 2) with diameters (N,) [m]."""
+    """Draw discs at positions (N, 2) with diameters (N,) [m]."""
     axes.add_collection(
         EllipseCollection(
             diameter, diameter, np.zeros(len(at)), units="x", offsets=at, transOffset=axes.transData,
