@@ -8,7 +8,7 @@ import networkx as nx
 
 from flcav.network.ledger import LinkMegabytes
 from flcav.network.plan import StagePlan, price
-from flcav.optimization.allocation.allocate import Allocation, TaskAllocation, resolve_problem
+from flcav.optimization.allocation.allocate import Allocation, TaskAllocation, resolve_problem, settle_plan
 from flcav.optimization.allocation.budget_sweep import LINKS, BudgetPoint
 from flcav.optimization.allocation.comparison import PlanComparison
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
@@ -105,7 +105,7 @@ def _parts(problem: Problem, plan: Allocation) -> list[plans.StageTraffic]:
     shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}
     others = f"{len(ordered) - len(shown)} other tasks"
     totals: dict[tuple[str, str, str], float] = {}
-    for task, row in zip(problem.tasks, plan.tasks, strict=True):
+    for task, row in zip(settle_plan(problem, plan.tasks).tasks, plan.tasks, strict=True):
         for stage, cost in _stage_prices(problem, task, row).items():
             for link in LINKS:
                 key = (link, row.name if row.name in shown else others, stage)
