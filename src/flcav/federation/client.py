@@ -65,7 +65,8 @@ def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
     They are those of strategy and compression, the optimiser's where it is kept, and under local noise or masks the
     last answered request.
     """
-    keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
+    upload = rules.upload
+    keeps = isinstance(strategy, Exchanges | FedMD) or upload.compression == "top-k" or upload.feeds_back
     guards = wire.is_local(rules) or rules.secure is not None
     digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
     optimiser = (OPTIMISER,) if rules.keep_optimiser else ()
