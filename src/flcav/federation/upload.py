@@ -198,6 +198,37 @@ def decompress(upload: Upload, sent: Weights, like: Weights) -> Arrays:
             return {name: sent[name].astype(array.dtype) for name, array in like.items()}
 
 
+def encode_model(weights: Weights) -> Arrays:
+    """Return a model in 8 bits: learned arrays of single precision, rounded to the nearest level, and their scales.
+
+    `SCALES` has an entry for each array, NaN for those that are as they were.
+    """
+    single = {name: weights[name] for name in learned_names(weights) if weights[name].dtype == np.float32}
+    if not single:
+        return dict(weights)
+    sent, _ = compress(Upload(compression="int8", error_feedback=True), single, None, 0)
+    scale_of = dict(zip(single, sent[SCALES], strict=True))
+    scales = np.array([scale_of.get(name, np.nan) for name in weights], np.float32)
+    return {**{name: sent.get(name, array) for name, array in weights.items()}, SCALES: scales}
+
+
+def decode_model(sent: Weights) -> Arrays:
+    """Return the model that `encode_model` encoded, in single precision; one that is sent whole as it is."""
+    if SCALES not in sent:
+        return dict(sent)
+    arrays = {name: array for name, array in sent.items() if name != SCALES}
+    return {
+        name: array if np.isnan(scale) else array * scale
+        for (name, array), scale in zip(arrays.items(), sent[SCALES], strict=True)
+    }
+
+
+def restore_model(weights: Weights, start: Weights, whole: Weights) -> Arrays:
+    """Return `whole` plus the change from `start`, which clients got in place of it, to `weights`."""
+    lost = [name for name in whole if not np.array_equal(start[name], whole[name])]
+    return {**weights, **apply_change({name: whole[name] for name in lost}, find_change(weights, start, lost))}
+
+
 def find_change(weights: Weights, start: Weights, names: Sequence[str]) -> Arrays:
     """Return the change of the arrays `names` in a round, in the dtypes of `start`."""
     return {name: (weights[name].astype(np.float64) - start[name]).astype(start[name].dtype) for name in names}
