@@ -12,12 +12,12 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.links.ros_names import ROS_NAMESPACE
+from flcav.federation.local_steps import MEASURED, fit_local_steps
 from flcav.federation.rules import Rules
 from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.interface.notebook import Displayed
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
-from flcav.runs.local_steps import MEASURED, fit_local_steps
 from flcav.runs.registry import RECIPE_CHECKS, ArmFields, FederationFields, LabelFields, RecipeFields, load_all
 from flcav.sensors.rig import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
