@@ -61,7 +61,7 @@ def _count_rounds(values: Values, task: Values, name: str) -> int:
     """Return the edge rounds of a task, those in its cloud rounds included: of its plan, or the most by the limits."""
     plan, limits = _mapping(task, "plan"), _mapping(values, "limits")
     told = [plan.get(stage) if plan else limits.get(stage) for stage in ("edge_rounds", "cloud_rounds")]
-    counts = [each[-1] if isinstance(each, list | tuple) and each else each for each in told]
+    counts: list[Any] = [each[-1] if isinstance(each, list | tuple) and each else each for each in told]
     counts.append(_mapping(values, "federation").get("edge_rounds_per_cloud_round", 1))
     if not all(map(_is_count, counts)):
         raise ValueError(

@@ -129,7 +129,7 @@ def _flatten(change: Weights) -> NDArray[np.float32]:
     return np.concatenate([np.ravel(array).astype(np.float32) for array in change.values()])
 
 
-def _split(flat: NDArray[np.float32], like: Weights) -> Arrays:
+def _split(flat: NDArray[np.number], like: Weights) -> Arrays:
     """Return coordinates as arrays with the names, shapes and dtypes of `like`: the inverse of `_flatten`."""
     parts = np.split(flat, np.cumsum([array.size for array in like.values()])[:-1])
     return {
@@ -138,16 +138,17 @@ def _split(flat: NDArray[np.float32], like: Weights) -> Arrays:
     }
 
 
-def _pack(levels: NDArray[np.int8]) -> NDArray[np.uint8]:
+def _pack(levels: NDArray[np.number]) -> NDArray[np.number]:
     """Return levels from -7 to 7, in order, two in a byte: the first in its lower half."""
     halves = np.zeros(levels.size + levels.size % 2, np.uint8)
     halves[: levels.size] = (levels.ravel() + 8).astype(np.uint8)
     return halves[0::2] | halves[1::2] << 4
 
 
-def _unpack(packed: NDArray[np.uint8], shape: tuple[int, ...]) -> NDArray[np.int8]:
+def _unpack(packed: NDArray[np.number], shape: tuple[int, ...]) -> NDArray[np.number]:
     """Return the levels that `_pack` packed."""
-    halves = np.stack((packed & 15, packed >> 4), axis=1).ravel()
+    both = packed.astype(np.uint8)
+    halves = np.stack((both & 15, both >> 4), axis=1).ravel()
     return (halves[: int(np.prod(shape))].astype(np.int8) - np.int8(8)).reshape(shape)
 
 

@@ -316,13 +316,14 @@ class Problem(Displayed, Quantities):
 
     @model_validator(mode="after")
     def _held_by_a_round(self) -> Self:
-        for task in self.tasks if self.horizon_s is not None else ():
+        horizon_s = np.inf if self.horizon_s is None else self.horizon_s
+        for task in self.tasks:
             train_s = min([task.vehicle_train_s.get(name, task.train_s) for name in task.vehicles] or [task.train_s])
             for steps in task.local_steps:
-                if steps.factor * train_s > self.horizon_s:
+                if steps.factor * train_s > horizon_s:
                     raise ValueError(
                         f"local_steps of task {task.name!r}: no round can hold {steps.factor:g} times the steps, which "
-                        f"take {steps.factor * train_s:g} s and horizon_s is {self.horizon_s:g}"
+                        f"take {steps.factor * train_s:g} s and horizon_s is {horizon_s:g}"
                     )
         return self
 

@@ -131,7 +131,7 @@ def test_it_goes_with_other_forms_and_resumes_to_the_same_bits(rules: Rules) -> 
 
 def test_vehicles_get_it_in_cloud_rounds_too_edge_servers_do_not_and_other_strategies_take_it() -> None:
     book = ledger(10.0, 10.0)
-    cloud, edge = (Account(book, stage, "walk", link) for stage, link in (("cloud", "wireline"), ("grid", "wireless")))
+    cloud, edge = Account(book, "cloud", "walk", "wireline"), Account(book, "grid", "walk", "wireless")
     server = EdgeServer({"cav0": Nudged(0.1)}, 2, edge, START, rules=DOWN)
     found = federate({"grid": server}, START, SCHEDULE, cloud, rules=DOWN.of_servers()).weights
     np.testing.assert_allclose(found["head.weight"], START["head.weight"] + 0.8, atol=4e-3)

@@ -34,7 +34,8 @@ def list_choices(task: AllocationTask, *, timed: bool) -> list[RoundChoice]:
 
     timed: whether training takes any of the time that the problem limits.
     """
-    every = [RoundChoice(*each) for each in product(task.local_steps or (None,), [*task.forms] or [None])]
+    forms: list[FormName | None] = [*task.forms]
+    every = [RoundChoice(steps, form) for steps, form in product(task.local_steps or (None,), forms or [None])]
 
     def cost(choice: RoundChoice) -> tuple[float, ...]:
         steps = choice.steps or SAME
