@@ -6,13 +6,14 @@ A vehicle of speed 1 trains in every round of every task, in the fixed plan or, 
 
 from collections.abc import Mapping
 from math import floor
-from typing import Any
+
+from flcav.config import Json
 
 FIT = "fit"
 MEASURED = 16  # steps that `train_s` is of where the recipe's own are to be found: the default of `Training`
 ROUNDING = 1e-9  # of a step, which there is time for all the same
 
-Values = Mapping[str, Any]  # of a recipe, before any field is checked
+Values = Mapping[str, Json]  # of a recipe, before any field is checked
 
 
 def fit_local_steps(values: Values, preset: int) -> Values:
@@ -27,19 +28,21 @@ def fit_local_steps(values: Values, preset: int) -> Values:
     for task in _mapping(values, "tasks"):
         if _mapping(_mapping(_mapping(values, "tasks"), task), "training").get("local_steps") == FIT:
             raise ValueError(f"tasks.{task}.training.local_steps: tasks share a vehicle's time; write it in training")
-    measured = MEASURED if own else training.get("local_steps", MEASURED if training else preset)
-    if not (own or fitted) or not _is_count(measured):
+    measured = _count(MEASURED if own else training.get("local_steps", MEASURED if training else preset))
+    if not (own or fitted) or measured is None:
         return values
     steps = _find_steps(values, measured, "training" if own else f"arms.{fitted[0]}.training")
-    tasks = {
-        name: {**task, "train_s": task["train_s"] * steps / measured} for name, task in values["tasks"].items() if own
-    }
-    changed = {name: {**arms[name], "training": {**arms[name]["training"], "local_steps": steps}} for name in fitted}
-    return {
-        **values,
-        **({"training": {**training, "local_steps": steps}, "tasks": tasks} if own else {}),
-        **({"arms": {**arms, **changed}} if fitted else {}),
-    }
+    found = dict(values)
+    if own:
+        tasks = {name: _mapping(_mapping(values, "tasks"), name) for name in _mapping(values, "tasks")}
+        taken = {name: _number(task, "train_s", "train_s") * steps / measured for name, task in tasks.items()}
+        found["training"] = {**training, "local_steps": steps}
+        found["tasks"] = {name: {**task, "train_s": taken[name]} for name, task in tasks.items()}
+    if fitted:
+        changed = {name: _mapping(arms, name) for name in fitted}
+        by_arm = {name: {**_mapping(arm, "training"), "local_steps": steps} for name, arm in changed.items()}
+        found["arms"] = {**arms, **{name: {**arm, "training": by_arm[name]} for name, arm in changed.items()}}
+    return found
 
 
 def _find_steps(values: Values, measured: int, where: str) -> int:
@@ -61,18 +64,18 @@ def _count_rounds(values: Values, task: Values, name: str) -> int:
     """Return the edge rounds of a task, those in its cloud rounds included: of its plan, or the most by the limits."""
     plan, limits = _mapping(task, "plan"), _mapping(values, "limits")
     told = [plan.get(stage) if plan else limits.get(stage) for stage in ("edge_rounds", "cloud_rounds")]
-    counts: list[Any] = [each[-1] if isinstance(each, list | tuple) and each else each for each in told]
-    counts.append(_mapping(values, "federation").get("edge_rounds_per_cloud_round", 1))
-    if not all(map(_is_count, counts)):
+    edge, cloud = (_count(each[-1] if isinstance(each, list | tuple) and each else each) for each in told)
+    k = _count(_mapping(values, "federation").get("edge_rounds_per_cloud_round", 1))
+    if edge is None or cloud is None or k is None:
         raise ValueError(
             f"local_steps: {FIT} needs the number of rounds of '{name}': a fixed 'plan', or the most of 'edge_rounds' "
             "and 'cloud_rounds' in 'limits'"
         )
-    return counts[0] + counts[1] * counts[2]
+    return edge + k * cloud
 
 
-def _is_count(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+def _count(value: Json) -> int | None:
+    return value if isinstance(value, int) and not isinstance(value, bool) and value >= 0 else None
 
 
 def _mapping(values: Values, name: str) -> Values:

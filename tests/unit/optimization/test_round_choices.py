@@ -16,6 +16,7 @@ from flcav.optimization.allocation.allocate import Allocation, allocate, settle_
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.replanning import PlanState, condition_problem
+from flcav.optimization.graph import load_problem
 from flcav.optimization.verification.allocation import verify_allocation
 
 STEPS = [{"factor": 1}, {"factor": 2, "worth": 1.6}, {"factor": 4, "worth": 2.3}]
@@ -184,13 +185,9 @@ def test_more_combinations_than_can_be_planned_are_one_sentence() -> None:
         allocate(parsed(many))
 
 
-def test_an_example_problem_tells_what_it_chose(capsys: pytest.CaptureFixture[str]) -> None:
-    from flcav.cli.main import run
-
-    recipe = Path(__file__).parents[3] / "recipes" / "allocation" / "local_steps.yaml"
-    with pytest.raises(SystemExit) as stopped:
-        run(["allocate", str(recipe), "--json", "--verify"])
-    told = json.loads(capsys.readouterr().out)
-    assert stopped.value.code == 0
-    assert {name: told["tasks"][0][name] for name in ("local_steps", "form")} == {"local_steps": 4.0, "form": "int8"}
-    assert told["verification"]["faults"] == []
+def test_an_example_problem_tells_what_it_chose() -> None:
+    plan = allocate(load_problem(Path(__file__).parents[3] / "recipes" / "allocation" / "steps_and_forms.yaml"))
+    assert plan.tasks[0].describe_rounds() == "4 times the local steps of the history, updates in int8"
+    few = allocate(parsed(one_task(local_steps=STEPS, forms=FORMS))).tasks[0]
+    assert few.describe_rounds() == "the local steps of the history, updates in int8"
+    assert allocate(parsed(one_task())).tasks[0].describe_rounds() == ""

@@ -60,7 +60,8 @@ class TaskAllocation:
 
     def describe_rounds(self) -> str:
         """Return the local steps and the form of updates that a plan has chosen; "" where it had no choice."""
-        steps = "" if self.local_steps is None else f"{self.local_steps:g} times the local steps of the history"
+        times = f"{self.local_steps:g} times " if self.local_steps not in (None, 1) else ""
+        steps = "" if self.local_steps is None else f"{times}the local steps of the history"
         return ", ".join(filter(None, (steps, f"updates in {self.form}" if self.form else "")))
 
     def describe_accuracy(self) -> str:
