@@ -2,6 +2,7 @@
 
 A vehicle of speed 1 trains in every round of every task, in the fixed plan or, with a history, in the most rounds that
 `limits` allow. `train_s` of a task is the time of a round with `MEASURED` steps, and becomes that of the steps found.
+Where all plans are fixed, the horizon decides on nothing else, and the recipe is then without it.
 """
 
 from collections.abc import Mapping
@@ -33,8 +34,10 @@ def fit_local_steps(values: Values, preset: int) -> Values:
         return values
     steps = _find_steps(values, measured, "training" if own else f"arms.{fitted[0]}.training")
     found = dict(values)
+    tasks = {name: _mapping(_mapping(values, "tasks"), name) for name in _mapping(values, "tasks")}
+    if all(_mapping(task, "plan") for task in tasks.values()):
+        found["horizon_s"] = None  # it is used up: no plan is left that it could limit
     if own:
-        tasks = {name: _mapping(_mapping(values, "tasks"), name) for name in _mapping(values, "tasks")}
         taken = {name: _number(task, "train_s", "train_s") * steps / measured for name, task in tasks.items()}
         found["training"] = {**training, "local_steps": steps}
         found["tasks"] = {name: {**task, "train_s": taken[name]} for name, task in tasks.items()}

@@ -25,6 +25,7 @@ def test_the_steps_are_the_most_whose_rounds_end_within_the_horizon() -> None:
     found = recipe()
     assert (found.training_of("objects").local_steps, found.training_of("objects").local_rate) == (50, 0.7)
     assert found.tasks["objects"].train_s == pytest.approx(5.0)
+    assert found.horizon_s is None  # which a run of fixed plans alone refuses
     assert recipe(horizon_s=59.9).training_of("objects").local_steps == 49
     again = parse_config(RunRecipe, found.model_dump(mode="json"), "it")
     assert again == found
@@ -34,7 +35,7 @@ def test_tasks_share_the_time_and_limits_bound_the_rounds_of_a_history() -> None
     """By hand: at most 5 + 3 * 1 = 8 rounds of 1.6 s and 3.2 s are 38.4 s with 16 steps: 25 in 60 s."""
     tasks = {name: {"history": name, "train_s": each} for name, each in (("objects", 1.6), ("weather", 3.2))}
     found = recipe(tasks=tasks, limits={"edge_rounds": [1, 5], "cloud_rounds": [1, 1]})
-    assert found.training_of("weather").local_steps == 25
+    assert (found.training_of("weather").local_steps, found.horizon_s) == (25, 60)
     assert [task.train_s for task in found.tasks.values()] == pytest.approx([2.5, 5.0])
 
 
