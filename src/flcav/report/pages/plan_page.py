@@ -58,7 +58,13 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
         for link in LINKS
     }
     tasks = [
-        {**asdict(row), "accuracy": row.describe_accuracy(), "weight": task.weight, "vehicles": sum(task.edge_groups)}
+        {
+            **asdict(row),
+            "accuracy": row.describe_accuracy(),
+            "rounds": row.describe_rounds(),
+            "weight": task.weight,
+            "vehicles": sum(task.edge_groups),
+        }
         for task, row in zip(resolve_problem(problem).tasks, plan.tasks, strict=True)
     ]
     values = {
