@@ -104,6 +104,8 @@ def _count_alike(strategy: Strategy, rules: Rules) -> str | None:
 
 
 def _check_outputs(rules: Rules) -> None:
+    if rules.download != "none":
+        raise InputError("FedMD sends class probabilities, and 'download' is a form of weights")
     if rules.upload.layers:
         raise InputError("FedMD sends class probabilities, and 'upload.layers' names arrays of weights")
     if isinstance(rules.personal, RegionalModels):
@@ -116,6 +118,8 @@ def _check_outputs(rules: Rules) -> None:
 
 def _check_buffers(strategy: FedBuff, rules: Rules, clients: int) -> None:
     strategy.check_buffer(clients)
+    if rules.download != "none":
+        raise InputError("FedBuff: clients begin with models of several rounds, which 'download' does not compress")
     if rules.selection.rule != "all":
         raise InputError(f"FedBuff: all clients train, at their own pace, and {rules.selection.rule} selects some")
     if rules.secure is not None:

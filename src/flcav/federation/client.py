@@ -37,7 +37,7 @@ from flcav.federation.trainable import (
     count_samples,
     learned_names,
 )
-from flcav.federation.upload import find_change
+from flcav.federation.upload import decode_model, find_change
 from flcav.network.ledger import BudgetExceeded
 from flcav.statistics.streams import derive_seed
 
@@ -67,7 +67,8 @@ def kept_records(strategy: Strategy, rules: Rules) -> tuple[str, ...]:
     They are those of strategy and compression, the optimiser's where it is kept, and under local noise or masks the
     last answered request.
     """
-    keeps = isinstance(strategy, Exchanges | FedMD) or rules.upload.compression == "top-k"
+    upload = rules.upload
+    keeps = isinstance(strategy, Exchanges | FedMD) or upload.compression == "top-k" or upload.feeds_back
     guards = wire.is_local(rules) or rules.secure is not None
     digests = (OWN_DIGESTS,) if isinstance(strategy, FedMD) else ()
     optimiser = (OPTIMISER,) if rules.keep_optimiser else ()
@@ -161,7 +162,7 @@ class _ClientSide:
         if asked == wire.SEND:
             start, update = _recorded(context, KEPT_START), _recall(context, KEPT)
         else:
-            start = wire.read_arrays(message.content, wire.ARRAYS)
+            start = decode_model(wire.read_arrays(message.content, wire.ARRAYS))
             update, extra, own = self._train(self.trainables[name], message, context, start, work, seed)
         if asked == wire.NORM:
             context.state[KEPT_START] = wire.to_array_record(start)
@@ -190,7 +191,7 @@ class _ClientSide:
         if (complaint := complain(message, context)) is not None:
             return complaint
         if HIDDEN not in context.state:
-            start = wire.read_arrays(message.content, wire.ARRAYS)
+            start = decode_model(wire.read_arrays(message.content, wire.ARRAYS))
             seed, key = self._seeds(name, work)
             update, _, _ = self._train(self.trainables[name], message, context, start, work, seed)
             about = (1, 0.0) if wire.is_local(self.rules) else (update.samples, update.loss)

@@ -158,6 +158,7 @@ class OpenRound:
     expected: Expected  # of the updates, with the rules and the weights that the round began with
     sent: Weights = field(default_factory=dict)  # the strategy's further arrays
     centre: Weights | None = None  # centre of the proximal term
+    model: Weights | None = None  # `start` as it is sent down; None: whole
 
     @property
     def start(self) -> Weights:
@@ -171,7 +172,7 @@ class OpenRound:
 
     def training(self) -> RecordDict:
         """Return a request to train: weights, further arrays, and the local work."""
-        records = {wire.ARRAYS: wire.to_array_record(self.start)} | (
+        records = {wire.ARRAYS: wire.to_array_record(self.start if self.model is None else self.model)} | (
             {wire.EXTRA: wire.to_array_record(self.sent)} if self.sent else {}
         )
         if self.centre is not None:

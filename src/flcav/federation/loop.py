@@ -50,6 +50,7 @@ from flcav.federation.trainable import (
     forms_of,
     learned_names,
 )
+from flcav.federation.upload import decode_model, encode_model, restore_model
 from flcav.federation.wire import LocalWork
 from flcav.statistics.streams import derive_seed
 
@@ -301,19 +302,22 @@ class FederationServer(Exchange):
         to report; `TooFewClients` where too few are left for secure aggregation; `InputError` where the strategy
         refuses the updates or returns arrays of other names, shapes or types.
         """
-        round_ = self._call(number, start)  # who takes part
+        round_ = self._call(number, start)  # who takes part, and what is sent down
         updates = self._collect(round_)  # what is sent, and checked as it arrives
         round_.here.check(self.rules, self.strategy, number)  # whether enough is left
         try:
             weights = self._combine(round_, updates)  # how it is combined
         except (ClientFailed, TooFewClients, SumLost, NoShares) as error:
             round_.here.excuse(error)
-            weights, updates = start, Intake()
+            weights, updates = round_.start, Intake()
         self._keep(round_, updates)  # what is kept
-        return weights
+        return weights if round_.model is None else restore_model(weights, round_.start, start)
 
     def _call(self, number: int, start: Weights) -> OpenRound:
-        """Return the round with its chosen clients, and those of them that are absent."""
+        """Return the round with its chosen clients, those of them that are absent, and the model that they get.
+
+        What its form loses is not lost to the server: `run_round` adds the round's change to the whole model.
+        """
         work = self.work(number)
         selection = self.rules.selection
         clients = [*self.names.values()]
@@ -325,8 +329,10 @@ class FederationServer(Exchange):
         seed = int.from_bytes(self._key("selection", work), "little") if self.rules.hides_draws else work.seed
         chosen = selection.choose(clients, number, seed, self.earlier)
         here = Attendance(clients if selection.unbiased else chosen, chosen, self.away(number))
+        model = encode_model(start) if self.rules.download == "int8" else None
+        start = start if model is None else decode_model(model)
         expected = Expected(self.rules, start, extra_forms(self.strategy, self.rules, start, sent))
-        return OpenRound(work, here, expected, sent, self.centre)
+        return OpenRound(work, here, expected, sent, self.centre, model)
 
     def _key(self, purpose: str, work: LocalWork) -> bytes:
         return derive_key(self.state.keep_secret(SERVER), purpose, work.round, work.seed)

@@ -67,6 +67,9 @@ class Rules(Config):
 
     selection: Selection = Selection()  # of the clients of a round
     upload: Upload = Upload()  # form of the updates
+    download: Annotated[Literal["none", "int8"], Field(exclude_if=lambda form: form == "none")] = (
+        "none"  # compression of the model that vehicles begin a round with; int8: to the nearest level, by array
+    )
     privacy: Privacy | None = None  # clipping and noise; default: none
     secure: SecureAggregation | None = None  # default: the server sees every update
     personal: Patterns | RegionalModels = ()  # what edge servers keep for their regions: arrays, as in `head.*`, or all
@@ -82,9 +85,9 @@ class Rules(Config):
     def of_servers(self) -> "Rules":
         """Return the rules among edge servers in the cloud's rounds, where these are the rules among vehicles.
 
-        All edge servers take part, none may fail, and updates have the same form. Only vehicles add noise, since
-        post-processing keeps differential privacy. The samples of an edge server are those of all its vehicles, and the
-        limit on training time applies to vehicles only.
+        All edge servers take part, none may fail, and updates have the same form; models go down whole. Only vehicles
+        add noise, since post-processing keeps differential privacy. The samples of an edge server are those of all its
+        vehicles, and the limit on training time applies to vehicles only.
         """
         limits = self.limits.model_copy(update={"samples": MOST_SAMPLES, "train_s": None})
         upload = self.upload.model_copy(update={"kept": self.personal_arrays})

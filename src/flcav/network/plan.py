@@ -1,8 +1,20 @@
 """Training plans of the three stages and their uplink traffic (Wang et al., IEEE Network 37(3), 2023)."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 from flcav.network.ledger import LinkMegabytes
+
+FormName = Literal["float32", "fp16", "int8", "int4", "top-k"]  # of an update; the first is the weights as stored
+FORM_BITS: Mapping[FormName, float] = {  # of a parameter in an update; of top-k, of one that is sent: place and value
+    "float32": 32,
+    "fp16": 16,
+    "int8": 8,
+    "int4": 4,
+    "top-k": 64,
+}
+STORED_BITS = FORM_BITS["float32"]
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,12 @@ import networkx as nx
 from pydantic import Field, model_validator
 
 from flcav.config import InputError, parse_config, read_yaml
+from flcav.network.plan import FormName
 from flcav.optimization.curves.curves import NonNegative, OwnCurve, Positive
-from flcav.optimization.problem import Budgets, Count, Limits, Problem, Quantities, Uplink
-from flcav.storage.records import LEFT_OUT
+from flcav.optimization.problem import Budgets, Count, Form, Limits, LocalSteps, Problem, Quantities, Uplink
+from flcav.storage.records import LEFT_OUT, WHERE_TRUE
 
+CHOICES = ("local_steps", "forms")  # fields of a network that a plan chooses from
 KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins two neighbours of this list
 
 
@@ -44,6 +46,8 @@ class NetworkNode(Quantities):
     limits: Limits
     curve: OwnCurve | None = None
     train_s: NonNegative = 0.0  # time that a vehicle of speed 1 trains in one round [s]
+    local_steps: Annotated[tuple[LocalSteps, ...], WHERE_TRUE] = ()  # as of `AllocationTask`
+    forms: Annotated[Mapping[FormName, Form], WHERE_TRUE] = {}  # as of `AllocationTask`
 
 
 class ModalityNode(Quantities):
@@ -156,6 +160,7 @@ def extract_layers(graph: nx.Graph) -> Layers:
             key[1]: {
                 **{name: graph.nodes[key][name] for name in ("model_mb", "limits", "curve")},
                 **{name: graph.nodes[key].get(name) for name in ("exchange_mb", "labels_mb")},
+                **{name: graph.nodes[key][name] for name in CHOICES if name in graph.nodes[key]},
                 "train_s": graph.nodes[key].get("train_s", 0.0),
                 "modalities": [other[1] for other in graph[key] if other[0] == "modality"],
             }
@@ -247,6 +252,7 @@ def to_problem(graph: nx.Graph) -> Problem:
                 "labels_mb": network.labels_mb,
                 "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
                 **_named(ordered, held, network.train_s),
+                **network.model_dump(mode="json", include={*CHOICES}),
                 "limits": network.limits.model_dump(),
                 "curve": _cluster_curve(layers, name, tasks_of),
             }

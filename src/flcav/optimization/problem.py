@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
 from flcav.config import Config
 from flcav.interface.notebook import Displayed
-from flcav.network.plan import MessageSizes
+from flcav.network.plan import FORM_BITS, STORED_BITS, FormName, MessageSizes
 from flcav.optimization.curves.curves import (
     STAGES,
     Additive,
@@ -21,7 +21,7 @@ from flcav.optimization.curves.curves import (
     Positive,
     SharedCurve,
 )
-from flcav.storage.records import LEFT_OUT
+from flcav.storage.records import LEFT_OUT, WHERE_TRUE
 
 MOST = 10**9  # largest count
 WORST = 1e6  # largest error that a curve may predict within the limits; that of a fitted curve is about 1
@@ -80,6 +80,24 @@ class Measured(Config):
     cloud_rounds: NonNegative | None = None  # most cloud rounds in the history
 
 
+class LocalSteps(Quantities):
+    """A number of local steps that a plan may choose, relative to the history of the learning curve."""
+
+    factor: Positive  # times the steps, and so the training time, of a round of the history
+    worth: Positive = 1.0  # rounds of the history that a round of so many steps is worth, as measured
+
+
+class UpdateForm(Quantities):
+    """A form of updates that a plan may choose: what it takes, and what it costs in accuracy."""
+
+    bits: Positive | None = None  # of an update, per parameter, as measured; None: those of the form, without headers
+    fraction: Annotated[float, Field(gt=0, le=1)] | None = None  # of the parameters that top-k sends
+    loss: Fraction = 0.0  # added to the error of a plan with this form, as measured
+
+
+Form = Annotated[UpdateForm, BeforeValidator(lambda value: {} if value is None else value)]  # `int8:` has all defaults
+
+
 class AllocationTask(Quantities):
     """A unit of allocation: one perception task or a cluster, with its message sizes, vehicles and learning curve.
 
@@ -107,6 +125,8 @@ class AllocationTask(Quantities):
     data_quality: Mapping[str, Positive] = {}  # by vehicle: worth of one of its samples; 1 if not named
     train_s: NonNegative = 0.0  # time that a vehicle trains in one round [s]
     vehicle_train_s: Mapping[str, NonNegative] = {}  # by vehicle, where it is another; names them all if uplinks do not
+    local_steps: Annotated[tuple[LocalSteps, ...], WHERE_TRUE] = ()  # those to choose from; none: those of the history
+    forms: Annotated[Mapping[FormName, Form], WHERE_TRUE] = {}  # of updates, to choose from; none: `model_mb` is sent
     limits: Limits
     curve: Curve
     upper: Curve | None = None  # the upper band of `curve`, for robust plans
@@ -133,6 +153,11 @@ class AllocationTask(Quantities):
     def sizes(self) -> MessageSizes:
         """Sizes of the task's messages [MB]."""
         return MessageSizes(self.sample_mb, self.model_mb, self.exchange_mb, self.labels_mb)
+
+    def form_bits(self, form: FormName) -> float:
+        """Return what an update of one of the task's forms takes per parameter [bits]."""
+        own = self.forms[form]
+        return FORM_BITS[form] * (own.fraction or 1.0) if own.bits is None else own.bits
 
     def weigh_groups(self, called: int) -> tuple[float, ...]:
         """Return the worth of the data at each edge server where at most `called` of its vehicles are called."""
@@ -185,6 +210,26 @@ class AllocationTask(Quantities):
             raise ValueError(f"called of task {self.name!r}: vehicles with names join rounds by a plan of their own")
         if any(not isinstance(each, Effective | Federated) for each in (self.curve, self.upper or self.curve)):
             raise ValueError(f"called of task {self.name!r}: its curve does not know what data vehicles bring")
+        return self
+
+    @model_validator(mode="after")
+    def _choosable(self) -> Self:
+        factor, times = (
+            Counter(each.factor for each in self.local_steps).most_common(1)[0] if self.local_steps else (1, 1)
+        )
+        if times > 1:
+            raise ValueError(f"local_steps of task {self.name!r}: {times} of them have the factor {factor:g}")
+        for form, own in self.forms.items():
+            if (own.fraction is not None) != (form == "top-k" and own.bits is None):
+                wanted = "'fraction' or 'bits'" if form == "top-k" else "no 'fraction', which is of top-k"
+                raise ValueError(f"forms.{form} of task {self.name!r}: it takes {wanted}")
+            if (bits := self.form_bits(form)) > STORED_BITS:
+                raise ValueError(
+                    f"forms.{form} of task {self.name!r}: {bits:g} bits per parameter are more than the "
+                    f"{STORED_BITS:g} that are stored"
+                )
+        if self.forms and self.exchange_mb is not None:
+            raise ValueError(f"forms of task {self.name!r} are of the network, and vehicles send 'exchange_mb' instead")
         return self
 
     @model_validator(mode="after")
@@ -266,6 +311,19 @@ class Problem(Displayed, Quantities):
                 if links.setdefault(vehicle, link) != link:
                     raise ValueError(
                         f"uplink_mbps of task {task.name!r} gives vehicle {vehicle!r} another link than an earlier task"
+                    )
+        return self
+
+    @model_validator(mode="after")
+    def _held_by_a_round(self) -> Self:
+        horizon_s = np.inf if self.horizon_s is None else self.horizon_s
+        for task in self.tasks:
+            train_s = min([task.vehicle_train_s.get(name, task.train_s) for name in task.vehicles] or [task.train_s])
+            for steps in task.local_steps:
+                if steps.factor * train_s > horizon_s:
+                    raise ValueError(
+                        f"local_steps of task {task.name!r}: no round can hold {steps.factor:g} times the steps, which "
+                        f"take {steps.factor * train_s:g} s and horizon_s is {horizon_s:g}"
                     )
         return self
 

@@ -12,6 +12,7 @@ from pydantic import BeforeValidator, Field, field_validator, model_validator
 
 from flcav.config import Config, InputError, parse_config, read_yaml
 from flcav.federation.links.ros_names import ROS_NAMESPACE
+from flcav.federation.local_steps import MEASURED, fit_local_steps
 from flcav.federation.rules import Rules
 from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.interface.notebook import Displayed
@@ -80,7 +81,9 @@ class Training(Config):
 
     batch: int | None = Field(default=None, ge=1, le=4096)  # samples per optimiser step; default: the task's
     steps: int = Field(default=1400, ge=1, le=10**6)  # optimiser steps of pretraining, with the task's own schedule
-    local_steps: int = Field(default=16, ge=1, le=10**6)  # optimiser steps of one vehicle in one round
+    local_steps: int = Field(
+        default=MEASURED, ge=1, le=10**6
+    )  # optimiser steps of one vehicle in one round; fit: as many as `horizon_s` holds
     local_rate: float = Field(default=0.5, gt=0)  # learning rate of the first round after pretraining
     final_rate: float = Field(default=0.1, gt=0)  # learning rate of their last, and of further rounds after them
     average_rounds: int = Field(default=3, ge=1)  # last rounds of a federation whose models its result averages
@@ -416,6 +419,9 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
         for part, model in (("recording", Recording), ("training", Training)):
             _refuse_owners(values, part, model)
         tasks = {name: {} if task is None else task for name, task in values["tasks"].items()}
+        preset = SIZES.get(str(values.get("size")), SIZES["demo"])[1].local_steps
+        values = {**fit_local_steps({**values, "tasks": tasks}, preset)}
+        tasks = values["tasks"]
         placement = values.get("placement", {})
         if isinstance(placement, dict) and "tasks" not in placement:
             placement = placement | {"tasks": ["objects"] if "objects" in tasks else []}

@@ -35,6 +35,9 @@ START = {
 KINDS: dict[str, dict[str, Any]] = {
     "fp16": {"compression": "fp16"},
     "int8": {"compression": "int8"},
+    "int8 with feedback": {"compression": "int8", "error_feedback": True},
+    "int4": {"compression": "int4"},
+    "int4 without feedback": {"compression": "int4", "error_feedback": False},
     "top-k": {"compression": "top-k", "fraction": 0.05},
     "layers": {"layers": ("head.*",)},
     "layers of int8": {"layers": ("head.*",), "compression": "int8"},
@@ -103,7 +106,9 @@ def test_a_compressed_federation_is_deterministic_and_resumes_to_the_same_bits(k
     assert {name: (a.shape, a.dtype) for name, a in once.items()} == {n: (a.shape, a.dtype) for n, a in START.items()}
 
 
-@pytest.mark.parametrize(("kind", "per_weight"), [("fp16", 2), ("int8", 1), ("top-k", 0.05 * 8), ("layers", 0.5)])
+@pytest.mark.parametrize(
+    ("kind", "per_weight"), [("fp16", 2), ("int8", 1), ("int4", 0.5), ("top-k", 0.05 * 8), ("layers", 0.5)]
+)
 def test_the_ledger_has_the_bytes_that_are_left(kind: str, per_weight: float):
     whole, fewer = up(run(Upload())[1]), up(run(Upload(**KINDS[kind]))[1])
     weights = 64 * 50 + 50 * 8
@@ -131,6 +136,15 @@ def test_fp16_and_int8_end_near_and_top_k_gets_there_by_what_it_kept():
     kept = distance(True)
     assert kept < 0.15, kept
     assert kept < 0.3 * distance(False), distance(False)
+    short = Schedule(rounds=30, steps=1, learning_rate=0.3, final_learning_rate=0.3, seed=1)
+    ends = {
+        feedback: federate(
+            CLIENTS, START, short, rules=Rules(upload=Upload(compression="int4", error_feedback=feedback))
+        ).weights["body.weight"]
+        for feedback in (True, False)
+    }
+    near, far = (np.linalg.norm(ends[feedback] - MEAN["body.weight"]) for feedback in (True, False))
+    assert near < 0.8 * far, (near, far)
 
 
 @given(st.integers(0, 1000), st.floats(1e-3, 1e3))
@@ -150,16 +164,58 @@ def test_what_top_k_sends_and_keeps_is_all_there_was(seed: int, scale: float):
     assert compress(Upload(compression="top-k", error_feedback=False), change, None, seed)[1] == {}
 
 
-def test_int8_is_unbiased_and_within_a_step():
+def quantised(whole: Weights, levels: int) -> Weights:
+    """Return what rounding to the nearest of `levels` on either side of 0 leaves, element by element."""
+    back = {}
+    for name, array in whole.items():
+        step = max((abs(float(value)) for value in array.ravel()), default=0.0) / levels
+        rounded = [round(float(value) / step) * step if step else 0.0 for value in array.ravel()]
+        back[name] = np.reshape(rounded, array.shape)
+    return back
+
+
+@pytest.mark.parametrize(("compression", "levels"), [("int8", 127), ("int4", 7)])
+def test_feedback_of_rounding_is_by_an_oracle_what_there_was_less_what_came(compression: Any, levels: int):
+    rng = np.random.default_rng(levels)
+    upload = Upload(compression=compression, error_feedback=True)
+    residual: Any = None
+    left = np.zeros(33)
+    for _ in range(4):
+        change = {"a": rng.normal(size=(7, 3)).astype(np.float32), "b": rng.normal(size=12).astype(np.float32) ** 3}
+        sent, kept = compress(upload, change, residual, 1)
+        whole = {"a": change["a"] + left[:21].reshape(7, 3), "b": change["b"] + left[21:]}
+        told = quantised(whole, levels)
+        back = decompress(upload, sent, change)
+        for name in change:
+            np.testing.assert_allclose(back[name], told[name], atol=1e-5)
+        left = np.concatenate([np.ravel(whole[name] - told[name]) for name in change])
+        residual = kept[VALUES]
+        np.testing.assert_allclose(residual, left, atol=1e-5)
+        assert np.linalg.norm(residual) < np.linalg.norm(np.concatenate([each.ravel() for each in whole.values()]))
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 6])
+def test_two_levels_of_int4_share_a_byte(size: int):
+    change = {"a": np.linspace(-7, 7, size, dtype=np.float32)}
+    sent, _ = compress(Upload(compression="int4"), change, None, 0)
+    assert (sent["a"].dtype, sent["a"].nbytes) == (np.uint8, (size + 1) // 2)
+    if size == 5:  # -7, -3.5, 0, 3.5, 7: to even levels, with 8 added
+        assert [hex(each) for each in sent["a"]] == ["0x41", "0xc8", "0xf"]
+    np.testing.assert_allclose(decompress(Upload(compression="int4"), sent, change)["a"], change["a"], atol=0.5)
+
+
+@pytest.mark.parametrize(("compression", "levels"), [("int8", 127), ("int4", 7)])
+def test_int8_and_int4_without_feedback_are_unbiased_and_within_a_step(compression: Any, levels: int):
     change = {"a": np.linspace(-1, 1, 41, dtype=np.float32) ** 3, "b": np.zeros(4, np.float32)}
-    upload = Upload(compression="int8")
+    upload = Upload(compression=compression, error_feedback=False)
     back, step = [], 0.0
     for seed in range(4000):
-        sent, _ = compress(upload, change, None, seed)
+        sent, kept = compress(upload, change, None, seed)
         step = float(sent[SCALES][0])
-        assert {sent["a"].dtype, sent["b"].dtype} == {np.dtype(np.int8)}
+        assert {sent["a"].dtype, sent["b"].dtype} == {np.dtype(np.int8 if levels > 7 else np.uint8)}
+        assert kept == {}
         back.append(decompress(upload, sent, change))
-    assert step == pytest.approx(1 / 127)
+    assert step == pytest.approx(1 / levels)
     every = np.array([each["a"] for each in back])
     assert np.abs(every - change["a"]).max() <= step * 1.0001
     np.testing.assert_allclose(every.mean(axis=0), change["a"], atol=4 * step / 2 / np.sqrt(4000))
@@ -189,6 +245,7 @@ def test_messages_that_are_no_update_are_told():
         ("top-k", {"#values": np.zeros(3, np.float32)}),
         ("int8", {"head.weight": np.zeros((2, 2), np.int8)}),
         ("int8", {SCALES: np.zeros(1, np.float32)}),
+        ("int4", {"head.weight": np.zeros(199, np.uint8)}),
         ("layers", {"body.weight": START["body.weight"]}),
     ):
         rules = Rules(upload=Upload(**KINDS[kind]))
@@ -199,7 +256,7 @@ def test_messages_that_are_no_update_are_told():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("kind", ["fp16", "int8", "top-k"])
+@pytest.mark.parametrize("kind", ["fp16", "int8", "int8 with feedback", "int4", "top-k"])
 @pytest.mark.parametrize("value", [np.inf, -np.inf, np.nan])
 def test_a_change_that_is_not_finite_is_refused_in_every_form(kind: str, value: float):
     weights = START | {"body.weight": START["body.weight"].copy()}

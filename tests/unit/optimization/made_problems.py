@@ -1,5 +1,6 @@
 """Random allocation problems, and what trying every plan finds."""
 
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -73,21 +74,35 @@ def _error(curve: dict, x: NDArray, y: NDArray, z: NDArray, k: int) -> list[tupl
 
 
 def searched(values: dict) -> float:
-    """Return the best objective by trying every plan: the least weighted error, or the least largest one."""
+    """Return the best objective by trying every plan: the least weighted error, or the least largest one.
+
+    Plans include each number of local steps and each form of updates that a task leaves to choose.
+    """
     k, largest = values["edge_rounds_per_cloud_round"], values.get("objective") == "max-min"
     choices = []
     for task in values["tasks"]:
         grids = np.meshgrid(*(np.arange(low, high + 1) for low, high in task["limits"].values()), indexing="ij")
         x, y, z = (grid.ravel().astype(float) for grid in grids)
-        errors = _error(task["curve"], x, y, z, k)
-        error = np.max([e for _, e in errors], axis=0) if largest else task["weight"] * sum(w * e for w, e in errors)
-        vehicles, servers, model = sum(task["edge_groups"]), len(task["edge_groups"]), task["model_mb"]
-        exchange, labels = task.get("exchange_mb", model), task.get("labels_mb", 0.0)
-        wireless = x * task["sample_mb"] + vehicles * ((y + k * z) * exchange + (y + (z > 0)) * labels)
-        wireline = x * task["sample_mb"] + z * servers * model
-        kept = z <= (1 if k == 0 else np.inf)
-        busy_s = (y + k * z) * task.get("train_s", 0.0)
-        choices.append([v[kept] for v in (error, wireless, wireline, busy_s)])
+        own = []
+        for steps, (name, form) in product(
+            task.get("local_steps") or [{"factor": 1}], (task.get("forms") or {"float32": {}}).items()
+        ):
+            worth, drift = steps.get("worth", 1.0), task["curve"].get("drift", 0.0)
+            loss = form.get("loss", 0.0) + drift * (z / (z + 1) - worth * z / (worth * z + 1))  # a drift has no pace
+            errors = [(w, e + loss) for w, e in _error(task["curve"], x, worth * y, worth * z, k)]
+            error = (
+                np.max([e for _, e in errors], axis=0) if largest else task["weight"] * sum(w * e for w, e in errors)
+            )
+            bits = {"float32": 32, "fp16": 16, "int8": 8, "int4": 4, "top-k": 64}[name] * form.get("fraction", 1)
+            model = task["model_mb"] * form.get("bits", bits) / 32
+            vehicles, servers = sum(task["edge_groups"]), len(task["edge_groups"])
+            exchange, labels = task.get("exchange_mb", model), task.get("labels_mb", 0.0)
+            wireless = x * task["sample_mb"] + vehicles * ((y + k * z) * exchange + (y + (z > 0)) * labels)
+            wireline = x * task["sample_mb"] + z * servers * model
+            kept = z <= (1 if k == 0 else np.inf)
+            busy_s = (y + k * z) * task.get("train_s", 0.0) * steps["factor"]
+            own.append([v[kept] for v in (error, wireless, wireline, busy_s)])
+        choices.append([np.concatenate(parts) for parts in zip(*own, strict=True)])
     budget, horizon_s = values["budgets_mb"], values.get("horizon_s", np.inf)
     total = [np.zeros(1)] * 4
     for choice in choices:

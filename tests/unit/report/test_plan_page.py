@@ -12,7 +12,7 @@ from flcav.optimization.allocation.comparison import PlanComparison, compare_pla
 from flcav.optimization.allocation.fleet import allocate_fleet
 from flcav.optimization.allocation.problem_file import STEPS, TERMS
 from flcav.optimization.graph import load_problem
-from flcav.optimization.problem import Budgets, Limits, Problem, Uplink
+from flcav.optimization.problem import Budgets, Limits, Problem, UpdateForm, Uplink
 from flcav.report.pages.plan_page import SHOWN, plan_page, plan_results
 from flcav.reproductions.fig3a.run import article_graph
 
@@ -48,6 +48,17 @@ def page() -> str:
 def test_parts_add_up_to_what_the_plan_uses(fleet: dict[str, Any]) -> None:
     for link, used in fleet["links"].items():
         assert sum(row["mb"] for row in fleet["parts"] if row["link"] == link) == pytest.approx(used["used_mb"])
+
+
+def test_parts_of_updates_in_a_chosen_form_add_up_and_the_page_names_it() -> None:
+    limits = Limits(samples=(100, 100), edge_rounds=(0, 9), cloud_rounds=(0, 2))
+    task = ONE.tasks[0].model_copy(update={"limits": limits, "forms": {"int4": UpdateForm(loss=0.01)}})
+    problem = ONE.model_copy(update={"tasks": (task,)})
+    found = results_of(problem)
+    for link, used in found["links"].items():
+        assert sum(row["mb"] for row in found["parts"] if row["link"] == link) == pytest.approx(used["used_mb"])
+    assert found["links"]["wireless"]["used_mb"] == pytest.approx(100 * 1.6 + (9 + 2) * 7 * 60 / 8)
+    assert "<small>updates in int4</small>" in page_of(problem)
 
 
 def test_vehicles_add_up_to_what_the_plan_uses(fleet: dict[str, Any]) -> None:

@@ -164,7 +164,9 @@ def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
         for name in ("accuracy_low", "accuracy_high"):
             if task[name] is None:
                 del task[name]
-    values["tasks"] = [_given(task, "upper_error", "members", "called") for task in values["tasks"]]
+    values["tasks"] = [
+        _given(task, "upper_error", "members", "called", "local_steps", "form") for task in values["tasks"]
+    ]
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
             values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
@@ -183,6 +185,8 @@ def _describe(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") 
         if task.called is not None:
             told = plural(task.called, "vehicle")
             yield (f"{task.name}: {told} at most of each edge server in its edge rounds")
+        if chosen := task.describe_rounds():
+            yield f"{task.name}: {chosen}"
     curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
     yield (f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
     yield (f"{measure.capitalize()}: {explain_objective(problem, plan.objective)}")

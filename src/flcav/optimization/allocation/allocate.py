@@ -14,17 +14,19 @@ from flcav.config import InputError
 from flcav.geometry.arrays import Array
 from flcav.interface.notebook import Displayed
 from flcav.network.ledger import LinkMegabytes
+from flcav.optimization.allocation.round_choices import RoundChoice, find_choice, list_settled, settle_all
 from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
 from flcav.optimization.solvers.branches import call_vehicles, solve_branches
 from flcav.optimization.solvers.fairness import minimise_largest_error
-from flcav.optimization.solvers.instance import Clock, Instance, build_instance, price_counts, shared_clock
+from flcav.optimization.solvers.instance import Clock, Infeasible, Instance, build_instance, price_counts, shared_clock
 from flcav.optimization.solvers.weighted import minimise_weighted_error
 
 MB_PER_GB = 1000.0
 EXACT = 1e-9  # gap for problems of few tasks
 EXACT_TASKS = 4  # most tasks that are few
+COARSE = 1.0  # gap of the first plan of each choice; its bound tells whether the choice is worth a better one
 AREA_GAP = 1e-4  # least gap for the weighted problems within the search for a large area
 NO_CERTIFICATE = "the area is not concave in the plan: this is the best of several local optima, with no certificate"
 
@@ -53,6 +55,14 @@ class TaskAllocation:
     called: int | None = None  # vehicles of each edge server in the rounds of stage II; None: all
     accuracy_low: float | None = None  # predicted by the upper band of the error; None where the task has none
     accuracy_high: float | None = None  # predicted by its lower band
+    local_steps: float | None = None  # times those of the history, where the problem leaves the choice
+    form: str | None = None  # of the updates, where the problem leaves the choice
+
+    def describe_rounds(self) -> str:
+        """Return the local steps and the form of updates that a plan has chosen; "" where it had no choice."""
+        times = f"{self.local_steps:g} times " if self.local_steps not in (None, 1) else ""
+        steps = "" if self.local_steps is None else f"{times}the local steps of the history"
+        return ", ".join(filter(None, (steps, f"updates in {self.form}" if self.form else "")))
 
     def describe_accuracy(self) -> str:
         """Return the predicted accuracy with its band, as far as that is known; the error has two digits in it."""
@@ -122,8 +132,69 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     """
     if not isinstance(problem, Problem):
         raise InputError("allocate: a problem is wanted; flcav.load_problem(path) reads one")
-    resolved = resolve_problem(problem)
+    settled = [*list_settled(problem)]
     sought = gap if len(problem.tasks) > EXACT_TASKS else min(gap, EXACT)
+    first = sought if len(settled) == 1 or problem.objective == "area" else COARSE
+    found: dict[int, Allocation] = {}  # by place in `settled`
+    refused: list[Infeasible] = []
+    for place, (choices, each) in enumerate(settled):
+        try:
+            found[place] = name_choices(_allocate(each, first, gap, clocks), choices)
+        except Infeasible as error:
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    for place in sorted(found, key=lambda place: found[place].objective) if first > sought else ():
+        choices, each = settled[place]
+        if (found[place].lower_bound or 0.0) < min(plan.objective for plan in found.values()):
+            found[place] = name_choices(_allocate(each, sought, gap, clocks), choices)
+    return join_plans(problem, [*found.values()], gap)
+
+
+def name_choices(plan: Allocation, choices: Sequence[RoundChoice]) -> Allocation:
+    """Return the plan with a choice of local steps and form named in each of its tasks."""
+    return replace(plan, tasks=name_in_tasks(plan.tasks, choices))
+
+
+def name_in_tasks(plans: Sequence[TaskAllocation], choices: Sequence[RoundChoice]) -> tuple[TaskAllocation, ...]:
+    """Return the tasks' plans with their choices of local steps and form."""
+    return tuple(
+        replace(plan, local_steps=None if choice.steps is None else choice.steps.factor, form=choice.form)
+        for plan, choice in zip(plans, choices, strict=True)
+    )
+
+
+def settle_plan(problem: Problem, plans: Sequence[TaskAllocation]) -> Problem:
+    """Return the problem with the local steps and forms that `plans`, one per task, have chosen."""
+    choices = (find_choice(task, plan.local_steps, plan.form) for task, plan in zip(problem.tasks, plans, strict=True))
+    return settle_all(problem, tuple(choices))
+
+
+def join_plans(
+    problem: Problem, found: Sequence[Allocation], gap: float, certificate: tuple[Dual, ...] = ()
+) -> Allocation:
+    """Return the best of the plans of all choices: no plan of the problem is below the least of their bounds.
+
+    It is optimal where it is within `gap` of that. certificate: of all choices; default: those of the plans.
+    """
+    best = (max if problem.objective == "area" else min)(found, key=lambda plan: plan.objective)
+    if len(found) == 1:
+        return replace(best, certificate=certificate or best.certificate)
+    bounds = [plan.lower_bound for plan in found if plan.lower_bound is not None]
+    lower = min(bounds) if bounds else None
+    achieved = None if lower is None else relative_gap(best.objective, lower)
+    return replace(
+        best,
+        status="optimal" if achieved is not None and achieved <= gap else "feasible",
+        lower_bound=lower,
+        gap=achieved,
+        certificate=certificate or tuple(dual for plan in found for dual in plan.certificate),
+    )
+
+
+def _allocate(problem: Problem, sought: float, gap: float, clocks: Sequence[Clock]) -> Allocation:
+    """Return the best plan, to a relative gap `sought`, of a problem without choices of local steps and forms."""
+    resolved = resolve_problem(problem)
     method = _METHODS[problem.objective]
     solved = solve_branches(
         resolved, lambda branch: replace(method(branch, build_instance(branch, clocks), sought, clocks), branch=branch)

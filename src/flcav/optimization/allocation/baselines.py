@@ -16,9 +16,11 @@ from flcav.optimization.allocation.allocate import (
     TaskAllocation,
     build_task_plans,
     evaluate_objective,
+    name_in_tasks,
     resolve_problem,
     sum_prices,
 )
+from flcav.optimization.allocation.round_choices import settle_first
 from flcav.optimization.allocation.vehicles import split_plan, trains
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.branches import solve_branches
@@ -48,14 +50,17 @@ class Baseline:
 def baseline(problem: Problem, name: str) -> Baseline:
     """Return the plan of `BASELINES[name]` with its predicted objective.
 
-    Baselines call as many vehicles as allowed, and respect only the fleet's budgets: `note` says where the vehicles'
-    samples or links do not suffice. Raises `Infeasible` as `allocate` does, and `InputError` for an unknown name.
+    Baselines call as many vehicles as allowed, have the first local steps and form of each task, and respect only the
+    fleet's budgets: `note` says where the vehicles' samples or links do not suffice. Raises `Infeasible` as `allocate`
+    does, and `InputError` for an unknown name.
     """
     if name not in BASELINES:
         raise InputError(f"baseline {shorten(name)}: unknown; known baselines: {', '.join(BASELINES)}")
+    choices, problem = settle_first(problem)
     problem = problem.model_copy(update={"tasks": tuple(map(_call_most, problem.tasks))})
     resolved = resolve_problem(problem)
     plans = build_task_plans(problem, BASELINES[name](resolved, build_instance(resolved)))
+    plans = name_in_tasks(plans, choices)
     try:
         split_plan(problem, plans)
     except Infeasible:

@@ -29,13 +29,17 @@ from flcav.interface.wording import plural
 from flcav.network.ledger import LinkMegabytes
 from flcav.optimization.allocation.allocate import (
     Allocation,
+    Dual,
     allocate,
     build_task_plans,
     evaluate_objective,
+    join_plans,
+    name_choices,
     relative_gap,
     resolve_problem,
     sum_prices,
 )
+from flcav.optimization.allocation.round_choices import list_settled
 from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, sum_busy, trains
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Clock, Infeasible
@@ -57,8 +61,31 @@ def allocate_fleet(problem: Problem) -> Carried:
     Tasks without named vehicles are planned under the budgets only and have no shares. Raises `Infeasible` where the
     limits ask for more than the budgets or the samples held, and `TooSlow` where no plan fits the horizon.
     """
-    bounded = problem.model_copy(update={"tasks": tuple(_within_held(task) for task in problem.tasks)})
-    plan = allocate(bounded)
+    if not any(task.vehicles for task in problem.tasks):
+        return _timed(problem, (allocate(problem), {}))
+    found: list[Carried] = []
+    refused: list[Infeasible] = []
+    certificate: list[Dual] = []
+    for choices, settled in list_settled(problem):
+        try:
+            bounded = settled.model_copy(update={"tasks": tuple(_within_held(task) for task in settled.tasks)})
+            plan = allocate(bounded)
+            certificate += plan.certificate
+            least = min((best.objective for best, _ in found), default=np.inf)
+            if problem.objective != "area" and (plan.lower_bound or 0.0) >= least:
+                continue
+            carried, shares = _carry(bounded, plan)
+            found.append((name_choices(carried, choices), shares))
+        except Infeasible as error:
+            refused.append(error)
+    if not found:
+        raise refused[0]
+    best = join_plans(problem, [plan for plan, _ in found], OPTIMAL, tuple(certificate))
+    return best, next(shares for plan, shares in found if plan.tasks is best.tasks)
+
+
+def _carry(bounded: Problem, plan: Allocation) -> Carried:
+    """Return `plan`, the best one within the budgets, or the best that the vehicles can carry out, with its split."""
     try:
         return _timed(bounded, (plan, split_plan(bounded, plan.tasks)))
     except TooSlow as error:

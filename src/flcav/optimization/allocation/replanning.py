@@ -9,10 +9,21 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from flcav.config import Config, InputError
-from flcav.optimization.curves.curves import STAGES, Additive, Curve, Decay, Effective, Federated, NonNegative
+from flcav.optimization.allocation.round_choices import narrow, settle_first
+from flcav.optimization.curves.curves import (
+    STAGES,
+    Additive,
+    Curve,
+    Decay,
+    Effective,
+    Federated,
+    NonNegative,
+    Positive,
+)
 from flcav.optimization.problem import AllocationTask, Budgets, Count, Fraction, Problem, Vehicles
 from flcav.optimization.solvers.branches import call_vehicles
 from flcav.optimization.solvers.instance import price_counts
+from flcav.storage.records import LEFT_OUT
 
 LEAST_ERROR = 1e-6  # error assumed for an accuracy of 1: test sets are finite
 
@@ -26,6 +37,8 @@ class TaskState(Config):
     called: Vehicles | None = (
         None  # vehicles of each edge server that were called to its edge rounds, where a plan says
     )
+    local_steps: Annotated[Positive | None, LEFT_OUT] = None  # factor of its rounds so far, where a plan says
+    form: Annotated[str | None, LEFT_OUT] = None  # of their updates, where a plan says
     accuracy: Fraction | None = (
         None  # accuracy now; None: not measured; of a cluster: the weighted mean of its members'
     )
@@ -77,7 +90,9 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
 
 
 def _call(problem: Problem, task: AllocationTask, spent: TaskState | None) -> AllocationTask:
-    """Return the task with the number of vehicles that were called to the edge rounds done."""
+    """Return the task with the number of vehicles, the local steps and the form of the rounds that are done."""
+    if spent is not None and (any(spent.counts[1:]) or spent.local_steps is not None or spent.form is not None):
+        task = narrow(task, spent.local_steps, spent.form)
     if spent is None or spent.called is None:
         return task
     if task.called is None or not task.called[0] <= spent.called <= task.called[1]:
@@ -131,7 +146,7 @@ def _left(problem: Problem, progress: PlanState) -> Budgets:
         return budgets
     done = [
         price_counts(problem, task, progress.tasks[task.name].counts)
-        for task in problem.tasks
+        for task in settle_first(problem)[1].tasks
         if task.name in progress.tasks
     ]
     left = {}

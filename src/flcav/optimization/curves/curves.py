@@ -21,6 +21,9 @@ Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Sizeable = Annotated[float, Field(ge=1e-9)]  # large enough to divide by
 Change = Annotated[float, Field(ge=-1, le=1)]  # of an error
+Pace = Annotated[
+    float, Field(ge=1e-9, exclude_if=lambda value: value == 1)
+]  # rounds of the history that one is worth; left out of the JSON where it is 1
 
 
 @overload
@@ -101,7 +104,7 @@ class Additive(CurveConfig):
 class Effective(CurveConfig):
     """Learning curve over effective samples: error = floor + a * n^(-b).
 
-    n is `effective_samples` with group = beta * group_samples and t = edge_rounds + k * cloud_rounds.
+    n is `effective_samples` with group = beta * group_samples and t = pace * (edge_rounds + k * cloud_rounds).
     """
 
     model: Literal["effective"]
@@ -111,6 +114,7 @@ class Effective(CurveConfig):
     alpha: Sizeable  # worth of an uploaded sample
     beta: NonNegative  # worth of a sample that stays on its vehicle
     group_samples: NonNegative  # held by the vehicles of all edge groups
+    pace: Pace = 1.0
 
     def __str__(self) -> str:
         """Return the formula in x samples and t rounds."""
@@ -124,14 +128,15 @@ class Effective(CurveConfig):
 
     def effective_samples(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int) -> Array:
         """Return the number of effective samples n, elementwise, at `k` edge rounds per cloud round."""
-        t = np.asarray(edge_rounds, np.float64) + k * np.asarray(cloud_rounds)
+        t = self.pace * (np.asarray(edge_rounds, np.float64) + k * np.asarray(cloud_rounds))
         return effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.beta * self.group_samples)
 
 
 class Federated(CurveConfig):
     """Learning curve of regions that learn from each other in cloud rounds: error = floor + a * n^(-b) + drift part.
 
-    With t = edge_rounds + k * cloud_rounds, z cloud rounds, R regions and G samples held in all of them,
+    With t = edge_rounds + k * cloud_rounds, z cloud rounds, R regions and G samples held in all of them, for a pace of
+    1 (another one multiplies t and z in n),
 
         n = alpha * samples + beta * (G / R * (1 - 1 / (t + 1)) + gamma * (G - G / R) * (1 - 1 / (z + 1))):
 
@@ -150,6 +155,7 @@ class Federated(CurveConfig):
     gamma: NonNegative = 0.0  # worth of a sample of another region, relative to beta
     group_samples: Annotated[tuple[NonNegative, ...], Field(min_length=2)]  # held by the vehicles of each region
     drift: Change = 0.0  # change of the error by infinitely many cloud rounds, in addition to what they bring
+    pace: Pace = 1.0
 
     def __str__(self) -> str:
         """Return the formula in x samples, t rounds and z cloud rounds."""
@@ -177,9 +183,9 @@ class Federated(CurveConfig):
     def effective_samples(self, samples: ArrayLike, edge_rounds: ArrayLike, cloud_rounds: ArrayLike, k: int) -> Array:
         """Return the number of effective samples n, elementwise, at `k` edge rounds per cloud round."""
         z = np.asarray(cloud_rounds, np.float64)
-        t = np.asarray(edge_rounds, np.float64) + k * z
+        t = self.pace * (np.asarray(edge_rounds, np.float64) + k * z)
         effective = effective_samples(np.asarray(samples, np.float64), t, self.alpha, self.own)
-        return np.asarray(effective_samples(effective, z, 1.0, self.others), dtype=np.float64)
+        return np.asarray(effective_samples(effective, self.pace * z, 1.0, self.others), dtype=np.float64)
 
 
 def split_regions(group_samples: Sequence[float]) -> tuple[float, float]:

@@ -56,7 +56,7 @@ def call_vehicles(task: AllocationTask, least: int, most: int, k: int) -> Alloca
         if isinstance(curve, Effective) and whole < 1:
             held = whole * curve.group_samples
             others = 0.0 if k == 0 else (1 - whole) / whole
-            values = {name: getattr(curve, name) for name in ("floor", "a", "b", "alpha", "beta")}
+            values = {name: getattr(curve, name) for name in ("floor", "a", "b", "alpha", "beta", "pace")}
             return Federated(model="federated", **values, group_samples=(held, held), gamma=others)
         if isinstance(curve, Federated):
             parts = shares if len(shares) == len(curve.group_samples) else [whole] * len(curve.group_samples)

@@ -2,12 +2,12 @@
 
 A task's error above its floor is
 
-    weight (a n^(-b) + drift part of z),   n = alpha x + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)),
+    weight (a n^(-b) + drift part of z),   n = alpha x + own (1 - 1 / (p t + 1)) + others (1 - 1 / (p z + 1)),
 
-with x samples, t = y + k z rounds and z cloud rounds. Where cloud rounds bring more than edge rounds, or cost less
-(labels are sent before each edge round), every pair (y, z) is tried; for other `Effective` curves, and for `Federated`
-ones whose cloud rounds bring nothing, only the pair with the fewest cloud rounds for each t. For a given pair the best
-x has a closed form. No step needs the error to be convex in the rounds, or to decrease with them.
+with x samples, t = y + k z rounds, z cloud rounds and the curve's pace p. Where cloud rounds bring more than edge
+rounds, or cost less (labels are sent before each edge round), every pair (y, z) is tried; for other `Effective` curves,
+and for `Federated` ones whose cloud rounds bring nothing, only the pair with the fewest cloud rounds for each t. For a
+given pair the best x has a closed form. No step needs the error to be convex in the rounds, or to decrease with them.
 """
 
 from collections.abc import Sequence
@@ -34,6 +34,7 @@ class EffectiveTasks:
     own: Array  # (E, 1) worth of the samples held in a task's region
     others: Array  # (E, 1) worth of the samples held in the other regions
     drift: Array  # (E, 1) weight * drift
+    pace: Array  # (E, 1) rounds of the history that one is worth
     k: int  # edge rounds per cloud round
     least: Array  # (E, 1) samples
     most: Array  # (E, 1) samples
@@ -99,8 +100,9 @@ class EffectiveTasks:
 
     def _effective(self, samples: Array | float, rounds: Array) -> Array:
         """Return the effective samples (E, T) of `samples` (E, T) and `rounds` (E, T, 2)."""
-        held = effective_samples(samples, rounds[..., 0] + self.k * rounds[..., 1], self.alpha, self.own)
-        return effective_samples(held, rounds[..., 1], 1.0, self.others) if self.others.any() else held
+        t = self.pace * (rounds[..., 0] + self.k * rounds[..., 1])
+        held = effective_samples(samples, t, self.alpha, self.own)
+        return effective_samples(held, self.pace * rounds[..., 1], 1.0, self.others) if self.others.any() else held
 
 
 @dataclass(frozen=True)
@@ -129,11 +131,13 @@ def build_effective_tasks(
     for row, (pairs, q) in enumerate(zip(choices, quantity)):
         rounds[row, : len(pairs)] = pairs
         rounds_cost[row, : len(pairs)] = pairs @ cost[q[1:]]
-    rows = [(task.weight * task.curve.a, task.curve.b, task.curve.alpha, *_held(task)) for task in tasks]
-    gain, b, alpha, own, others, drift = np.array(rows).T[:, :, None]
+    rows = [
+        (task.weight * task.curve.a, task.curve.b, task.curve.alpha, *_held(task), task.curve.pace) for task in tasks
+    ]
+    gain, b, alpha, own, others, drift, pace = np.array(rows).T[:, :, None]
     least, most = low[quantity[:, :1]], high[quantity[:, :1]]
     sample_cost = cost[quantity[:, 0]]
-    worth = (gain, b, alpha, own, others, drift)
+    worth = (gain, b, alpha, own, others, drift, pace)
     return EffectiveTasks(quantity, *worth, k, least, most, sample_cost, rounds, rounds_cost)
 
 

@@ -58,8 +58,8 @@ class PowerTerm:
 class EffectiveTerm:
     """The inverse power gain * n^(-b) of effective samples n; its cuts are tangents.
 
-    n = alpha s + own (1 - 1 / (t + 1)) + others (1 - 1 / (z + 1)), for s = x[first] samples, z = x[first + 2] cloud
-    rounds and t = x[first + 1] + k z rounds.
+    n = alpha s + own (1 - 1 / (p t + 1)) + others (1 - 1 / (p z + 1)), for s = x[first] samples, z = x[first + 2] cloud
+    rounds, t = x[first + 1] + k z rounds and the pace p.
     """
 
     first: int
@@ -68,6 +68,7 @@ class EffectiveTerm:
     alpha: float
     own: float  # worth of the samples held in the task's region
     others: float  # worth of the samples held in the other regions
+    pace: float  # rounds of the history that one is worth
     k: int  # edge rounds per cloud round
 
     def value(self, x: Array) -> float:
@@ -79,16 +80,16 @@ class EffectiveTerm:
         """Return the tangent at x (n,)."""
         samples, edge_rounds, cloud_rounds = x[self.first : self.first + 3]
         t = edge_rounds + self.k * cloud_rounds
-        per_round = self.own / (t + 1) ** 2
-        per_cloud_round = self.k * per_round + self.others / (cloud_rounds + 1) ** 2
+        per_round = self.pace * self.own / (self.pace * t + 1) ** 2
+        per_cloud_round = self.k * per_round + self.pace * self.others / (self.pace * cloud_rounds + 1) ** 2
         fall = self.gain * self.b * self._effective(samples, t, cloud_rounds) ** (-self.b - 1)
         slope = -fall * np.array((self.alpha, per_round, per_cloud_round))
         index = (self.first, self.first + 1, self.first + 2)
         return [Line(index, tuple(map(float, slope)), self.value(x) - float(slope @ x[self.first : self.first + 3]))]
 
     def _effective(self, samples: float, t: float, cloud_rounds: float) -> float:
-        held = effective_samples(samples, t, self.alpha, self.own)
-        return float(effective_samples(held, cloud_rounds, 1.0, self.others))
+        held = effective_samples(samples, self.pace * t, self.alpha, self.own)
+        return float(effective_samples(held, self.pace * cloud_rounds, 1.0, self.others))
 
 
 @dataclass(frozen=True)
@@ -111,8 +112,9 @@ def list_terms(instance: Instance) -> list[Term]:
     rows = zip(of.tolist(), powers.a.tolist(), powers.b.tolist(), powers.x0.tolist())
     terms: list[Term] = [PowerTerm(*row) for row in rows if row[1] > 0]
     if effective is not None:
-        columns = (effective.quantity, effective.gain, effective.b, effective.alpha, effective.own, effective.others)
-        terms += [EffectiveTerm(*row, k=effective.k) for row in zip(*(column[:, 0].tolist() for column in columns))]
+        worth = (effective.gain, effective.b, effective.alpha, effective.own, effective.others, effective.pace)
+        own = zip(*(column[:, 0].tolist() for column in (effective.quantity, *worth)))
+        terms += [EffectiveTerm(*row, k=effective.k) for row in own]
         terms += [PowerTerm(index, -drift, 1.0, 1.0) for index, drift in _drifts(effective) if drift < 0]
     return terms
 

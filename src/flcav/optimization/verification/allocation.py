@@ -42,7 +42,9 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     lower = plan["lower_bound"]
     duals = plan.get("certificate", ())
     read, budgets = read_tasks(problem, k)
-    tasks = [task.calls.get(row.get("called"), task) for task, row in zip(read, plan["tasks"], strict=True)]
+    chosen = [(row.get("local_steps"), row.get("form")) for row in plan["tasks"]]
+    settled = [task.works.get(names, task) for task, names in zip(read, chosen, strict=True)]
+    tasks = [task.calls.get(row.get("called"), task) for task, row in zip(settled, plan["tasks"], strict=True)]
     counts = [[row[name] for name in QUANTITIES] for row in plan["tasks"]]
     costs = [task.cost(row) for task, row in zip(tasks, counts, strict=True)]
     stated = [plan["used_mb"].values(), *((row["wireless_mb"], row["wireline_mb"]) for row in plan["tasks"])]
@@ -55,8 +57,9 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
         value = float(np.sin(2 * np.pi / len(corners)) / 2 * (corners @ np.roll(corners, 1)))
     spent = sum(costs, np.zeros(1, dtype=object))
     claims = {
+        "the local steps and forms": all(names in task.works for task, names in zip(read, chosen)),
         "the vehicles called": all(
-            not task.calls or row["called"] in task.calls for task, row in zip(read, plan["tasks"])
+            not task.calls or row["called"] in task.calls for task, row in zip(settled, plan["tasks"])
         ),
         "the limits": all(a <= n <= b for task, row in zip(tasks, counts) for n, (a, b) in zip(row, task.limits)),
         "the budgets": bool(np.all(spent <= budgets)),
@@ -109,8 +112,10 @@ def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: A
         paid += fsum(w * (curve_["floor"] + curve_.get("merge", 0.0) * merged) for w, curve_ in task.curves)
         if curve["model"] == "additive":
             for stage, price, (low, high) in zip(STAGES, prices, ranges):
+                paces = (1.0 if stage == "pretrain" else each.get("pace", 1.0) for _, each in task.curves)
                 decays = [
-                    (w * curve_[stage]["a"], curve_[stage]["b"], 1.0, curve_[stage]["x0"]) for w, curve_ in task.curves
+                    (w * each[stage]["a"], each[stage]["b"], pace, each[stage]["x0"])
+                    for pace, (w, each) in zip(paces, task.curves)
                 ]
                 paid += float(_bound_convex([each for each in decays if each[0] > 0], price, low, high))
         else:

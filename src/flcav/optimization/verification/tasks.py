@@ -16,6 +16,7 @@ from flcav.optimization.verification.record import exact
 Data = Mapping[str, Any]  # JSON values
 Array = np.ndarray[Any, np.dtype[Any]]  # of floats, or (L,) of Fractions
 
+BITS = {"float32": 32, "fp16": 16, "int8": 8, "int4": 4, "top-k": 64}  # of a parameter that is sent
 QUANTITIES, STAGES = ("samples", "edge_rounds", "cloud_rounds"), ("pretrain", "edge", "cloud")
 SLACK = 1 + Fraction(1, 10**12)  # of a budget: the rounding of a sum that is within it
 
@@ -28,6 +29,7 @@ class VerifiedTask(NamedTuple):
     unit: Array  # (3, L) cost of one of each
     once: Array  # (L,) cost of the first cloud round
     calls: Mapping[int, Any] = {}  # the task with each number of vehicles that a plan may call, the fewest first
+    works: Mapping[tuple[float | None, str | None], Any] = {}  # with each number of local steps and form of updates
 
     def cost(self, counts: Sequence[int]) -> Array:
         """Return the cost (L,) of samples, edge rounds and cloud rounds."""
@@ -41,9 +43,9 @@ def least_cost(tasks: Sequence[VerifiedTask]) -> Array:
 
 def read_tasks(problem: Data, k: int) -> tuple[list[VerifiedTask], Array]:
     """Return the tasks, and the budgets (L,), raised by the rounding that a plan's sums may have."""
-    tasks = []
     budgets = list(problem["budgets_mb"].values())
     horizon_s = problem["horizon_s"]
+    tasks, timed = [], False
     gains = [max((problem["performance"] or 0) - (each["performance_without"] or 0), 0) for each in problem["tasks"]]
     for task, gain in zip(problem["tasks"], gains):
         weight = task["weight"] if problem["performance"] is None else gain / sum(gains)
@@ -57,18 +59,59 @@ def read_tasks(problem: Data, k: int) -> tuple[list[VerifiedTask], Array]:
         for limit, stage in zip(limits, STAGES):  # where an error is infinite at 0
             infinite = (member[stage]["a"] > 0 == member[stage]["x0"] for _, member in curves if stage in member)
             limit[0] = max(limit[0], any(infinite))
-        sent = task.get("exchange_mb") or task["model_mb"]
-        sizes = (task["sample_mb"], task["model_mb"], sent, task.get("labels_mb") or 0, 0 if names else task["train_s"])
-        sample, model, sent, labels, train_s = map(exact, sizes)
-        cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
-        rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
-        costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
-        read = VerifiedTask(curves, limits, costs[:3], costs[3])
-        tasks.append(read._replace(calls=_list_calls(task, read, sent + labels, k)) if task.get("called") else read)
-    budgets += [horizon_s] * (horizon_s is not None and any(task.unit[1, 2] for task in tasks))
+        works = {}
+        for factor, worth, form, share, loss in _list_works(task, horizon_s):
+            paced: list[tuple[float, Data]] = [
+                (w, {**own, "floor": own["floor"] + loss, "pace": worth * own.get("pace", 1.0)}) for w, own in curves
+            ]
+            model = exact(task["model_mb"]) * share
+            sizes = (task["sample_mb"], task.get("exchange_mb") or model, task.get("labels_mb") or 0)
+            sample, sent, labels = map(exact, sizes)
+            train_s = exact(0 if names else task["train_s"]) * exact(factor or 1)
+            timed |= train_s > 0
+            cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
+            rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
+            costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
+            read = VerifiedTask(paced, limits, costs[:3], costs[3])
+            calls = _list_calls(task, read, sent + labels, k) if task.get("called") else {}
+            works[factor, form] = read._replace(calls=calls)
+        tasks.append(next(iter(works.values()))._replace(works=works))
+    budgets += [horizon_s] * (horizon_s is not None and timed)
     kept = slice(len(budgets))
     tasks = [_keep(task, kept) for task in tasks]
     return tasks, np.array([exact(budget) * SLACK for budget in budgets])
+
+
+def _list_works(task: Data, horizon_s: float | None) -> list[tuple[float | None, float, str | None, Fraction, float]]:
+    """Return the choices of rounds that no other makes superfluous.
+
+    They are the factor and worth of local steps, and name, share of the stored bits and loss of a form.
+    """
+    steps = [(each["factor"], each["worth"]) for each in task.get("local_steps", ())] or [(None, 1.0)]
+    forms = [(None, Fraction(1), 0.0)]
+    if task.get("forms"):
+        forms = [
+            (
+                name,
+                exact(BITS[name] * (form["fraction"] or 1) if form["bits"] is None else form["bits"]) / 32,
+                form["loss"],
+            )
+            for name, form in task["forms"].items()
+        ]
+    limited = horizon_s is not None and (task["train_s"] > 0 or any(task["vehicle_train_s"].values()))
+    every = [(*one, *other) for one, other in product(steps, forms)]
+    return [
+        own
+        for number, own in enumerate(every)
+        if not any(_replaces(each, own, limited) for each in every[:number])
+        and not any(_replaces(each, own, limited) and not _replaces(own, each, limited) for each in every[number + 1 :])
+    ]
+
+
+def _replaces(one: Sequence[Any], other: Sequence[Any], limited: bool) -> bool:
+    """Return whether a choice of rounds takes no more time and bits than another, and teaches and loses no worse."""
+    quick = not limited or (one[0] or 1) <= (other[0] or 1)
+    return quick and one[1] >= other[1] and one[3] <= other[3] and one[4] <= other[4]
 
 
 def _list_calls(task: Data, read: VerifiedTask, sent: Fraction, k: int) -> dict[int, VerifiedTask]:
@@ -98,14 +141,20 @@ def _list_calls(task: Data, read: VerifiedTask, sent: Fraction, k: int) -> dict[
 def _keep(task: VerifiedTask, budgets: slice) -> VerifiedTask:
     """Return the task with costs under the budgets that exist only."""
     calls = {number: _keep(called, budgets) for number, called in task.calls.items()}
-    return task._replace(unit=task.unit[:, budgets], once=task.once[budgets], calls=calls)
+    works = {names: _keep(work, budgets) for names, work in task.works.items()}
+    return task._replace(unit=task.unit[:, budgets], once=task.once[budgets], calls=calls, works=works)
 
 
 def list_branches(tasks: Sequence[VerifiedTask]) -> Iterator[tuple[VerifiedTask, ...]]:
-    """Yield the tasks for every combination of vehicles called, and of limits without and with cloud rounds.
+    """Yield the tasks for every combination of rounds, and in it of vehicles called, and of limits on cloud rounds.
 
-    The latter are two branches where the first cloud round has a cost that is paid once.
+    Limits without and with cloud rounds are two branches where the first cloud round has a cost that is paid once.
     """
+    for chosen in product(*(task.works.values() or (task,) for task in tasks)):
+        yield from _list_parts(chosen)
+
+
+def _list_parts(tasks: Sequence[VerifiedTask]) -> Iterator[tuple[VerifiedTask, ...]]:
     options = []
     for task in tasks:
         *others, (least, most) = task.limits
@@ -120,7 +169,8 @@ def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
     """Return a curve's error after `counts` (samples, edge rounds, cloud rounds), elementwise."""
     x, y, z = counts
     if curve["model"] == "additive":
-        powers = ((curve[stage], each) for stage, each in zip(STAGES, counts))
+        pace = curve.get("pace", 1.0)
+        powers = ((curve[stage], each) for stage, each in zip(STAGES, (x, pace * y, pace * z)))
         parts = [
             power["a"] * np.asarray(each + power["x0"], float) ** -power["b"]
             for power, each in powers
@@ -133,7 +183,8 @@ def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
 
 def held_samples(curve: Data, y: Any, z: Any, k: int) -> Any:
     """Return the effective samples that edge rounds `y` and cloud rounds `z` bring, elementwise."""
-    groups, t, left = np.atleast_1d(curve["group_samples"]), y + k * z, curve.get("left", 0.0)
+    groups, left, pace = np.atleast_1d(curve["group_samples"]), curve.get("left", 0.0), curve.get("pace", 1.0)
+    t, z = pace * (y + k * z), pace * z
     mean = fsum(groups) / len(groups)
     later = curve.get("gamma", 0.0) * mean * (len(groups) - 1) + left * curve.get("trained", False)
     return curve["beta"] * ((mean - left) * t / (t + 1) + later * z / (z + 1))

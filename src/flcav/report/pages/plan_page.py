@@ -8,7 +8,7 @@ import networkx as nx
 
 from flcav.network.ledger import LinkMegabytes
 from flcav.network.plan import StagePlan, price
-from flcav.optimization.allocation.allocate import Allocation, TaskAllocation, resolve_problem
+from flcav.optimization.allocation.allocate import Allocation, TaskAllocation, resolve_problem, settle_plan
 from flcav.optimization.allocation.budget_sweep import LINKS, BudgetPoint
 from flcav.optimization.allocation.comparison import PlanComparison
 from flcav.optimization.allocation.problem_file import CURVE, MEASURES, STEPS, TERMS, explain_objective
@@ -58,7 +58,13 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
         for link in LINKS
     }
     tasks = [
-        {**asdict(row), "accuracy": row.describe_accuracy(), "weight": task.weight, "vehicles": sum(task.edge_groups)}
+        {
+            **asdict(row),
+            "accuracy": row.describe_accuracy(),
+            "rounds": row.describe_rounds(),
+            "weight": task.weight,
+            "vehicles": sum(task.edge_groups),
+        }
         for task, row in zip(resolve_problem(problem).tasks, plan.tasks, strict=True)
     ]
     values = {
@@ -106,7 +112,7 @@ def _parts(problem: Problem, plan: Allocation) -> list[plans.StageTraffic]:
     shown = {row.name for row in ordered[: SHOWN if len(ordered) > SHOWN + 1 else len(ordered)]}
     others = f"{len(ordered) - len(shown)} other tasks"
     totals: dict[tuple[str, str, str], float] = {}
-    for task, row in zip(problem.tasks, plan.tasks, strict=True):
+    for task, row in zip(settle_plan(problem, plan.tasks).tasks, plan.tasks, strict=True):
         for stage, cost in _stage_prices(problem, task, row).items():
             for link in LINKS:
                 key = (link, row.name if row.name in shown else others, stage)

@@ -11,6 +11,7 @@ from flcav.federation.links.in_process import update_bytes
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.strategies import exchanges_more
 from flcav.federation.trainable import Weights
+from flcav.federation.upload import encode_model
 from flcav.network.clock.records import save_rounds
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.network.ledger import Ledger
@@ -199,6 +200,8 @@ def open_region_fleet(settings: FederationSettings, learning: Learning, region: 
     weights = to_arrays(learning.build_network())
     both = isinstance(how.personal, RegionalModels)  # the region's and the global model are downloaded together
     down = update_bytes(weights, exchanging=both)
+    if how.download != "none":
+        down += update_bytes(encode_model(weights)) - update_bytes(weights)
     up = update_bytes(weights, how.upload, exchanging=exchanges_more(how.strategy))
     return Fleet(region, tuple(clients), down, up, settings.train_s, settings.speeds)
 
