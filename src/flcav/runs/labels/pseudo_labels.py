@@ -63,32 +63,15 @@ def annotated_samples(
     return {name: task.samples(split.data, config, numbers) for name, numbers in own.items()}
 
 
-def pseudo_label_samples(
-    network: Second,
-    threshold: float,
-    split: Frames,
-    frames: Sequence[int],
-    poles: Sequence[int],
-    region: str,
-    report: Report,
-    book: Ledger | None = None,
-    trained: bool = False,
-    poses: PoseSource = EXACT,
-) -> dict[str, list[Sample]]:
-    """Return each vehicle's sweeps with pseudo-labels, by "region/vehicle".
-
-    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the sensors `poles`, by
-    the package's road detector if `trained`, else by an ideal one, as their messages have them, which enter `book` as
-    downlinks; stage III passes none, since its labels are those of stage II. A vehicle places them by the `poses`
-    of its navigation.
-    """
+def label_detected(network: Second, threshold: float, split: Frames) -> LabelFrame:
+    """Return the labelling of frames by the detections of the frozen `network` that score `threshold` or more."""
     relief = DatasetGround(split.data).relief
 
-    def label(i: int, frame: Frame, told: Sequence[RoadView]) -> Sample:
+    def label(i: int, frame: Frame, views: Sequence[RoadView]) -> Sample:
         (detections,) = detect_in(network, [frame], score_threshold=threshold)
-        return label_sample(frame, detections, told, network.config, choose_lidar(frame), relief)
+        return label_sample(frame, detections, views, network.config, choose_lidar(frame), relief)
 
-    return label_frames(label, split, frames, poles, region, report, book, trained, poses)
+    return label
 
 
 def label_frames(
@@ -104,8 +87,9 @@ def label_frames(
 ) -> dict[str, list[Sample]]:
     """Return each vehicle's samples, by "region/vehicle", as `label` makes them.
 
-    It is given a frame's number, the frame with the pose of the vehicle's navigation, and what road sensors see of it.
-    See `pseudo_label_samples` for the other arguments.
+    `label` is given a frame's number, the frame with the pose of the vehicle's navigation (`poses`), and the messages
+    of the sensors on `poles`, by the package's road detector if `trained`, else by an ideal one. The messages enter
+    `book` as downlinks; stage III passes none, since its labels are those of stage II.
     """
     data = split.data
     views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})
@@ -125,7 +109,7 @@ def label_frames(
 def road_views(
     split: Frames, poles: Sequence[int], trained: bool, spins: Collection[Spin]
 ) -> dict[Spin, dict[int, RoadView]]:
-    """Return what sensors see in `spins`, by spin and number of the pole, of `poles`: see `pseudo_label_samples`."""
+    """Return what sensors see in `spins`, by spin and number of the pole, of `poles`: see `label_frames`."""
     ground = DatasetGround(split.data)
     views: dict[Spin, dict[int, RoadView]] = {}
     find = road_detector(split.data) if trained and poles else None
