@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
+from statements import list_imports
+
 import flcav
 
 VAGUE = frozenset({"Any", "object"})
@@ -60,8 +62,8 @@ class Tree:
     def crossings(self) -> Iterator[tuple[str, ast.stmt]]:
         """Yield the definitions that a module of another folder imports, or reaches through a module it imports."""
         for module, tree in self.modules.items():
-            for node in ast.walk(tree):
-                if not isinstance(node, ast.ImportFrom) or not node.module or not node.module.startswith(self.root):
+            for node in list_imports(tree):
+                if not node.module or not node.module.startswith(self.root):
                     continue
                 for alias in node.names:
                     whole = f"{node.module}.{alias.name}"
@@ -103,9 +105,8 @@ class Tree:
 
 def names(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
     """Yield each name that is defined at the top of a module, or imported anywhere in it, with its statement."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom):
-            yield from ((alias.asname or alias.name, node) for alias in node.names)
+    for node in list_imports(tree):
+        yield from ((alias.asname or alias.name, node) for alias in node.names)
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name, node
