@@ -5,6 +5,7 @@ parameters, returned values and fields. `ALLOWED` holds what is left, with a rea
 """
 
 import ast
+import gc
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -152,10 +153,14 @@ def annotations(function: ast.FunctionDef) -> list[ast.expr | None]:
 def read(folder: Path) -> Tree:
     """Return the modules below the folder of a package."""
     modules = {}
-    for path in sorted(folder.rglob("*.py")):
-        parts = [folder.name, *path.relative_to(folder).with_suffix("").parts]
-        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        modules[name] = ast.parse(path.read_text(encoding="utf-8"))
+    gc.disable()  # or the collector walks through the growing trees again and again, for most of the time
+    try:
+        for path in sorted(folder.rglob("*.py")):
+            parts = [folder.name, *path.relative_to(folder).with_suffix("").parts]
+            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            modules[name] = ast.parse(path.read_text(encoding="utf-8"))
+    finally:
+        gc.enable()
     return Tree(modules)
 
 
