@@ -22,7 +22,7 @@ FEW = 0.001  # share of them
 
 def list_methods() -> list[str]:
     """Return the names of all calls."""
-    methods = [name for name in vars(Calls) if not name.startswith("_") and callable(getattr(Calls, name))]
+    methods = [name for name in dir(Calls) if not name.startswith("_") and callable(getattr(Calls, name))]
     return [name for name in methods if "return" in get_type_hints(getattr(Calls, name))]
 
 

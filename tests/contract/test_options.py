@@ -1,6 +1,7 @@
 """No option is passed over in silence: each is used, or refused in a sentence where it would have no effect."""
 
 import ast
+import functools
 import inspect
 import textwrap
 from collections.abc import Callable, Iterator
@@ -203,6 +204,7 @@ def commands(group: click.Group, before: str = "") -> Iterator[tuple[str, click.
             yield before + name, command
 
 
+@functools.cache
 def app_commands() -> dict[str, click.Command]:
     group = typer.main.get_command(app)
     assert isinstance(group, click.Group)

@@ -10,11 +10,30 @@ import yaml
 
 from flcav.cli.main import run
 from flcav.optimization.allocation import allocate as allocation
+from flcav.optimization.allocation import budget_sweep, fleet
 from flcav.optimization.allocation.problem_file import TERMS
 from flcav.optimization.curves.history import ARTICLE
 
 RECIPES = sorted((Path(__file__).parents[2] / "recipes" / "allocation").glob("*.yaml"))
 TASK_KEYS = {"name", "samples", "edge_rounds", "cloud_rounds", "predicted_error", "wireless_mb", "wireline_mb"}
+
+
+SOLVED: dict[str, fleet.Carried] = {}
+
+
+@pytest.fixture
+def solved_once(monkeypatch):
+    """Solve each problem once: the JSON and the text of a command, and its baselines, are of one plan."""
+    solve = fleet.allocate_fleet
+
+    def recall(problem):
+        asked = problem.model_dump_json()
+        if asked not in SOLVED:
+            SOLVED[asked] = solve(problem)
+        return SOLVED[asked]
+
+    for module in (fleet, budget_sweep):
+        monkeypatch.setattr(module, "allocate_fleet", recall)
 
 
 def called(*arguments: object) -> int:
@@ -24,7 +43,7 @@ def called(*arguments: object) -> int:
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda path: path.stem)
-def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
+def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys, solved_once):
     assert called("allocate", recipe, "--json") == 0
     plan, asked = json.loads(capsys.readouterr().out), yaml.safe_load(recipe.read_text())
     assert set(plan) - {"busy_s"} == {
@@ -43,7 +62,7 @@ def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys):
     assert plan["tasks"][0]["name"] in capsys.readouterr().out
 
 
-def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys):
+def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys, solved_once):
     values = yaml.safe_load(RECIPES[-1].read_text())
     for task in values["tasks"]:
         task["weight"] = 1
@@ -68,7 +87,7 @@ def test_a_certificate_is_verified_and_one_that_does_not_hold_is_exit_1(by, caps
     assert bool(json.loads(capsys.readouterr().out)["verification"]["faults"]) == (by > 1)
 
 
-def test_a_graph_is_planned_down_to_its_vehicles(capsys):
+def test_a_graph_is_planned_down_to_its_vehicles(capsys, solved_once):
     graph = RECIPES[0].parents[1] / "graphs" / "three_layers.yaml"
     assert called("allocate", graph, "--json") == 0
     plan = json.loads(capsys.readouterr().out)
@@ -81,7 +100,7 @@ def test_a_graph_is_planned_down_to_its_vehicles(capsys):
     assert "car 4" in capsys.readouterr().out
 
 
-def test_out_is_a_page_that_tells_the_plan(tmp_path, capsys):
+def test_out_is_a_page_that_tells_the_plan(tmp_path, capsys, solved_once):
     assert called("allocate", RECIPES[0], "--json", "--out", tmp_path / "plan.html") == 0
     plan = json.loads(capsys.readouterr().out)
     page = (tmp_path / "plan.html").read_text()
@@ -213,7 +232,7 @@ def test_numbers_too_different_for_the_solver_are_refused_in_a_sentence(tmp_path
 
 
 @pytest.mark.parametrize("name", ["equal-stages", "equal-tasks", "max-throughput", "article"])
-def test_a_baseline_stands_beside_the_optimum(name, capsys):
+def test_a_baseline_stands_beside_the_optimum(name, capsys, solved_once):
     assert called("allocate", RECIPES[0], "--baseline", name, "--json") == 0
     plan = json.loads(capsys.readouterr().out)
     assert plan["baseline"]["name"] == name

@@ -5,6 +5,7 @@ from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import pytest
+from statements import list_imports
 
 import flcav
 
@@ -18,9 +19,8 @@ def imports(folder: Path) -> dict[str, set[str]]:
     found: dict[str, set[str]] = {}
     for name, path in paths.items():
         named: set[tuple[str, str]] = set()
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.ImportFrom):
-                named |= {(node.module or "", alias.name) for alias in node.names}
+        for node in list_imports(ast.parse(path.read_text(encoding="utf-8"))):
+            named |= {(node.module or "", alias.name) for alias in node.names}
         found[name] = {place for module, own in named for place in (module, f"{module}.{own}") if place in paths}
     return found
 

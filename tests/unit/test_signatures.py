@@ -5,10 +5,13 @@ parameters, returned values and fields. `ALLOWED` holds what is left, with a rea
 """
 
 import ast
+import gc
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+
+from statements import list_imports
 
 import flcav
 
@@ -60,8 +63,8 @@ class Tree:
     def crossings(self) -> Iterator[tuple[str, ast.stmt]]:
         """Yield the definitions that a module of another folder imports, or reaches through a module it imports."""
         for module, tree in self.modules.items():
-            for node in ast.walk(tree):
-                if not isinstance(node, ast.ImportFrom) or not node.module or not node.module.startswith(self.root):
+            for node in list_imports(tree):
+                if not node.module or not node.module.startswith(self.root):
                     continue
                 for alias in node.names:
                     whole = f"{node.module}.{alias.name}"
@@ -103,9 +106,8 @@ class Tree:
 
 def names(tree: ast.Module) -> Iterator[tuple[str, ast.stmt]]:
     """Yield each name that is defined at the top of a module, or imported anywhere in it, with its statement."""
-    for node in ast.walk(tree):
-        if isinstance(node, ast.ImportFrom):
-            yield from ((alias.asname or alias.name, node) for alias in node.names)
+    for node in list_imports(tree):
+        yield from ((alias.asname or alias.name, node) for alias in node.names)
     for node in tree.body:
         if isinstance(node, ast.FunctionDef | ast.ClassDef):
             yield node.name, node
@@ -151,10 +153,14 @@ def annotations(function: ast.FunctionDef) -> list[ast.expr | None]:
 def read(folder: Path) -> Tree:
     """Return the modules below the folder of a package."""
     modules = {}
-    for path in sorted(folder.rglob("*.py")):
-        parts = [folder.name, *path.relative_to(folder).with_suffix("").parts]
-        name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-        modules[name] = ast.parse(path.read_text(encoding="utf-8"))
+    gc.disable()  # or the collector walks through the growing trees again and again, for most of the time
+    try:
+        for path in sorted(folder.rglob("*.py")):
+            parts = [folder.name, *path.relative_to(folder).with_suffix("").parts]
+            name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+            modules[name] = ast.parse(path.read_text(encoding="utf-8"))
+    finally:
+        gc.enable()
     return Tree(modules)
 
 

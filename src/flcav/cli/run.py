@@ -1,9 +1,9 @@
 """`flcav run`, `flcav demo`, `flcav compare`: run a recipe through the three stages, and compare two runs."""
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -15,6 +15,7 @@ from flcav.machine.threads import use_threads
 
 if TYPE_CHECKING:
     from flcav.runs.results.run import Run, Summary
+    from flcav.runs.running import RunOptions
 
 
 RUNTIME = typer.Option(
@@ -45,8 +46,9 @@ def run(
         return _forecast(recipe)
     if out is None:
         raise InputError("--out is missing: the folder of the run; --dry says what it would take")
-    how = {"jobs": jobs, "stale": stale.value, "engine": engine.value, "runtime": runtime.value, "fleet": fleet}
-    return _run(recipe, None, out, seeds, "run", how)
+    options: RunOptions = {"jobs": jobs, "stale": stale.value, "engine": engine.value}
+    options |= {"runtime": runtime.value, "fleet": fleet}
+    return _run(recipe, None, out, seeds, "run", options)
 
 
 def _forecast(path: Path) -> Answer:
@@ -82,8 +84,7 @@ def demo(
         echo(line)
 
 
-def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: Mapping[str, Any]) -> Answer:
-    """Run a recipe; `how`: arguments of `flcav.run`."""
+def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, options: "RunOptions") -> Answer:
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.report.pages.run_page import write_report
@@ -99,13 +100,13 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, how: M
     asked = load_run_recipe(found)
     if seed is not None:
         asked = asked.model_copy(update={"seed": seed})
-    how = {**how, "beside": found.parent}
     with live_steps(title) as notify:
+        options = {**options, "beside": found.parent, "notify": notify}
         if seeds == 1:
-            results = {out: run_one(asked, out, notify=notify, **how)}
+            results = {out: run_one(asked, out, **options)}
             summary = None
         else:
-            runs, summary = run_seeds(asked, out, seeds=seeds, notify=notify, **how)
+            runs, summary = run_seeds(asked, out, seeds=seeds, **options)
             results = {out / f"seed{each.recipe.seed}": each for each in runs}
             write_bytes(out / "seeds.png", draw_seeds(runs))
     reports = [write_report(result, folder) for folder, result in results.items()]

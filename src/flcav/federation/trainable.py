@@ -5,7 +5,7 @@ A federation only sees weights and numbers, so that any `Trainable` can be feder
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, TypedDict, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +89,14 @@ class LocalUpdate:
     optimiser: Weights = field(default_factory=dict)  # state of the optimiser after the steps, where it was given
 
 
+class CorrectionArguments(TypedDict, total=False):
+    """Arguments of `Trainable.train` by which a client corrects its gradients, as `Correction` has them."""
+
+    proximal: float
+    shift: Weights
+    centre: Weights
+
+
 @dataclass(frozen=True)
 class Correction:
     """A correction of a client's gradients at every local step: g + proximal (w - centre) + shift.
@@ -100,11 +108,14 @@ class Correction:
     shift: Weights | None = None  # by name of parameter; missing ones are not shifted
     centre: Weights | None = None  # by name of parameter; None: the weights at the start of the round
 
-    def arguments(self) -> dict[str, Any]:
+    def arguments(self) -> CorrectionArguments:
         """Return the correction as arguments of `Trainable.train`: none where nothing is corrected."""
-        found: dict[str, Any] = {"proximal": self.proximal} if self.proximal else {}
-        arrays = {"shift": self.shift, "centre": self.centre}
-        return found | {name: each for name, each in arrays.items() if each is not None}
+        found: CorrectionArguments = {"proximal": self.proximal} if self.proximal else {}
+        if self.shift is not None:
+            found["shift"] = self.shift
+        if self.centre is not None:
+            found["centre"] = self.centre
+        return found
 
 
 class Trainable(Protocol):

@@ -24,16 +24,17 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import softmax
 
 from flcav.arrays import Array, Ints, Mask
 from flcav.config import InputError
 from flcav.geometry import rotations_about_z
-from flcav.machine.compiled import compiled
 from flcav.sensors.navigation import GRAVITY
 from flcav.sensors.navigation_log import NavigationLog
 from flcav.world.geodesy import convert_to_map
 from flcav.world.map.parameters import GeoReference
 
+Nominal = tuple[Array, Array, Array, Array]  # position, velocity, turn and bias as in `_States`, by heading (H, ...)
 STATES = 18  # position, velocity, attitude, biases of force, of rate, and of the receiver: 3 each
 ACROSS_MPS, UP_MPS = 0.2, 0.2  # standard deviations of a car's lateral and vertical velocity, vehicle's axes
 REST_MPS, REST_RADPS = 0.02, 0.001  # standard deviations of velocity and angular rate at rest
@@ -101,19 +102,18 @@ def estimate_drive(
     places = convert_to_map(geo, log.fix)
     epochs, fixes = _list_epochs(log, places, ground, at_s)
     position, velocity, covariance = _begin(log, places, levers[0])
-    rest = _find_rest(log, inertia, epochs)
-    tried = []
-    for turn in rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)):
-        begin = (position, velocity, turn, covariance)
-        tried.append(_filter(log.imu_time_s, inertia, (epochs, fixes, rest), levers, _sigmas(log), begin))
-    forwards = [_measure_way(log.imu_time_s[epochs], states) > -BACKWARDS_M for states, *_ in tried]
-    likelihood = np.nan_to_num(np.where(forwards, [result[-1] for result in tried], -np.inf), nan=-np.inf)
+    begin = (position, velocity, rotations_about_z(2 * np.pi / HEADINGS * np.arange(HEADINGS)), covariance)
+    measured = (epochs, fixes, _find_rest(log, inertia, epochs))
+    states, transition, misfit, fit = _filter(log.imu_time_s, inertia, measured, levers, _sigmas(log), begin)
+    tried = [tuple(values[i] for values in states) for i in range(HEADINGS)]
+    forwards = [_measure_way(log.imu_time_s[epochs], both) > -BACKWARDS_M for both in tried]
+    likelihood = np.nan_to_num(np.where(forwards, fit, -np.inf), nan=-np.inf)
     best = int(likelihood.argmax())
-    if not np.nanmean(tried[best][2]) < IMPOSSIBLE or not np.isfinite(tried[best][0][-1]).all():
+    if not np.nanmean(misfit[best]) < IMPOSSIBLE or not np.isfinite(tried[best][-1]).all():
         raise InputError("the fixes of the navigation log are not where its IMU leads: they are of no common drive")
-    weights = np.exp(likelihood - likelihood[best])
-    kept = [(weight, *result[:2]) for weight, result in zip(weights / weights.sum(), tried) if weight > LEAST_WEIGHT]
-    state = _mix([(weight, _smooth(states, transition)) for weight, states, transition in kept])
+    weights = softmax(likelihood)
+    kept = np.flatnonzero(weights > LEAST_WEIGHT)
+    state = _mix([(weights[i], _smooth(tried[i], transition[i])) for i in kept])
     rows = _nearest(log.imu_time_s, at_s)
     state = _States(*(values[np.searchsorted(epochs, rows)] for values in state))
     return _of_agent(state, inertia[rows, 3:], at_s - log.imu_time_s[rows], levers[1])
@@ -196,134 +196,145 @@ def _find_rest(log: NavigationLog, inertia: Array, epochs: Ints) -> Mask:
     return (inertia[around].std(axis=1) <= QUIET * np.maximum(sigma, LEAST_BIAS)).all(axis=1)
 
 
-@compiled
-def _skew(v):
-    """Return the matrix (3, 3) of the cross product with `v` (3,)."""
-    return np.array(((0.0, -v[2], v[1]), (v[2], 0.0, -v[0]), (-v[1], v[0], 0.0)))
+def _skew(v: Array) -> Array:
+    """Return the matrices (..., 3, 3) of the cross product with `v` (..., 3)."""
+    matrix = np.zeros((*v.shape, 3))
+    matrix[..., 2, 1], matrix[..., 0, 2], matrix[..., 1, 0] = np.moveaxis(v, -1, 0)
+    return matrix - np.swapaxes(matrix, -1, -2)
 
 
-@compiled
-def _exp(v):
-    """Return the rotation matrix (3, 3) of a rotation vector (3,): Rodrigues' formula."""
-    angle = np.sqrt((v * v).sum())
-    cross = _skew(v)
-    if angle < 1e-8:
-        return np.eye(3) + cross
-    return np.eye(3) + np.sin(angle) / angle * cross + (1 - np.cos(angle)) / angle**2 * (cross @ cross)
+def _exp(v: Array) -> Array:
+    """Return the rotation matrices (..., 3, 3) of rotation vectors (..., 3): Rodrigues' formula."""
+    angle, cross = np.sqrt((v * v).sum(axis=-1))[..., None, None], _skew(v)
+    turned = angle >= 1e-8
+    angle = np.where(turned, angle, 1.0)
+    sine, cosine = np.where(turned, np.sin(angle), 1.0), np.where(turned, np.cos(angle), 1.0)
+    return np.eye(3) + sine / angle * cross + (1 - cosine) / angle**2 * (cross @ cross)
 
 
-@compiled
-def _filter(times_s, inertia, measured, levers, sigmas, begin):
-    """Return the updated and the predicted states (2, E, ...), transitions between epochs, and measures of fit.
+@np.errstate(all="ignore")  # states of a wrong heading may diverge: they have no likelihood then
+def _filter(
+    times_s: Array, inertia: Array, measured: tuple[Ints, Array, Mask], levers: Array, sigmas: Array, begin: Nominal
+) -> tuple[tuple[Array, ...], Array, Array, Array]:
+    """Return the updated and the predicted states (H, 2, E, ...), transitions between epochs, and measures of fit.
 
     measured: epochs (E,), fixes (E, 5), see `_list_epochs`, and whether at rest (E,). levers: (2, 3) from the IMU to
-    antenna and vehicle's origin, vehicle's axes [m]. sigmas: see `_sigmas`. begin: position, velocity, turn,
-    covariance. Measures of fit: normalised squared innovations (E,) of fixes, and the log-likelihood of all
-    measurements but zero-velocity updates, since which epochs have these depends on the nominal state.
+    antenna and vehicle's origin, vehicle's axes [m]. sigmas: see `_sigmas`. begin: position, velocity, turns (H, 3, 3),
+    covariance; the filter runs from each turn. Measures of fit: normalised squared innovations (H, E) of fixes, and
+    log-likelihood (H,) of all but zero-velocity updates, since which epochs have these depends on the nominal state.
     """
     epochs, fixes, rest = measured
-    position, velocity, turn, p = begin
-    count, bias, likelihood = len(epochs), np.zeros(9), 0.0
-    positions = np.zeros((2, count, 3))
-    velocities = np.zeros((2, count, 3))
-    turns = np.zeros((2, count, 3, 3))
-    biases = np.zeros((2, count, 9))
-    covariances = np.zeros((2, count, STATES, STATES))
-    transition = np.zeros((count, STATES, STATES))
-    misfit = np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan)
+    tried, count = len(begin[2]), len(epochs)
+    position, velocity, p = (np.repeat(begin[i][None], tried, axis=0) for i in (0, 1, 3))
+    state, likelihood = (position, velocity, begin[2], np.zeros((tried, 9))), np.zeros(tried)
+    kept = tuple(np.zeros((tried, 2, count, *shape)) for shape in ((3,), (3,), (3, 3), (9,), (STATES, STATES)))
+    transition = np.zeros((tried, count, STATES, STATES))
+    misfit = np.tile(np.where(np.isfinite(fixes[:, 0]), 0.0, np.nan), (tried, 1))
     for e in range(count):
-        phi = np.eye(STATES)
-        for k in range(epochs[max(e - 1, 0)], epochs[e]):
-            sample, dt = (inertia[k] + inertia[k + 1]) / 2, times_s[k + 1] - times_s[k]
-            step, spread = _transit(turn, bias, sample, dt, sigmas)
-            acceleration = turn @ _exp((sample[3:] - bias[3:6]) * dt / 2) @ (sample[:3] - bias[:3]) + GRAVITY
-            position = position + velocity * dt + acceleration * dt**2 / 2
-            velocity = velocity + acceleration * dt
-            turn = turn @ _exp((sample[3:] - bias[3:6]) * dt)
-            bias[6:] *= step[15, 15]
-            p = step @ p @ step.T + np.diag(spread)
-            phi = step @ phi
-        transition[e], covariances[1, e] = phi, p
-        positions[1, e], velocities[1, e], turns[1, e], biases[1, e] = position, velocity, turn, bias
-
-        state = (position, velocity, turn, bias)
+        rows = slice(epochs[max(e - 1, 0)], epochs[e] + 1)
+        state, p, transition[:, e] = _predict(state, p, inertia[rows], np.diff(times_s[rows]), sigmas)
+        for values, value in zip(kept, (*state, p)):
+            values[:, 1, e] = value
         h, r, noise, common = _measure(state, inertia[epochs[e], 3:], fixes[e], rest[e], levers, sigmas)
-        shift = np.zeros(STATES)
-        for i in range(len(r)):  # sequential updates by scalars, since the measurements' noise is independent
-            seen = p @ h[i]
-            variance = (seen * h[i]).sum() + noise[i]
-            missed = r[i] - (h[i] * shift).sum()
-            shift += seen * (missed / variance)
-            p = p - np.outer(seen, seen / variance)
+        shift = np.zeros((tried, STATES))
+        for i in range(len(noise)):  # sequential updates by scalars, since the measurements' noise is independent
+            seen = (p @ h[:, i, :, None])[..., 0]
+            variance = (seen * h[:, i]).sum(axis=1) + noise[i]
+            missed = r[:, i] - (h[:, i] * shift).sum(axis=1)
+            shift += seen * (missed / variance)[:, None]
+            p -= seen[:, :, None] * (seen / variance[:, None])[:, None]
             if i < common:
                 likelihood -= (missed**2 / variance + np.log(variance)) / 2
             if i < 3 and np.isfinite(fixes[e, 0]):
-                misfit[e] += missed**2 / variance
-        p = (p + p.T) / 2  # symmetric despite rounding
-        position = position + shift[:3]
-        velocity = velocity + shift[3:6]
-        turn = turn @ _exp(shift[6:9])
-        bias = bias + shift[9:]
-        covariances[0, e] = p
-        positions[0, e], velocities[0, e], turns[0, e], biases[0, e] = position, velocity, turn, bias
-    return (positions, velocities, turns, biases, covariances), transition, misfit, likelihood
+                misfit[:, e] += missed**2 / variance
+        p = (p + np.swapaxes(p, 1, 2)) / 2  # symmetric despite rounding
+        position, velocity, turn, bias = state
+        state = (position + shift[:, :3], velocity + shift[:, 3:6], turn @ _exp(shift[:, 6:9]), bias + shift[:, 9:])
+        for values, value in zip(kept, (*state, p)):
+            values[:, 0, e] = value
+    return kept, transition, misfit, likelihood
 
 
-@compiled
-def _transit(turn, bias, sample, dt, sigmas):
-    """Return the transition of the error state over one sample interval, and the added process noise (STATES,)."""
-    force, rate = sample[:3] - bias[:3], sample[3:] - bias[3:6]
-    middle = turn @ _exp(rate * dt / 2)
-    step, spread = np.eye(STATES), np.zeros(STATES)
-    step[:3, 3:6] = np.eye(3) * dt
-    step[3:6, 6:9] = -(middle @ _skew(force)) * dt
-    step[3:6, 9:12] = -middle * dt
-    step[6:9, 6:9] = _exp(-rate * dt)
-    step[6:9, 12:15] = -np.eye(3) * dt
-    step[15:, 15:] = np.eye(3) * np.exp(-dt / sigmas[8])
-    spread[3:6], spread[6:9] = (sigmas[0] * dt) ** 2, (sigmas[1] * dt) ** 2
-    spread[9:12], spread[12:15] = sigmas[2] ** 2 * dt, sigmas[3] ** 2 * dt
-    spread[15:17], spread[17] = sigmas[6] ** 2, sigmas[7] ** 2
-    spread[15:] *= 1 - np.exp(-2 * dt / sigmas[8])
+def _predict(state: Nominal, p: Array, inertia: Array, dt: Array, sigmas: Array) -> tuple[Nominal, Array, Array]:
+    """Return the nominal states after K sample intervals `dt` [s], their errors' covariances, and the transitions.
+
+    inertia: (K + 1, 6) samples at the ends of the intervals.
+    """
+    position, velocity, turn, bias = state
+    sample, dt = (inertia[:-1] + inertia[1:]) / 2, dt[:, None]
+    force, rate = sample[:, :3] - bias[:, None, :3], sample[:, 3:] - bias[:, None, 3:6]
+    turns = [turn]
+    for change in np.moveaxis(_exp(rate * dt), 1, 0):
+        turns.append(turns[-1] @ change)
+    middle = np.stack(turns, axis=1)[:, :-1] @ _exp(rate * dt / 2)
+    acceleration = (middle @ force[..., None])[..., 0] + GRAVITY
+    velocities = np.cumsum(np.concatenate((velocity[:, None], acceleration * dt), axis=1), axis=1)
+    position = position + (velocities[:, :-1] * dt + acceleration * dt**2 / 2).sum(axis=1)
+    steps, spread = _transit(middle, force, rate, dt, sigmas)
+    phi = np.eye(STATES)
+    for k in range(len(dt)):
+        step = steps[:, k]
+        p = step @ p @ np.swapaxes(step, 1, 2) + np.diag(spread[k])
+        phi = step @ phi
+    bias = np.concatenate((bias[:, :6], bias[:, 6:] * np.exp(-dt / sigmas[8]).prod()), axis=1)
+    return (position, velocities[:, -1], turns[-1], bias), p, phi
+
+
+def _transit(middle: Array, force: Array, rate: Array, dt: Array, sigmas: Array) -> tuple[Array, Array]:
+    """Return transitions (H, K, STATES, STATES) of the error state over sample intervals, and their noise (K, STATES).
+
+    middle: attitudes (H, K, 3, 3) in the middle of the intervals `dt` (K, 1) [s]. force, rate: (H, K, 3), without bias.
+    """
+    step, wide = np.tile(np.eye(STATES), (*rate.shape[:2], 1, 1)), dt[:, None]
+    spread = np.zeros((len(dt), STATES))
+    step[..., :3, 3:6], step[..., 6:9, 12:15] = np.eye(3) * wide, -np.eye(3) * wide
+    step[..., 3:6, 6:9], step[..., 3:6, 9:12] = -(middle @ _skew(force)) * wide, -middle * wide
+    step[..., 6:9, 6:9], step[..., 15:, 15:] = _exp(-rate * dt), np.eye(3) * np.exp(-wide / sigmas[8])
+    spread[:, 3:6], spread[:, 6:9] = (sigmas[0] * dt) ** 2, (sigmas[1] * dt) ** 2
+    spread[:, 9:12], spread[:, 12:15] = sigmas[2] ** 2 * dt, sigmas[3] ** 2 * dt
+    spread[:, 15:] = sigmas[[6, 6, 7]] ** 2 * (1 - np.exp(-2 * dt / sigmas[8]))
     return step, spread
 
 
-@compiled
-def _measure(state, sample, fix, rests, levers, sigmas):
-    """Return Jacobians (M, STATES), innovations (M,) and variances (M,) of an epoch's measurements, and a count.
+def _measure(
+    state: Nominal, sample: Array, fix: Array, rests: bool, levers: Array, sigmas: Array
+) -> tuple[Array, Array, Array, int]:
+    """Return Jacobians (H, M, STATES), innovations (H, M) and variances (M,) of an epoch's measurements, and a count.
 
     In order: the fix and the height of the ground, where there are any; lateral and vertical velocity; velocity and
     angular rate, at rest. The count is that of the measurements before the last group. sample: (3,) angular rate
     [rad/s].
     """
     position, velocity, turn, bias = state
-    h, r, noise, rows = np.zeros((12, STATES)), np.zeros(12), np.zeros(12), 0
-    rate = sample - bias[3:6]
-    back = turn.T @ velocity
+    h, r, noise, rows = np.zeros((len(turn), 12, STATES)), np.zeros((len(turn), 12)), np.zeros(12), 0
+    rate = sample - bias[:, 3:6]
+    back = (velocity[:, None] @ turn)[:, 0]
     if np.isfinite(fix[0]):
-        h[:3, :3], h[:3, 3:6], h[:3, 15:] = np.eye(3), np.eye(3) * fix[3], np.eye(3)
-        h[:3, 6:9] = -turn @ _skew(levers[0])
-        r[:3] = fix[:3] - (position + velocity * fix[3] + turn @ levers[0] + bias[6:])
+        h[:, :3, :3], h[:, :3, 3:6], h[:, :3, 15:] = np.eye(3), np.eye(3) * fix[3], np.eye(3)
+        h[:, :3, 6:9] = -turn @ _skew(levers[0])
+        r[:, :3] = fix[:3] - (position + velocity * fix[3] + turn @ levers[0] + bias[:, 6:])
         noise[:2], noise[2], rows = sigmas[4] ** 2, sigmas[5] ** 2, 3
     if np.isfinite(fix[4]):
-        h[rows, 2] = 1
-        h[rows, 6:9] = -(turn @ _skew(levers[1]))[2]
-        r[rows], noise[rows] = fix[4] - position[2] - (turn @ levers[1])[2], HEIGHT_M**2
+        h[:, rows, 2] = 1
+        h[:, rows, 6:9] = -(turn @ _skew(levers[1]))[:, 2]
+        r[:, rows], noise[rows] = fix[4] - position[:, 2] - (turn @ levers[1])[:, 2], HEIGHT_M**2
         rows += 1
     along = back + _skew(rate) @ levers[1]  # velocity of the vehicle's origin, vehicle's axes
     for axis in range(1, 3):
-        h[rows, 3:6] = turn[:, axis]
-        h[rows, 6:9] = _skew(back)[axis]
-        h[rows, 12:15] = _skew(levers[1])[axis]
-        r[rows], noise[rows] = -along[axis], (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
+        h[:, rows, 3:6] = turn[:, :, axis]
+        h[:, rows, 6:9] = _skew(back)[:, axis]
+        h[:, rows, 12:15] = _skew(levers[1])[axis]
+        r[:, rows], noise[rows] = -along[:, axis], (ACROSS_MPS if axis == 1 else UP_MPS) ** 2
         rows += 1
     common = rows
-    if rests and np.sqrt((velocity * velocity).sum()) < SLOW_MPS:
-        h[rows : rows + 3, 3:6], h[rows + 3 : rows + 6, 12:15] = np.eye(3), np.eye(3)
-        r[rows : rows + 3], r[rows + 3 : rows + 6] = -velocity, rate
+    if rests:  # a row of zeros changes nothing: for headings with which the vehicle is too fast to be at rest
+        slow = (np.sqrt((velocity * velocity).sum(axis=1)) < SLOW_MPS)[:, None]
+        still = slow[..., None] * np.eye(3)
+        h[:, rows : rows + 3, 3:6], h[:, rows + 3 : rows + 6, 12:15] = still, still
+        r[:, rows : rows + 3], r[:, rows + 3 : rows + 6] = np.where(slow, -velocity, 0), np.where(slow, rate, 0)
         noise[rows : rows + 3], noise[rows + 3 : rows + 6] = REST_MPS**2, REST_RADPS**2 + sigmas[1] ** 2
         rows += 6
-    return h[:rows].copy(), r[:rows].copy(), noise[:rows].copy(), common
+    return h[:, :rows], r[:, :rows], noise[:rows], common
 
 
 def _smooth(both: tuple[Array, ...], transition: Array) -> _States:

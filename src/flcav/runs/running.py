@@ -1,8 +1,9 @@
 """Running a recipe, with one seed or several, and collecting the results of its steps."""
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import TypedDict, Unpack
 
 from flcav.config import InputError
 from flcav.interface.notebook import resumable
@@ -10,7 +11,7 @@ from flcav.runs.analysis.collect import collect_results
 from flcav.runs.analysis.histories import make_history_points
 from flcav.runs.analysis.summary import summarise
 from flcav.runs.arms import check_federations
-from flcav.runs.engine import Notify, Stale, print_steps, run_side_by_side, run_steps, stopwatch
+from flcav.runs.engine import Notify, Stale, Step, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.runs.recipe import RunRecipe, load_run_recipe
 from flcav.runs.results.run import Run, Summary
 from flcav.runs.results.table import save_table
@@ -25,19 +26,43 @@ WORK, HISTORY, SPREAD = "work", "history.csv", "spread.csv"
 RESULTS = Run.file
 
 
+class RunOptions(TypedDict, total=False):
+    """Keyword arguments of `run`, which describes them; their defaults are those of `_Terms`."""
+
+    beside: Path | str | None
+    jobs: int
+    notify: Notify
+    stale: Stale
+    engine: str
+    runtime: str
+    fleet: Path | None
+
+
+@dataclass(frozen=True)
+class _Terms:
+    """How and where a run's steps are performed."""
+
+    beside: Path | str | None = None
+    jobs: int = 1
+    notify: Notify = print_steps
+    stale: Stale = "refuse"
+    engine: str = "processes"
+    runtime: str = "embedded"
+    fleet: Path | None = None
+
+    def read(self, recipe: RunRecipe) -> Graph:
+        """Return the graph of a recipe's steps, whose federations are checked."""
+        graph = Graph(recipe, Path(self.beside or "."))
+        check_federations(recipe, graph.settings.values())
+        return graph
+
+    def deploy(self, graph: Graph) -> tuple[Step, ...]:
+        """Return the steps of a graph, on vehicles of the fleet if the runtime has one."""
+        return deploy(graph, self.runtime, self.fleet, self.engine)
+
+
 @resumable
-def run(
-    recipe: RunRecipe | Path | str,
-    out: Path | str,
-    *,
-    beside: Path | str | None = None,
-    jobs: int = 1,
-    notify: Notify = print_steps,
-    stale: Stale = "refuse",
-    engine: str = "processes",
-    runtime: str = "embedded",
-    fleet: Path | None = None,
-) -> Run:
+def run(recipe: RunRecipe | Path | str, out: Path | str, **options: Unpack[RunOptions]) -> Run:
     """Run or finish a recipe, or that in a YAML file, in the folder `out`; write its results there, and return them.
 
     The files are results.json, results.csv, history.csv, ledgers, rounds.parquet, and TensorBoard's event files.
@@ -45,13 +70,18 @@ def run(
     Args:
         recipe: of the run, or the path of its YAML file.
         out: folder of the run.
-        beside: folder that towns, datasets and histories are looked for in; None: the working directory.
-        jobs: number of workers, of one thread each.
-        notify: called with a step's name, its progress and a note.
-        stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
-        engine: processes of this machine, or ray: actors of a cluster.
-        runtime: where vehicles train: embedded, or flower: vehicles of a deployed fleet; the results are the same.
-        fleet: folder of the fleet that is up; None: one is brought up on this machine for each federation.
+        options: by name, each with a default, see below.
+
+    Options:
+        beside: folder that towns, datasets and histories are looked for in; None, the default: the working directory.
+        jobs: number of workers, of one thread each; 1 by default.
+        notify: called with a step's name, its progress and a note; by default a line of each is printed.
+        stale: what becomes of finished steps of other code or arguments: refuse (the default), redo or keep (see
+            `run_steps`).
+        engine: processes of this machine (the default), or ray: actors of a cluster.
+        runtime: where vehicles train: embedded (the default), or flower: vehicles of a deployed fleet; the results are
+            the same.
+        fleet: folder of the fleet that is up; None, the default: one is brought up on this machine for each federation.
 
     Raises `InputError` where a part of the recipe cannot be used, and where `out` holds another run or, if `stale`
     refuses that, one of other code.
@@ -75,32 +105,22 @@ def run(
     out, recipe = Path(out), recipe if isinstance(recipe, RunRecipe) else load_run_recipe(recipe)
     if (out / RESULTS).exists():
         Run.load(out)  # raises for results of another version
-    graph, clock = Graph(recipe, Path(beside or ".")), stopwatch(out / WORK)
-    check_federations(recipe, graph.settings.values())
-    tell_rigs([graph], notify)
+    terms, clock = _Terms(**options), stopwatch(out / WORK)
+    graph = terms.read(recipe)
+    tell_rigs([graph], terms.notify)
 
     def timed(step: str, done: int, total: int, note: str) -> None:
         if note == "done":
             clock()
-        notify(step, done, total, note)
+        terms.notify(step, done, total, note)
 
-    steps = deploy(graph, runtime, fleet, engine)
-    run_steps(steps, out / WORK, jobs=jobs, notify=timed, stale=stale, engine=engine)
+    steps = terms.deploy(graph)
+    run_steps(steps, out / WORK, jobs=terms.jobs, notify=timed, stale=terms.stale, engine=terms.engine)
     return _save_results(graph, out, out / HISTORY, clock(), f"seed{recipe.seed}")
 
 
 def run_seeds(
-    recipe: RunRecipe,
-    out: Path | str,
-    *,
-    seeds: int,
-    beside: Path | str | None = None,
-    jobs: int = 1,
-    notify: Notify = print_steps,
-    stale: Stale = "refuse",
-    engine: str = "processes",
-    runtime: str = "embedded",
-    fleet: Path | None = None,
+    recipe: RunRecipe, out: Path | str, *, seeds: int, **options: Unpack[RunOptions]
 ) -> tuple[tuple[Run, ...], Summary]:
     """Run or finish a recipe with `seeds` consecutive seeds, from the recipe's; return all runs and their summary.
 
@@ -110,48 +130,28 @@ def run_seeds(
         recipe: of the runs, but for their seeds.
         out: folder of all runs.
         seeds: number of runs.
-        beside: folder that towns, datasets and histories are looked for in; None: the working directory.
-        jobs: number of workers, of one thread each.
-        notify: called with a step's name, its progress and a note.
-        stale: what becomes of finished steps of other code or arguments: refuse, redo or keep (see `run_steps`).
-        engine: processes of this machine, or ray: actors of a cluster.
-        runtime: where vehicles train: embedded, or flower: vehicles of a deployed fleet; the results are the same.
-        fleet: folder of the fleet that is up; None: one is brought up on this machine for each federation.
+        options: those of `run`.
     """
     recipes = {
         f"seed{seed}": recipe.model_copy(update={"seed": seed}) for seed in range(recipe.seed, recipe.seed + seeds)
     }
-    where = {"engine": engine, "runtime": runtime, "fleet": fleet}
-    runs = run_several(recipes, out, beside=beside, jobs=jobs, notify=notify, stale=stale, **where)
+    runs = run_several(recipes, out, **options)
     summary = summarise(runs, [Path(out) / name / WORK for name in recipes])
     summary.save(out)
     return runs, summary
 
 
-def run_several(
-    recipes: Mapping[str, RunRecipe],
-    out: Path | str,
-    *,
-    beside: Path | str | None = None,
-    jobs: int = 1,
-    notify: Notify = print_steps,
-    stale: Stale = "refuse",
-    engine: str = "processes",
-    runtime: str = "embedded",
-    fleet: Path | None = None,
-) -> tuple[Run, ...]:
+def run_several(recipes: Mapping[str, RunRecipe], out: Path | str, **options: Unpack[RunOptions]) -> tuple[Run, ...]:
     """Run or finish several recipes in parallel, in the folders of their names in `out`; return their results.
 
-    They have a common history.csv in `out`. Other arguments are those of `run`.
+    They have a common history.csv in `out`; `options` are those of `run`.
     """
-    out = Path(out)
-    graphs = {out / name: Graph(recipe, Path(beside or ".")) for name, recipe in recipes.items()}
-    for graph in graphs.values():
-        check_federations(graph.recipe, graph.settings.values())
-    tell_rigs(graphs.values(), notify)
-    steps = {folder / WORK: deploy(graph, runtime, fleet, engine) for folder, graph in graphs.items()}
+    terms, out = _Terms(**options), Path(out)
+    graphs = {out / name: terms.read(recipe) for name, recipe in recipes.items()}
+    tell_rigs(graphs.values(), terms.notify)
+    steps = {folder / WORK: terms.deploy(graph) for folder, graph in graphs.items()}
     names = {folder / WORK: folder.name for folder in graphs}
-    run_side_by_side(steps, jobs=jobs, notify=notify, stale=stale, engine=engine, names=names)
+    run_side_by_side(steps, jobs=terms.jobs, notify=terms.notify, stale=terms.stale, engine=terms.engine, names=names)
     return tuple(_save_results(graph, folder, out / HISTORY, 0.0, folder.name) for folder, graph in graphs.items())
 
 

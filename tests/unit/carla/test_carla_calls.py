@@ -10,25 +10,12 @@ from flcav.carla.server import wire
 from flcav.carla.server.blueprints import NOT_SERVED, SENSORS, CallRefused, check_description, list_blueprints
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.episode import Measurement
-from flcav.carla.server.maps import Maps
 from flcav.carla.server.sensors import KINDS, SensorClock
 from flcav.carla.server.weather import to_weather
 from flcav.config import InputError
 from flcav.world.shapes import SHAPES
 
 CAMERA = (("image_size_x", "64"), ("image_size_y", "48"))
-
-
-@pytest.fixture(scope="module")
-def maps():
-    return Maps()
-
-
-@pytest.fixture
-def calls(maps):
-    made = Calls(maps, "suburb", seed=3, traffic=0, port=2000)
-    yield made
-    made.episode.close()
 
 
 def test_all_blueprints_of_sensors_are_served_or_refused_by_name(calls):

@@ -14,18 +14,12 @@ from flcav.carla.server import connections, serve, wire
 from flcav.carla.server.blueprints import list_blueprints
 from flcav.carla.server.calls import Calls
 from flcav.carla.server.episode import Episode
-from flcav.carla.server.maps import Maps
 from flcav.carla.server.sensors import KINDS, Kind
 from flcav.carla.server.serve import CarlaServer
 from flcav.carla.server.wire import Stream
 
 SYNCHRONOUS = wire.EpisodeSettings(synchronous=True, fixed_dt_s=0.05).packed()
 UNFINISHED = b"\x94\x00\x01\xa7version\xdd\x00\x03\x00\x00"  # the beginning of a call with 196,608 arguments
-
-
-@pytest.fixture(scope="module")
-def maps():
-    return Maps()
 
 
 class Client:

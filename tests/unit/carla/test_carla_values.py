@@ -28,18 +28,6 @@ from flcav.world.opendrive.importing import ImportedTown
 DT_S = 0.05
 
 
-@pytest.fixture(scope="module")
-def maps():
-    return Maps()
-
-
-@pytest.fixture
-def calls(maps):
-    made = Calls(maps, "suburb", seed=3, traffic=0, port=2000)
-    yield made
-    made.episode.close()
-
-
 def spawn(calls, name, where, *attributes):
     return calls.episode.find(invoke(calls, "spawn_actor", (describe(name, *attributes), where)).id)
 

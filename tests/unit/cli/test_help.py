@@ -35,14 +35,19 @@ EVERY = dict(commands(typer.main.get_command(app)))
 each_command = pytest.mark.parametrize("path", EVERY, ids=lambda path: " ".join(path) or "flcav")
 
 
+SHOWN: dict[tuple[tuple[str, ...], int], str] = {}  # help by words of a command and columns of the terminal
+
+
 @pytest.fixture
 def shown(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     def show(path: tuple[str, ...], width: int) -> str:
-        monkeypatch.setenv("COLUMNS", str(width))
-        with pytest.raises(SystemExit) as ended:
-            run([*path, "--help"])
-        assert ended.value.code == 0
-        return capsys.readouterr().out
+        if (path, width) not in SHOWN:
+            monkeypatch.setenv("COLUMNS", str(width))
+            with pytest.raises(SystemExit) as ended:
+                run([*path, "--help"])
+            assert ended.value.code == 0
+            SHOWN[path, width] = capsys.readouterr().out
+        return SHOWN[path, width]
 
     return show
 

@@ -19,7 +19,7 @@ from flcav.runs.extras.distillation import labelling as road_average
 from flcav.runs.extras.distillation.labelling import RoadAverageLabels
 from flcav.runs.frames import Frames, list_window
 from flcav.runs.labels import pseudo_labels, sightings
-from flcav.runs.labels.pseudo_labels import pseudo_label_samples
+from flcav.runs.labels.pseudo_labels import label_detected, label_frames
 from flcav.runs.recipe import EDGE
 from flcav.runs.stages.regions import Labelling
 from flcav.runs.stages.settings import RegionInputs
@@ -207,8 +207,8 @@ def test_road_boxes_reach_a_vehicle_s_frame_by_the_pose_that_it_tells_of(monkeyp
     network = second_tiny()
 
     def labels(errors: NavigationErrors) -> np.ndarray:
-        about = (network, 0.6, split, split.vehicles, (3,), "grid", ignore_progress)
-        found = pseudo_label_samples(*about, poses=errors)
+        about = (split, split.vehicles, (3,), "grid", ignore_progress)
+        found = label_frames(label_detected(network, 0.6, split), *about, poses=errors)
         return np.concatenate([sample.boxes.center[:, :2] for name in sorted(found) for sample in found[name]])
 
     np.testing.assert_allclose(labels(NavigationErrors()), np.tile(HIDDEN, (4, 1)), atol=1e-6)

@@ -8,8 +8,8 @@ import torch
 from line_task import Line, LineTask, Slope
 
 from flcav.config import InputError
-from flcav.federation.checks import check_federation
-from flcav.federation.rules import Rules
+from flcav.federation.loop import Schedule, federate
+from flcav.federation.state import FederationState
 from flcav.federation.strategies.corrections import Scaffold
 from flcav.perception.client import TaskClient
 from flcav.perception.weights import to_arrays
@@ -81,5 +81,12 @@ def test_named_layers_alone_are_trained(start):
         train(LineTask(), start, layers=("head",))
 
 
-def test_tasks_of_the_package_can_be_corrected():
-    check_federation({"cav0": TaskClient(cast(Any, LineTask()), Slope(), SAMPLES)}, Scaffold(), Rules())
+def test_tasks_of_the_package_can_be_corrected(start):
+    clients = {f"cav{i}": TaskClient(cast(Any, LineTask()), Slope(), SAMPLES[i:]) for i in range(2)}
+    schedule, state = Schedule(1, STEPS, learning_rate=0.1, final_learning_rate=0.1, seed=0), FederationState()
+    federate(clients, start, schedule, strategy=Scaffold(), state=state)
+    for name in start:
+        variates = [arrays[name] for kinds in state.clients.values() for arrays in kinds.values()]
+        assert len(variates) == len(clients)
+        assert not np.allclose(variates, 0)
+        np.testing.assert_allclose(state.server[name], np.mean(variates, axis=0), rtol=1e-6)

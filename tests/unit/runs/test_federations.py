@@ -32,7 +32,7 @@ from flcav.runs.driving import DrivenStage
 from flcav.runs.recipe import Federation, Training
 from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.results.training import StatisticsScore
-from flcav.runs.stages.rounds import RegionStart, federate_stage
+from flcav.runs.stages.rounds import RegionStart, StageFederation, federate_stage
 from flcav.runs.training.checkpoints import round_path
 from flcav.runs.training.learning import (
     Learning,
@@ -195,17 +195,22 @@ def test_measured_speeds_are_those_of_a_recipe() -> None:
     )
 
 
-def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
+def two_regions(folder: Path) -> StageFederation:
+    """Return a federation of two regions with two vehicles each, whose samples are near 1 and near 4."""
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1), 3)
     network = learning.build_network()
     starts = {}
     for region, x in (("a", 1.0), ("b", 4.0)):
         clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
         starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
-    federation = cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *where)
+    where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), folder, ignore_progress)
+    return cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *where)
+
+
+def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
+    federation = two_regions(tmp_path)
     federate_cloud(federation, 2, Rules(personal=("bias",)))
-    found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
+    found = {name: to_arrays(load_stage_network(federation.learning.task, tmp_path, name)) for name in (None, "a", "b")}
     assert np.array_equal(found["a"]["weight"], found["b"]["weight"])
     assert np.array_equal(found["a"]["weight"], found[None]["weight"])
     assert found["a"]["bias"] != found["b"]["bias"]
@@ -215,16 +220,10 @@ def test_a_region_s_own_model_is_beside_that_of_all(tmp_path: Path) -> None:
 
 
 def test_regional_models_are_beside_that_of_all(tmp_path: Path) -> None:
-    learning = Learning(cast(Task, LineTask()), None, Training(local_steps=2, average_rounds=1), 3)
-    network = learning.build_network()
-    starts = {}
-    for region, x in (("a", 1.0), ("b", 4.0)):
-        clients = make_clients(learning, Slope(), {f"{region}/cav{i}": [np.float32(x + i)] for i in range(2)})
-        starts[region] = RegionStart(clients, to_arrays(network), earlier=0)
-    where = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path, ignore_progress)
+    federation = two_regions(tmp_path)
     rules = Rules.model_validate({"personal": {"pull": 0.5}})
-    federate_cloud(cloud_federation(learning, network, starts, dict.fromkeys(starts, 1), *where), 2, rules)
-    found = {name: to_arrays(load_stage_network(learning.task, tmp_path, name)) for name in (None, "a", "b")}
+    federate_cloud(federation, 2, rules)
+    found = {name: to_arrays(load_stage_network(federation.learning.task, tmp_path, name)) for name in (None, "a", "b")}
     for name in ("weight", "bias"):
         assert found["a"][name] != found["b"][name]
         assert found[None][name] == pytest.approx((found["a"][name] + found["b"][name]) / 2)

@@ -36,6 +36,9 @@ def test_gymnasiums_checker_passes(lidar: Lidar | None):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(made.unwrapped)
+    seen, _ = made.reset(seed=0)
+    assert made.observation_space.contains(seen)
+    assert ("lidar" in seen) == (lidar is not None)
     made.close()
 
 

@@ -27,7 +27,8 @@ from flcav.carla.server import wire
 from flcav.carla.server.blueprints import CallRefused
 from flcav.carla.server.calls import Calls, invoke
 from flcav.carla.server.connections import Connections, Unpacker, send_payload, write
-from flcav.carla.server.episode import Episode, Measurement
+from flcav.carla.server.episode import Episode
+from flcav.carla.server.streams import Measurement
 from flcav.config import InputError
 
 # A client's Traffic Manager misses its wake-up, and deadlocks, if the next tick comes before its thread sleeps

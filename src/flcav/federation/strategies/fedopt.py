@@ -21,39 +21,8 @@ Rate = Annotated[float, Field(gt=0, le=1e3)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
-def step_adaptively(
-    start: Weights,
-    updates: Sequence[Update],
-    state: Weights,
-    second: Callable[[Floats, Floats], Floats],
-    rate: float,
-    beta1: float,
-    tau: float,
-) -> tuple[Weights, Weights]:
-    """Return the weights after a round of an adaptive server optimiser, and its moments (algorithm 2, lines 10-15).
-
-    m <- beta1 m + (1 - beta1) change; v <- second(v, change^2); start <- start + rate m / (sqrt(v) + tau). Initially m
-    is 0 and v is tau^2; there is no bias correction, as in the paper.
-    """
-    moments: dict[str, Floats] = {}
-
-    def moved(name: str, before: Floats, change: Floats) -> Floats:
-        m = beta1 * np.asarray(state.get(FIRST + name, 0.0 * before), np.float64) + (1 - beta1) * change
-        v = second(np.asarray(state.get(SECOND + name, np.full_like(before, tau**2)), np.float64), change**2)
-        moments[FIRST + name], moments[SECOND + name] = m, v
-        return np.asarray(before + rate * m / (np.sqrt(v) + tau))
-
-    return move_mean(start, updates, moved), moments
-
-
-@dataclass(frozen=True)
-class FedAdam:
-    """FedAdam: v <- beta2 v + (1 - beta2) change^2."""
-
-    rate: Rate = 0.01  # of the server: about the size of a round's change of a weight
-    beta1: Decay = 0.9
-    beta2: Decay = 0.99
-    tau: Rate = 1e-3  # degree of adaptivity: smaller is more adaptive
+class _ServerOptimiser:
+    """An optimiser of the server, which takes the mean of the clients' changes for a gradient."""
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
         """Return the weights after a first round."""
@@ -66,14 +35,48 @@ class FedAdam:
     def step(
         self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
     ) -> tuple[Weights, Weights]:
-        """Return the weights after a round, and both moments by name of array."""
+        """Return the weights after a round, and the optimiser's state by name of array."""
         return self._step(start, updates, state)
 
     def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]:
-        def second(v: Floats, squared: Floats) -> Floats:
-            return self.beta2 * v + (1 - self.beta2) * squared
+        raise NotImplementedError
 
-        return step_adaptively(start, updates, state, second, self.rate, self.beta1, self.tau)
+
+@dataclass(frozen=True)
+class _Adaptive(_ServerOptimiser):
+    """An adaptive one (algorithm 2, lines 10-15), with a rule for the second moment v.
+
+    m <- beta1 m + (1 - beta1) change; v <- second(v, change^2); start <- start + rate m / (sqrt(v) + tau). Initially m
+    is 0 and v is tau^2; there is no bias correction, as in the paper.
+    """
+
+    rate: Rate = 0.01  # of the server: about the size of a round's change of a weight
+    beta1: Decay = 0.9
+    beta2: Decay = 0.99
+    tau: Rate = 1e-3  # degree of adaptivity: smaller is more adaptive
+
+    def _second(self, v: Floats, squared: Floats) -> Floats:
+        raise NotImplementedError
+
+    def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]:
+        moments: dict[str, Floats] = {}
+
+        def moved(name: str, before: Floats, change: Floats) -> Floats:
+            m = self.beta1 * np.asarray(state.get(FIRST + name, 0.0 * before), np.float64) + (1 - self.beta1) * change
+            v = np.asarray(state.get(SECOND + name, np.full_like(before, self.tau**2)), np.float64)
+            v = self._second(v, change**2)
+            moments[FIRST + name], moments[SECOND + name] = m, v
+            return np.asarray(before + self.rate * m / (np.sqrt(v) + self.tau))
+
+        return move_mean(start, updates, moved), moments
+
+
+@dataclass(frozen=True)
+class FedAdam(_Adaptive):
+    """FedAdam: v <- beta2 v + (1 - beta2) change^2."""
+
+    def _second(self, v: Floats, squared: Floats) -> Floats:
+        return self.beta2 * v + (1 - self.beta2) * squared
 
 
 def move_mean(
@@ -91,25 +94,11 @@ def move_mean(
 
 
 @dataclass(frozen=True)
-class FedAvgM:
+class FedAvgM(_ServerOptimiser):
     """Federated averaging with server momentum: v <- momentum v + (mean - start), start <- start + rate v."""
 
     rate: Annotated[float, Field(gt=0, le=1e3)] = 1.0  # of the server
     momentum: Annotated[float, Field(ge=0, lt=1)] = 0.9
-
-    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
-        """Return the weights after a first round."""
-        return self._step(start, updates, {})[0]
-
-    def weigh(self, update: Update) -> float:
-        """Return the update's number of samples."""
-        return float(update.samples)
-
-    def step(
-        self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
-    ) -> tuple[Weights, Weights]:
-        """Return the weights after a round, and the velocity by name of array."""
-        return self._step(start, updates, state)
 
     def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]:
         velocity: dict[str, Floats] = {}
@@ -122,30 +111,8 @@ class FedAvgM:
 
 
 @dataclass(frozen=True)
-class FedYogi:
+class FedYogi(_Adaptive):
     """FedYogi: v <- v - (1 - beta2) change^2 sign(v - change^2), so that v falls slowly."""
 
-    rate: Rate = 0.01  # of the server: about the size of a round's change of a weight
-    beta1: Decay = 0.9
-    beta2: Decay = 0.99
-    tau: Rate = 1e-3  # degree of adaptivity: smaller is more adaptive
-
-    def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
-        """Return the weights after a first round."""
-        return self._step(start, updates, {})[0]
-
-    def weigh(self, update: Update) -> float:
-        """Return the update's number of samples."""
-        return float(update.samples)
-
-    def step(
-        self, start: Weights, updates: Sequence[LocalUpdate], state: Weights, clients: int
-    ) -> tuple[Weights, Weights]:
-        """Return the weights after a round, and both moments by name of array."""
-        return self._step(start, updates, state)
-
-    def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]:
-        def second(v: Floats, squared: Floats) -> Floats:
-            return v - (1 - self.beta2) * squared * np.sign(v - squared)
-
-        return step_adaptively(start, updates, state, second, self.rate, self.beta1, self.tau)
+    def _second(self, v: Floats, squared: Floats) -> Floats:
+        return v - (1 - self.beta2) * squared * np.sign(v - squared)

@@ -1,7 +1,7 @@
 """Map of a town: streets with their markings, buildings, trees, signs, lights, and numbered poles."""
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Required, TypedDict
 
 import numpy as np
 import shapely
@@ -76,12 +76,21 @@ def draw_map(axes: Axes, town: Town) -> None:
     style.scale_bar(axes, 50)
 
 
-def symbols(town: Town) -> list[tuple[str, dict[str, Any], Array]]:
+class Marker(TypedDict, total=False):
+    """The marker of a kind of sign or light, as arguments of `Axes.plot`."""
+
+    marker: Required[str]
+    markersize: Required[float]  # [pt]
+    color: Required[str]
+    markeredgecolor: str
+
+
+def symbols(town: Town) -> list[tuple[str, Marker, Array]]:
     """Return label, marker and positions (N, 2) of each kind of sign and light in a town."""
     kinds = np.array(town.signs.kind)
     at = town.signs.position[:, :2]
     speed = np.char.startswith(kinds, "speed") if len(kinds) else np.zeros(0, np.bool_)
-    rows = [
+    rows: list[tuple[str, Marker, Array]] = [
         ("traffic light", {"marker": "s", "markersize": 4.5, "color": style.GREEN}, town.signals.position[:, :2]),
         ("stop sign", {"marker": "8", "markersize": 6, "color": style.VERMILLION}, at[kinds == "stop"]),
         ("give way sign", {"marker": "v", "markersize": 6, "color": style.ORANGE}, at[kinds == "yield"]),

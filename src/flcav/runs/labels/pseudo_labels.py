@@ -63,32 +63,15 @@ def annotated_samples(
     return {name: task.samples(split.data, config, numbers) for name, numbers in numbers_by_vehicle.items()}
 
 
-def pseudo_label_samples(
-    network: Second,
-    threshold: float,
-    split: Frames,
-    frames: Sequence[int],
-    poles: Sequence[int],
-    region: str,
-    report: Report,
-    book: Ledger | None = None,
-    trained: bool = False,
-    poses: PoseSource = EXACT,
-) -> dict[str, list[Sample]]:
-    """Return the vehicles' sweeps with pseudo-labels, by "region/vehicle".
-
-    Labels are the frozen network's detections that score `threshold` or more, and the boxes of the roadside sensors on
-    `poles`, which come from the package's road detector if `trained`, else from an ideal one. Vehicles receive the
-    latter in messages, which enter `book` as downlinks; stage III passes no ledger, since its labels are those of
-    stage II. A vehicle transforms them into its frame by the `poses` of its navigation.
-    """
+def label_detected(network: Second, threshold: float, split: Frames) -> LabelFrame:
+    """Return the labelling of frames by the detections of the frozen `network` that score `threshold` or more."""
     relief = DatasetGround(split.data).relief
 
     def label(i: int, frame: Frame, views: Sequence[RoadView]) -> Sample:
         (detections,) = detect_in(network, [frame], score_threshold=threshold)
         return label_sample(frame, detections, views, network.config, choose_lidar(frame), relief)
 
-    return label_frames(label, split, frames, poles, region, report, book, trained, poses)
+    return label
 
 
 def label_frames(
@@ -104,8 +87,10 @@ def label_frames(
 ) -> dict[str, list[Sample]]:
     """Return the vehicles' samples as `label` makes them, by "region/vehicle".
 
-    `label` receives a frame's number, the frame with the pose of the vehicle's navigation in place of the true one,
-    and the views of roadside sensors at its spin. See `pseudo_label_samples` for the other arguments.
+    `label` receives a frame's number, the frame with the pose of the vehicle's navigation (`poses`) in place of the
+    true one, and the views of roadside sensors on `poles` at its spin, by the package's road detector if `trained`,
+    else by an ideal one. Vehicles receive the views in messages, which enter `book` as downlinks; stage III passes no
+    ledger, since its labels are those of stage II.
     """
     data = split.data
     views = road_views(split, poles, trained, {(data.keys[i].scene, data.keys[i].index) for i in frames})

@@ -366,7 +366,7 @@ def list_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[Step]
     for region in arm.regions:
         name, inputs = outline.names.edge(arm.name, region, task), outline.inputs(arm, region, task, EDGE)
         shown = outline.names.recording(region, "validation", task) if asks else ""
-        about = outline.federation(arm, task, EDGE)
+        about = dict(outline.federation(arm, task, EDGE))
         settings = EdgeSettings(**about, inputs=inputs, shown=shown, scored=scored, last=arm.stages[-1] == EDGE)
         yield make_step(name, federate_step, settings, outline.vehicles[region])
 
@@ -375,7 +375,7 @@ def list_more_edge_steps(outline: Outline, arm: Setting, task: str) -> Iterator[
     """Yield the steps with further edge rounds of an arm for a task, by region."""
     for region in arm.regions:
         name, inputs = outline.names.more_edge(arm.name, region, task), outline.inputs(arm, region, task, MORE_EDGE)
-        settings = EdgeSettings(**outline.federation(arm, task, MORE_EDGE), inputs=inputs)
+        settings = EdgeSettings(**dict(outline.federation(arm, task, MORE_EDGE)), inputs=inputs)
         yield make_step(name, federate_step, settings, outline.vehicles[region])
 
 
@@ -384,7 +384,7 @@ def make_cloud_step(outline: Outline, arm: Setting, task: str) -> Step:
     names = outline.names
     scored = arm.regions if arm.federation.score_statistics else ()
     settings = CloudSettings(
-        **outline.federation(arm, task, CLOUD),
+        **dict(outline.federation(arm, task, CLOUD)),
         regions={region: outline.inputs(arm, region, task, CLOUD) for region in arm.regions},
         pools=outline.pools(task) if arm.federation.replay else {},
         validation={region: names.recording(region, "validation", task) for region in scored},

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 from flcav.config import InputError, shorten
 from flcav.dataset.layout import navigation_path, read_manifest
@@ -31,7 +30,7 @@ from flcav.runs.recipe import (
     find_path,
 )
 from flcav.runs.spread import read_spreads
-from flcav.runs.stages.settings import LearningSettings, RegionInputs
+from flcav.runs.stages.settings import FederationSettings, LearningSettings, RegionInputs
 from flcav.runs.training.learning import find_start
 from flcav.statistics.streams import derive_seed
 
@@ -187,24 +186,24 @@ class Outline:
             pools=self.pools(task) if sends_outputs(arm.federation.strategy) else {},
         )
 
-    def federation(self, arm: Setting, task: str, stage: str) -> dict[str, Any]:
-        """Return the fields of `FederationSettings` of a stage of a task."""
+    def federation(self, arm: Setting, task: str, stage: str) -> FederationSettings:
+        """Return the settings that the federations of a stage of a task have in common."""
         recipe = self.recipe
         timed = arm.federation.network is not None
         given = {name: recipe.speeds(name) for name in self.federating}
         speeds = {f"{region}/{vehicle}": speed for region in given for vehicle, speed in given[region].items()}
-        return {
-            "learning": self.learning(arm, task),
-            "federation": arm.federation if stage == CLOUD else arm.edge_federation,
-            "budgets_mb": recipe.budgets_mb,
-            "vehicles": self.vehicles,
-            "labels": arm.labels[task],
-            "fault": arm.fault,
-            "distillation": arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
-            "navigation": recipe.navigation if LABEL_SOURCES[arm.labels[task]].placed else NavigationErrors(),
-            "train_s": recipe.tasks[task].train_s if timed else 0.0,
-            "speeds": speeds if timed else {},
-        }
+        return FederationSettings(
+            learning=self.learning(arm, task),
+            federation=arm.federation if stage == CLOUD else arm.edge_federation,
+            budgets_mb=recipe.budgets_mb,
+            vehicles=self.vehicles,
+            labels=arm.labels[task],
+            fault=arm.fault,
+            distillation=arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
+            navigation=recipe.navigation if LABEL_SOURCES[arm.labels[task]].placed else NavigationErrors(),
+            train_s=recipe.tasks[task].train_s if timed else 0.0,
+            speeds=speeds if timed else {},
+        )
 
     def find_data(self, region: Region, split: SplitName) -> Path:
         """Return the folder of a region's recorded dataset for a split; raises `InputError` where there is none."""

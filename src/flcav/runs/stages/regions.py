@@ -23,12 +23,7 @@ from flcav.runs.engine import Work
 from flcav.runs.frames import Frames
 from flcav.runs.label_sources import LABEL_SOURCES, LabelSource
 from flcav.runs.labels.faults import give_fault, read_occlusion
-from flcav.runs.labels.pseudo_labels import (
-    annotated_samples,
-    label_frames,
-    pseudo_label_samples,
-    select_frames_near,
-)
+from flcav.runs.labels.pseudo_labels import annotated_samples, label_detected, label_frames, select_frames_near
 from flcav.runs.labels.quality import measure_labels
 from flcav.runs.labels.tracks import label_tracked, load_tracks
 from flcav.runs.poles import find_sites
@@ -130,7 +125,7 @@ def label_samples(
             hidden = read_occlusion(split, frames, inputs.region, frozen.config)
             samples = give_fault(truth, samples, hidden, settings.fault)
         return LabelledSamples(samples, poles)
-    return LabelledSamples(pseudo_label_samples(frozen, threshold, *where), poles)
+    return LabelledSamples(label_frames(label_detected(frozen, threshold, split), *where), poles)
 
 
 def load_uploads(work: Work, learning: Learning, config: Any, pretrained: str, pools: Mapping[str, str]) -> list[Any]:

@@ -186,9 +186,9 @@ def _federate(
     outline: Outline, main: Setting, task: str, requests: Requests, inputs: RegionInputs, memory: Memory | None
 ) -> ReplaySettings:
     """Return the settings of a condition's rounds: like those of stage II, with groups on request."""
-    about = outline.federation(main, task, EDGE)
-    about["federation"] = main.edge_federation.model_copy(update={"requests": requests})
-    return ReplaySettings(**about, inputs=inputs, last=True, memory=memory)
+    rounds = main.edge_federation.model_copy(update={"requests": requests})
+    about = outline.federation(main, task, EDGE).model_copy(update={"federation": rounds})
+    return ReplaySettings(**dict(about), inputs=inputs, last=True, memory=memory)
 
 
 def _track(outline: Outline, main: Setting, task: str, inputs: RegionInputs) -> Step:
