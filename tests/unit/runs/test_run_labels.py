@@ -66,7 +66,10 @@ def test_groups_are_the_vehicles_within_range_of_a_sensor() -> None:
 
 
 def test_every_kind_that_nobody_could_have_says_that_it_is_an_upper_bound() -> None:
-    measured = ("own-detections", "road", "road-average", "tracks", "road+tracks")
+    heard = ("messages", "tracks+messages", "road+tracks+messages")
+    measured = ("own-detections", "road", "road-average", "tracks", "road+tracks", *heard)
+    assert heard == tuple(name for name, kind in LABEL_SOURCES.items() if kind.heard)
+    assert not any(LABEL_SOURCES[name].bound for name in measured)
     assert all(("upper bound" in kind.caveat) != (name in measured) for name, kind in LABEL_SOURCES.items())
     assert LABEL_SOURCES["road"].caveat != LABEL_SOURCES["ideal-road"].caveat  # reports show which it was
     assert choose_labels("objects", None) == "road"
