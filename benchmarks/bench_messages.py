@@ -53,7 +53,7 @@ def main() -> None:
         sweeps, world_from_lidar = read_window(network, split, i)
         bare = [replace(sweep, boxes=Boxes.empty()) for sweep in sweeps]
         for (source, share, deviation_m), how in list_sources():
-            heard = None if how is None else hear_messages(split, i, how, network.config)
+            heard = None if how is None else hear_messages(split, i, how, network)
             if heard is not None and source == "messages":
                 sizes.setdefault((share, deviation_m), []).append(heard.bytes)
             known = None if heard is None else heard.announced

@@ -31,10 +31,11 @@ SURE_M = 0.25  # standard deviation of a position up to which a vehicle with a r
 
 @dataclass(frozen=True)
 class Announced:
-    """The announced vehicles of a window of sweeps, world frame: the same rows in each report."""
+    """Announced vehicles around a window of sweeps, and what others detect, world frame; rows of all reports agree."""
 
     reports: tuple[BoxReport, ...]
     senders: Ints  # (N,)
+    perceived: tuple[BoxReport, ...] = ()  # what vehicles detect and send at the time that labels are for
 
     @property
     def middle(self) -> Boxes:

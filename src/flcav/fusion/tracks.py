@@ -63,12 +63,13 @@ def track_objects(
     less than `least` are left out. Vehicles are fitted to their returns, see `fit_vehicle`; trucks and buses then have
     the score 0.
 
-    Boxes of `announced` vehicles join the others; their length and width are known. One that nobody else reports is
-    moved onto the returns near it; it has the score 0 where there are too few of them to place it. It is left out where
-    the sweeps see through it, or where it comes to lie on another object.
+    Boxes of `announced` vehicles join the others, and so do those that these perceive; length and width of the former
+    are known. One that neither this vehicle nor `others` report is moved onto the returns near it; it has the score 0
+    where there are too few of them to place it. It is left out where the sweeps see through it, or where it comes to
+    lie on another object.
     """
     seen_by = [*(BoxReport("vehicle", sweep.time_s, sweep.boxes) for sweep in sweeps), *others]
-    average = average_boxes([*seen_by, *(announced.reports if announced else ())], at_s)
+    average = average_boxes([*seen_by, *((*announced.reports, *announced.perceived) if announced else ())], at_s)
     assert average.boxes.score is not None
     kept = np.flatnonzero(average.boxes.score >= least)
     boxes = average.boxes[kept]
@@ -83,26 +84,25 @@ def track_objects(
         size[average.member[len(seen_by) + len(announced.reports) // 2]] = announced.middle.size[:, :2]
     size = size[kept]
     alone = ~np.isin(kept, np.concatenate([np.zeros(0, np.int64), *average.member[: len(seen_by)]]))
-    there = np.ones(len(rows), np.bool_)
+    assert boxes.variance is not None
+    deviation_m = np.sqrt(boxes.variance[:, 0])
+    refused = np.zeros(len(rows), np.bool_)
     for number in np.flatnonzero(boxes.size[:, 0] >= VEHICLE_M):
         if alone[number]:
-            deviation_m = float(np.sqrt(boxes.variance[number, 0]))
-            rows[number, :2] += shift_onto_returns(
-                rows[number], gather_returns(rows[number], velocity[number], sweeps, at_s)[0], deviation_m
-            )
-            there[number] = not (
-                _overlaps(rows[number], rows[~alone])
-                or is_seen_through(rows[number], deviation_m, *_move_along(velocity[number], sweeps, at_s))
-            )
+            near, _ = gather_returns(rows[number], velocity[number], sweeps, at_s)
+            rows[number, :2] += shift_onto_returns(rows[number], near, deviation_m[number])
+            around = _move_along(velocity[number], sweeps, at_s)
+            refused[number] = is_seen_through(rows[number], deviation_m[number], *around)
+            refused[number] |= _overlaps(rows[number], rows[~alone])
         returns, origin = gather_returns(rows[number], velocity[number], sweeps, at_s)
-        if alone[number] and deviation_m > SURE_M and count_core(rows[number], returns) < LEAST_RETURNS:
+        if alone[number] and deviation_m[number] > SURE_M and count_core(rows[number], returns) < LEAST_RETURNS:
             score[number] = 0.0
-            rows[number, 3:5] += 2 * deviation_m
+            rows[number, 3:5] += 2 * deviation_m[number]
             continue
         rows[number] = fit_vehicle(rows[number], returns, origin, None if np.isnan(size[number, 0]) else size[number])
         if rows[number, 3] > LONGEST_M:
             score[number] = 0.0
-    return Boxes.from_array(rows, boxes.label, score)[there]
+    return Boxes.from_array(rows, boxes.label, score)[~refused]
 
 
 def _overlaps(box: Array, others: Array) -> bool:
@@ -200,7 +200,7 @@ def count_core(box: Array, returns: Array) -> int:
 
 
 def _in_core(plane: Array, box: Array) -> Mask:
-    return (np.abs(plane) < box[3:5] / 2 + MARGIN_M).all(1)
+    return np.asarray((np.abs(plane) < box[3:5] / 2 + MARGIN_M).all(1))
 
 
 def _fit_turn(plane: Array) -> float:

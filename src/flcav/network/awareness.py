@@ -1,5 +1,7 @@
 """Cooperative awareness messages (CAM, ETSI EN 302 637-2): which vehicles of a trace send them, when, and who hears.
 
+The size of a collective perception message (ETSI TS 103 324) is here, too.
+
 A message has the fields of the basic container and of the vehicle's containers, in the units and ranges of ETSI TS
 102 894-2; `CAM_BITS` lists their bits in unaligned PER. The reference position is the middle of the vehicle's front on
 the ground. A message is sent as soon as the vehicle has moved, turned or changed its speed enough, else after a second
@@ -14,6 +16,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 from scipy.interpolate import CubicHermiteSpline
 
@@ -58,6 +61,24 @@ CAM_BITS = {  # of the message without low-frequency container
     "yaw rate, its confidence": 16 + 4,
 }
 LIGHT_BITS = 1 + 4 + 8 + 6 + PATH_POINTS * (1 + 18 + 18 + 15 + 1 + 16)  # role, lights, path of points with their times
+CPM_BITS = {  # of a collective perception message without objects: TS 103 324, of a vehicle
+    "header: version, kind, station": 8 + 8 + 32,
+    "optional and extensible parts": 1 + 1 + 2 + 1 + 3,
+    "reference time": 42,
+    "reference position": 31 + 32 + 36 + 24,
+    "container of the vehicle: number, length, heading and its confidence": 4 + 8 + 24,
+    "container of objects: number, length, counts": 4 + 16 + 8 + 9,
+}
+OBJECT_BITS = {  # of each of its objects
+    "optional and extensible parts": 1 + 14,
+    "number, time": 16 + 12,
+    "position with confidences": 1 + 3 * (18 + 12),
+    "velocity with confidences": 1 + 1 + 2 * (15 + 7),
+    "heading with confidence": 2 + 12 + 7,
+    "three dimensions with confidences": 3 * (8 + 5),
+    "age, quality": 11 + 4,
+    "class with confidence": 1 + 3 + 1 + 2 + 8 + 7,
+}
 TRANSPORT_BYTES = 4 + 4 + 8 + 28  # BTP-B, and GeoNetworking headers of a single hop: EN 302 636-5-1 and 636-4-1
 SIGNED_BYTES = 95  # of TS 103 097 around a message: payload's header 19, digest 10, ECDSA P-256 signature 66
 CERTIFICATE_BYTES = (
@@ -73,6 +94,7 @@ class MessageSettings(Config):
         default=0.5, ge=0, le=10
     )  # standard deviation of announced positions, along x and along y; nearly all of it is one draw for each drive
     heading_deg: float = Field(default=0.5, ge=0, le=45)  # standard deviation of announced headings
+    perceived: bool = True  # whether those that record also send what they detect (TS 103 324)
     lost: float = Field(default=0.0, ge=0, le=1)  # share of messages lost to others on the air
     radio: Radio = Radio()  # of both ends
 
@@ -111,21 +133,17 @@ def draw_connected(trace: Trace, share: float, *names: str) -> Ints:
 def send_messages(trace: Trace, senders: Sequence[int] | Ints, how: MessageSettings, *names: str) -> AwarenessMessages:
     """Return all messages of the `senders`, actors of a trace; `names` name the random streams of their errors."""
     rows = [message for sender in senders for message in _messages_of(trace, int(sender), how, names)]
-    kinds = (np.int64, *[np.float64] * 6, np.int64)
-    shapes = ((-1,), (-1,), (-1, 2), (-1,), (-1,), (-1,), (-1, 2), (-1,))
-    columns = zip(*rows, strict=True) if rows else [()] * len(kinds)
-    return AwarenessMessages(
-        *(np.array(column, dtype=kind).reshape(shape) for column, kind, shape in zip(columns, kinds, shapes))
-    )
+    told = np.array(rows, dtype=np.float64).reshape(-1, 10)
+    numbers = told[:, (0, 9)].astype(np.int64)
+    deviation_m, heading, speed = told[:, 4:7].T
+    front, size = told[:, 2:4], told[:, 7:9]
+    return AwarenessMessages(numbers[:, 0], told[:, 1], front, deviation_m, heading, speed, size, numbers[:, 1])
 
 
-def _messages_of(
-    trace: Trace, sender: int, how: MessageSettings, names: Sequence[str]
-) -> Iterator[tuple[int, float, Array, float, float, float, Array, int]]:
-    """Yield the fields of `AwarenessMessages` of each message of a sender."""
-    rng = stream(0, "announced", *names, str(trace.actor[sender]))
-    bias = how.position_m * math.sqrt(1 - WHITE**2) * rng.standard_normal(2)
-    stated_m = min(max(math.ceil(100 * ELLIPSE * how.position_m), 1), 4094) / 100 / ELLIPSE
+def _messages_of(trace: Trace, sender: int, how: MessageSettings, names: Sequence[str]) -> Iterator[tuple[float, ...]]:
+    """Yield the ten numbers of each message of a sender, in the order of the fields of `AwarenessMessages`."""
+    name = str(trace.actor[sender])
+    rng, bias, stated_m = stream(0, "announced", *names, name), draw_bias(how, *names, name), state_deviation(how)
     size = np.ceil(trace.size[sender, :2] * 10 - 1e-6) / 10
     for times_s, place, yaw, speed in _pieces(trace, sender):
         sent = find_sending_times(times_s, place, yaw, speed, int(rng.integers(round(LONGEST_S / STEP_S))))
@@ -138,15 +156,20 @@ def _messages_of(
             told = np.degrees(yaw[row]) + how.heading_deg * rng.standard_normal()
             fast = max(speed[row] + SPEED_MPS * rng.standard_normal(), 0.0)
             yield (
-                sender,
-                float(times_s[row]),
-                np.round(front / POSITION_M) * POSITION_M,
-                stated_m,
-                float(np.radians(round(told * 10) / 10)),
-                round(min(fast, 163.82) * 100) / 100,
-                size,
+                *(sender, times_s[row], *np.round(front / POSITION_M) * POSITION_M, stated_m),
+                *(np.radians(round(told * 10) / 10), round(min(fast, 163.82) * 100) / 100, *size),
                 message_bytes(light=bool(light), certified=bool(certified)),
             )
+
+
+def draw_bias(how: MessageSettings, *names: str) -> Array:
+    """Return the constant part (2,) [m] of the position error of a vehicle's drive; `names` end with the vehicle's."""
+    return how.position_m * math.sqrt(1 - WHITE**2) * stream(0, "bias", *names).standard_normal(2)
+
+
+def state_deviation(how: MessageSettings) -> float:
+    """Return the standard deviation [m] that the stated confidence ellipse stands for, in centimetres rounded up."""
+    return min(max(math.ceil(100 * ELLIPSE * how.position_m), 1), 4094) / 100 / ELLIPSE
 
 
 def message_bytes(*, light: bool, certified: bool) -> int:
@@ -157,6 +180,16 @@ def message_bytes(*, light: bool, certified: bool) -> int:
     """
     bits = sum(CAM_BITS.values()) + light * LIGHT_BITS
     return math.ceil(bits / 8) + TRANSPORT_BYTES + SIGNED_BYTES + certified * CERTIFICATE_BYTES
+
+
+def perception_bytes(objects: int) -> int:
+    """Return the bytes on the air of a collective perception message with so many objects.
+
+    >>> perception_bytes(0), perception_bytes(10)
+    (177, 523)
+    """
+    bits = sum(CPM_BITS.values()) + objects * sum(OBJECT_BITS.values())
+    return math.ceil(bits / 8) + TRANSPORT_BYTES + SIGNED_BYTES
 
 
 def _pieces(trace: Trace, actor: int) -> Iterator[tuple[Array, Array, Array, Array]]:
@@ -234,7 +267,7 @@ def _losses_db(
     instant: int,
     senders: Ints,
     own: int,
-    state: Array,
+    state: NDArray[np.int8],
     blocker: Ints,
     actor: Ints,
     radio: Radio,

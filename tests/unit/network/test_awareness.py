@@ -21,6 +21,7 @@ from flcav.network.awareness import (
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.network.radio.budget import Radio
 from flcav.network.radio.links import raise_walls
+from flcav.world.rays.embree import Assembly
 from flcav.world.trace import Trace
 
 EXACT = MessageSettings(share=1, position_m=0, heading_deg=0)
@@ -115,7 +116,7 @@ def test_who_is_near_is_heard_and_who_is_far_behind_houses_is_not() -> None:
     walls = raise_walls(open_town((0.0, 70.0, 0.0, 60.0, 12.0, 20.0)))
     messages = send_messages(trace, range(4), quiet)
 
-    def heard(how: MessageSettings, around=walls) -> set[str]:
+    def heard(how: MessageSettings, around: Assembly | None = walls) -> set[str]:
         got = find_received(messages, trace, "me", around, how)
         return {str(trace.actor[sender]) for sender in messages.sender[got]}
 

@@ -50,7 +50,7 @@ def track_step(work: Work, settings: TrackSettings) -> None:
     for done, i in enumerate(frames, start=1):
         seen = [*views.get(spins[i], {}).values()]
         if settings.messages is not None:
-            heard[i] = hear_messages(split, i, settings.messages, network.config)
+            heard[i] = hear_messages(split, i, settings.messages, network)
         announced = heard[i].announced if i in heard else None
         tracks[i] = track_frame(network, split, i, seen, settings.navigation, announced, kind.from_detections)
         work.report(done, len(frames), "tracks")
