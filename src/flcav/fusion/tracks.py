@@ -26,6 +26,7 @@ ABOVE_M, BELOW_M = 0.25, 3.6  # heights above an object's underside between whic
 REACH_M = 5.0  # from an object's centre to its farthest return
 MARGIN_M = 0.3  # around a detected box, within which returns belong to the object
 LEAST_RETURNS = 8  # of an object that is fitted
+LEAST_SEEN = 3  # returns of an announced object in the frame that is labelled
 TURN_RAD, TURNS = 0.16, 17  # headings that are tried: greatest deviation from the detected one, and their number
 TURNED_RETURNS = 25  # of an object whose heading is fitted
 BIN_M, BIN_RETURNS = 0.1, 2  # bins of the histogram along an axis, and least returns in an occupied one
@@ -65,8 +66,8 @@ def track_objects(
 
     Boxes of `announced` vehicles join the others, and so do those that these perceive; length and width of the former
     are known. One that neither this vehicle nor `others` report is moved onto the returns near it; it has the score 0
-    where there are too few of them to place it. It is left out where the sweeps see through it, or where it comes to
-    lie on another object.
+    where there are too few of them to place it, and so has any announced one that is hidden at `at_s`. It is left out
+    where the sweeps see through it, or where it comes to lie on another object.
     """
     seen_by = [*(BoxReport("vehicle", sweep.time_s, sweep.boxes) for sweep in sweeps), *others]
     average = average_boxes([*seen_by, *((*announced.reports, *announced.perceived) if announced else ())], at_s)
@@ -100,6 +101,10 @@ def track_objects(
             rows[number, 3:5] += 2 * deviation_m[number]
             continue
         rows[number] = fit_vehicle(rows[number], returns, origin, None if np.isnan(size[number, 0]) else size[number])
+        now = [sweep for sweep in sweeps if sweep.time_s == at_s]
+        told = alone[number] or not np.isnan(size[number, 0])
+        if told and count_core(rows[number], gather_returns(rows[number], velocity[number], now, at_s)[0]) < LEAST_SEEN:
+            score[number] = 0.0
         if rows[number, 3] > LONGEST_M:
             score[number] = 0.0
     return Boxes.from_array(rows, boxes.label, score)[~refused]

@@ -4,6 +4,7 @@ Awareness messages are of the traffic of a recording, with errors; perception me
 the network that also labels: no annotation has a part in either.
 """
 
+import math
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
@@ -38,6 +39,7 @@ from flcav.world.map.town import Town
 from flcav.world.rays.embree import Assembly
 from flcav.world.trace import Trace
 
+BESIDE_M = 10.0  # as far beyond the network's range are vehicles of which something is in it
 ITSELF_M = 2.0  # a vehicle that is perceived as near as this, and twice the deviation, is the one that hears of it
 
 
@@ -86,7 +88,10 @@ def hear_messages(split: Frames, i: int, how: MessageSettings, network: Second) 
     def ground(places: Array) -> Array:
         return town.grounds(*places.T)
 
-    placed = place_senders(heard[label(heard.sender) != ""], key.time_s, ground, label)
+    reach_m = math.hypot(*(max(abs(network.config.range_m[k]), abs(network.config.range_m[k + 3])) for k in (0, 1)))
+    away_m = np.linalg.norm(heard.front - data.world_from_agent(i)[:2, 3], axis=1)
+    known = heard[(label(heard.sender) != "") & (away_m <= reach_m + BESIDE_M)]
+    placed = place_senders(known, key.time_s, ground, label)
     told = replace(placed, perceived=tuple(reports))
     return HeardMessages(told, len(heard) + len(sizes), int(heard.bytes.sum()) + sum(sizes))
 
