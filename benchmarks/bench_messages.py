@@ -84,10 +84,9 @@ def main() -> None:
     rings = [f"{low:g} to {high:g} m" if np.isfinite(high) else f"from {low:g} m" for low, high in RINGS_M]
     header = ("labels", "share", "position, m", "precision", *(f"P, {ring}" for ring in rings), "recall")
     print(format_table((*header, *(f"R, {ring}" for ring in rings), "R, drive", "R, park", "MB a frame"), rows))
-    counts = sum(len(truth.targets) for truth in truths), sum(int(own.sum()) for own in drives)
-    print(
-        f"{len(truths)} frames, {counts[0]} targets, {counts[1]} of which drive; {time.process_time() - begun:.0f} CPU-s"
-    )
+    targets, driving = sum(len(truth.targets) for truth in truths), sum(int(own.sum()) for own in drives)
+    spent_s = time.process_time() - begun
+    print(f"{len(truths)} frames, {targets} targets, {driving} of which drive; {spent_s:.0f} CPU-s")
 
 
 def list_rows() -> Iterator[tuple[Row, MessageSettings | None]]:
@@ -95,7 +94,7 @@ def list_rows() -> Iterator[tuple[Row, MessageSettings | None]]:
     yield ("tracks", "", ""), None
     for source, perceived in (("messages: CAM", False), ("tracks + CAM", False), ("tracks + CAM, CPM", True)):
         for share in SHARES:
-            for deviation_m in DEVIATIONS_M:
+            for deviation_m in DEVIATIONS_M[1:2] if perceived else DEVIATIONS_M:
                 how = MessageSettings(share=share, position_m=deviation_m, perceived=perceived)
                 yield (source, f"{share:g}", f"{deviation_m:g}"), how
 

@@ -19,6 +19,8 @@ AGENT = "messages"  # name of the reports of announced vehicles
 AROUND_S = (-1.0, 0.0, 1.0)  # times of these reports, by which a vehicle's velocity is known
 HEIGHT_M = 1.55  # of an announced vehicle, until returns tell: a message has none
 DEVIATION = np.array((0.0, 0.0, 0.2, 0.1, 0.1, 0.2, 0.03))  # of an announced box, beside that of its position
+BRAKE_MPS2 = 2.0  # standard deviation of accelerations, by which a velocity over two seconds changes
+MOTION_M = 0.1  # error of a position that is continued between messages
 SHIFT_M = 0.15  # step of the shifts that are tried
 SHELL_M, BESIDE_M = 0.25, 0.6  # depth of the flanks that returns lie on; reach beside the box where none should be
 DATA = 20.0  # weight of the share of returns that a shift explains against its squared deviation
@@ -65,7 +67,7 @@ def place_senders(
             center = own.front[near] + along * (own.speed[near] * since[near] - size[0] / 2)[:, None]
             rows[number, :2] = weight @ center / weight.sum()
             rows[number, 3:] = (*size, HEIGHT_M, own.heading[near[0]])
-            variance[number, :2] = own.deviation_m[near[0]] ** 2
+            variance[number, :2] = own.deviation_m[near[0]] ** 2 + (BRAKE_MPS2 / 2 * offset_s**2) ** 2
         rows[:, 2] = ground(rows[:, :2]) + HEIGHT_M / 2
         boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], label(senders), np.ones(len(senders)), variance)
         reports.append(BoxReport(AGENT, at_s + offset_s, boxes))
@@ -89,6 +91,14 @@ def shift_onto_returns(box: Array, returns: Array, deviation_m: float) -> Array:
     score = score - ((inside < 0) & (inside >= -BESIDE_M)).sum(axis=1)
     prior = (shifts**2).sum(axis=1) / (2 * deviation_m**2)
     return shifts[(DATA * score / max(len(plane), 1) - prior).argmax()]
+
+
+def keep_in_ellipse(place: Array, told: Boxes) -> Array:
+    """Return the place (2,) [m], or where it is outside the stated ellipse of one announced box, the nearest inside."""
+    assert told.variance is not None
+    off = place - told.center[0, :2]
+    reach_m = ELLIPSE * float(np.sqrt(told.variance[0, 0])) + MOTION_M
+    return told.center[0, :2] + off * min(1.0, reach_m / max(float(np.hypot(*off)), 1e-9))
 
 
 def is_seen_through(box: Array, deviation_m: float, points: Sequence[Array], origins: Sequence[Array]) -> bool:

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.arrays import Array, Mask
-from flcav.fusion.announced import SURE_M, Announced, is_seen_through, shift_onto_returns
+from flcav.arrays import Array, Ints, Mask
+from flcav.fusion.announced import SURE_M, Announced, is_seen_through, keep_in_ellipse, shift_onto_returns
 from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
 from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
 
@@ -80,34 +80,48 @@ def track_objects(
     feet = _average_feet(sweeps, average)[kept]
     seen = np.isfinite(feet)
     rows[seen, 2] = feet[seen] + rows[seen, 5] / 2
-    size = np.full((len(average.boxes), 2), np.nan)  # as announced
-    if announced:
-        size[average.member[len(seen_by) + len(announced.reports) // 2]] = announced.middle.size[:, :2]
-    size = size[kept]
-    alone = ~np.isin(kept, np.concatenate([np.zeros(0, np.int64), *average.member[: len(seen_by)]]))
+    told, alone, lost = _match_announced(average, kept, len(seen_by), announced)
     assert boxes.variance is not None
     deviation_m = np.sqrt(boxes.variance[:, 0])
-    refused = np.zeros(len(rows), np.bool_)
+    current = [min(sweeps, key=lambda sweep: abs(sweep.time_s - at_s))]
     for number in np.flatnonzero(boxes.size[:, 0] >= VEHICLE_M):
         if alone[number]:
             near, _ = gather_returns(rows[number], velocity[number], sweeps, at_s)
             rows[number, :2] += shift_onto_returns(rows[number], near, deviation_m[number])
             around = _move_along(velocity[number], sweeps, at_s)
-            refused[number] = is_seen_through(rows[number], deviation_m[number], *around)
-            refused[number] |= _overlaps(rows[number], rows[~alone])
+            lost[number] |= is_seen_through(rows[number], deviation_m[number], *around)
+            lost[number] |= _overlaps(rows[number], rows[~alone])
         returns, origin = gather_returns(rows[number], velocity[number], sweeps, at_s)
         if alone[number] and deviation_m[number] > SURE_M and count_core(rows[number], returns) < LEAST_RETURNS:
             score[number] = 0.0
             rows[number, 3:5] += 2 * deviation_m[number]
             continue
-        rows[number] = fit_vehicle(rows[number], returns, origin, None if np.isnan(size[number, 0]) else size[number])
-        now = [sweep for sweep in sweeps if sweep.time_s == at_s]
-        told = alone[number] or not np.isnan(size[number, 0])
-        if told and count_core(rows[number], gather_returns(rows[number], velocity[number], now, at_s)[0]) < LEAST_SEEN:
-            score[number] = 0.0
+        own = announced.middle[told[[number]]] if announced and told[number] >= 0 else None
+        rows[number] = fit_vehicle(rows[number], returns, origin, None if own is None else own.size[0, :2])
+        if own is not None:
+            rows[number, :2] = keep_in_ellipse(rows[number, :2], own)
+        if own is not None or alone[number]:
+            returns, _ = gather_returns(rows[number], velocity[number], current, at_s)
+            score[number] *= count_core(rows[number], returns) >= LEAST_SEEN
         if rows[number, 3] > LONGEST_M:
             score[number] = 0.0
-    return Boxes.from_array(rows, boxes.label, score)[~refused]
+    return Boxes.from_array(rows, boxes.label, score)[~lost]
+
+
+def _match_announced(
+    average: RoadAverage, kept: Ints, others: int, announced: Announced | None
+) -> tuple[Ints, Mask, Mask]:
+    """Return of the objects `kept` (K,) of an average: the row of the announced vehicle, -1 for none; whether none of
+    the first `others` reports is of it; and whether no report of the time asked for is.
+    """
+    first = np.isin(kept, np.concatenate([np.zeros(0, np.int64), *average.member[:others]]))
+    told = np.full(len(average.boxes), -1)
+    if announced is None:
+        return told[kept], ~first, ~first
+    middle = average.member[others + len(announced.reports) // 2]
+    told[middle] = np.arange(len(middle))
+    now = np.concatenate([middle, *average.member[others + len(announced.reports) :]])
+    return told[kept], ~first, ~first & ~np.isin(kept, now)
 
 
 def _overlaps(box: Array, others: Array) -> bool:

@@ -29,11 +29,13 @@ from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.labels.heard import hear_messages
 from flcav.runs.labels.pseudo_labels import EXACT, label_frames
 from flcav.runs.labels.tracks import label_tracked, load_heard, load_tracks, save_tracks, track_frame
+from flcav.runs.recipe import RunRecipe
+from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.tracking import check_windows
 from flcav.sources.recipe import Recipe
 from flcav.world.trace import Trace
 
-CLOSE = MessageSettings(share=0.6, position_m=0.1, radio=Radio(power_dbm=60))  # no vehicle in its way blocks a message
+CLOSE = MessageSettings(share=0.9, position_m=0.1, radio=Radio(power_dbm=60))  # no vehicle in its way blocks a message
 DRIVE = {"town": "suburb", "seed": 5, "scenes": 2, "spins_per_scene": 1, "cavs": 2, "warmup_s": 40.0, "window_s": 0.6}
 
 
@@ -83,9 +85,10 @@ def test_no_annotation_has_a_part_in_a_label(folder: Path, network, tmp_path: Pa
     kept = []
     for where in (folder, scrambled):
         split = Frames.open(where)
-        frames = split.vehicles[:1] if kind.heard else split.vehicles[:2]
-        heard = {i: hear_messages(split, i, CLOSE, network) for i in frames if kind.heard}
-        assert all(len(own.announced.senders) for own in heard.values())
+        heard = {i: hear_messages(split, i, CLOSE, network) for i in split.vehicles if kind.heard}
+        frames = [i for i, own in heard.items() if len(own.announced.senders)][:1] or split.vehicles[:2]
+        heard = {i: heard[i] for i in frames if kind.heard}
+        assert len(heard) == kind.heard
         told = {i: own.announced for i, own in heard.items()}
         tracks = {i: track_frame(network, split, i, (), EXACT, told.get(i), kind.from_detections) for i in frames}
         ground = None if kind.from_detections else DatasetGround(split.data)
@@ -112,7 +115,7 @@ def test_no_annotation_has_a_part_in_a_label(folder: Path, network, tmp_path: Pa
 
 def scramble_silent(folder: Path) -> None:
     """Move all traffic that neither records nor sends a message, other than far."""
-    for path in (folder / "traces").glob("*.parquet"):
+    for path in (folder / "data" / "traces").glob("*.parquet"):
         trace = Trace.load(path)
         silent = np.ones(len(trace.actor), np.bool_)
         silent[draw_connected(trace, CLOSE.share, str(DRIVE["seed"]), path.stem)] = False
@@ -177,3 +180,26 @@ def test_sweeps_that_stand_alone_are_refused_in_a_sentence() -> None:
     for times in ((("a", 0.0), ("b", 0.0)), (("a", 0.0), ("a", 1.5))):
         with pytest.raises(InputError, match=r"^real: labels by tracks need sweeps within 1 s of one another"):
             check_windows(split(*times), (0, 1), "real")
+
+
+def test_messages_need_the_traffic_of_a_town(folder: Path, network, tmp_path: Path) -> None:
+    """In the step, and before the run where the region is recorded data."""
+    bare = tmp_path / "bare"
+    shutil.copytree(folder, bare)
+    for path in (bare / "data" / "traces").iterdir():
+        path.unlink()
+    with pytest.raises(InputError, match=r"bare/data: labels by messages need the traffic of a simulated town"):
+        hear_messages(Frames.open(bare), 0, CLOSE, network)
+
+    def outline(where: Path) -> Outline:
+        split = dict.fromkeys(("validation", "registry", "edge", "test"), str(where / "data"))
+        fields = {
+            "tasks": {"objects": {"labels": "messages", "plan": {"samples": 4, "edge_rounds": 1, "cloud_rounds": 0}}},
+            "regions": {"suburb": {"role": "pretrain"}, "real": {"role": "federate", "data": split}},
+            "budgets_mb": {"wireless": 100, "wireline": 80},
+        }
+        return Outline(RunRecipe.model_validate(fields), tmp_path)
+
+    assert outline(folder).recorded["real"].keys() == {"cav0", "cav1"}
+    with pytest.raises(InputError, match=r"labels by messages need the traffic .* 'suburb-5-000' has none"):
+        outline(bare)
