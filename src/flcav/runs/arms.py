@@ -214,7 +214,7 @@ def _check_messages(recipe: RunRecipe, settings: Sequence[Setting]) -> None:
     """Raise `InputError` where messages are described and no labels come from them."""
     hear = {each.name for each in settings if any(LABEL_SOURCES[kind].heard for kind in each.labels.values())}
     given = [f"arms.{name}.messages" for name, arm in recipe.arms.items() if arm.messages and name not in hear]
-    if not hear and "messages" in recipe.model_fields_set:
+    if not hear and recipe.messages.model_dump() != MessageSettings().model_dump():
         given.append("messages")
     if given:
         raise InputError(f"{given[0]}: its labels are without messages; choose 'tracks+messages' or leave it out")

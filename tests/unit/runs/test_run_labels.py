@@ -168,6 +168,7 @@ def test_messages_that_no_label_comes_from_are_refused() -> None:
 
     check(messages_recipe("tracks", {"share": 0.6}, other={"labels": {"objects": "messages"}}))
     check(messages_recipe("messages", None, other={"messages": {"share": 0.6}}, bare={"labels": {"objects": "tracks"}}))
+    check(RunRecipe.model_validate(messages_recipe("tracks").model_dump()))  # with all fields, as results have it
     with pytest.raises(InputError, match=r"^messages: its labels are without messages; choose 'tracks\+messages'"):
         check(messages_recipe("tracks", {"share": 0.6}))
     with pytest.raises(InputError, match=r"^arms.other.messages: its labels are without messages"):
