@@ -15,11 +15,10 @@ from flcav.fusion.average import BoxReport
 from flcav.geometry import Boxes, heading_vectors, points_in_boxes, segments_meet_boxes
 from flcav.network.awareness import ELLIPSE, AwarenessMessages
 
-AGENT = "messages"  # name of the reports of announced vehicles
-AROUND_S = (-1.0, 0.0, 1.0)  # times of these reports, by which a vehicle's velocity is known
+AGENT = "messages"  # name of the report of announced vehicles
+HEARD_S = 1.0  # time before and after a frame within which messages count
 HEIGHT_M = 1.55  # of an announced vehicle, until returns tell: a message has none
 DEVIATION = np.array((0.0, 0.0, 0.2, 0.1, 0.1, 0.2, 0.03))  # of an announced box, beside that of its position
-BRAKE_MPS2 = 2.0  # standard deviation of accelerations, by which a velocity over two seconds changes
 MOTION_M = 0.1  # error of a position that is continued between messages
 SHIFT_M = 0.15  # step of the shifts that are tried
 SHELL_M, BESIDE_M = 0.25, 0.6  # depth of the flanks that returns lie on; reach beside the box where none should be
@@ -33,45 +32,40 @@ SURE_M = 0.25  # standard deviation of a position up to which a vehicle with a r
 
 @dataclass(frozen=True)
 class Announced:
-    """Announced vehicles around a window of sweeps, and what others detect, world frame; rows of all reports agree."""
+    """Announced vehicles at the time that labels are for, and what others detect then, world frame."""
 
-    reports: tuple[BoxReport, ...]
+    report: BoxReport  # of N vehicles
+    velocity: Array  # (N, 2) [m/s]
     senders: Ints  # (N,)
-    perceived: tuple[BoxReport, ...] = ()  # what vehicles detect and send at the time that labels are for
-
-    @property
-    def middle(self) -> Boxes:
-        """Return the boxes (N,) at the time that labels are for."""
-        return self.reports[len(self.reports) // 2].boxes
+    perceived: tuple[BoxReport, ...] = ()
 
 
 def place_senders(
     messages: AwarenessMessages, at_s: float, ground: Callable[[Array], Array], label: Callable[[Ints], Words]
 ) -> Announced:
-    """Return where the senders of messages are around `at_s` [s].
+    """Return where the senders of messages are at `at_s` [s].
 
     A position is that of the two messages nearest in time, each continued at its velocity and weighted by nearness.
     ground: heights (N,) [m] at places (N, 2) of the world. label: (N,) classes of senders (N,).
     """
     senders = np.unique(messages.sender)
-    reports = []
-    for offset_s in AROUND_S:
-        rows, variance = np.zeros((len(senders), 7)), np.tile(DEVIATION**2, (len(senders), 1))
-        for number, sender in enumerate(senders):
-            own = messages[messages.sender == sender]
-            since = at_s + offset_s - own.time_s
-            near = np.argsort(np.abs(since), kind="stable")[:2]
-            weight = 1 / (np.abs(since[near]) + 0.05)
-            along = heading_vectors(own.heading[near])
-            size = own.size[near[0]] - 0.05  # the middle of what an announced tenth stands for
-            center = own.front[near] + along * (own.speed[near] * since[near] - size[0] / 2)[:, None]
-            rows[number, :2] = weight @ center / weight.sum()
-            rows[number, 3:] = (*size, HEIGHT_M, own.heading[near[0]])
-            variance[number, :2] = own.deviation_m[near[0]] ** 2 + (BRAKE_MPS2 / 2 * offset_s**2) ** 2
-        rows[:, 2] = ground(rows[:, :2]) + HEIGHT_M / 2
-        boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], label(senders), np.ones(len(senders)), variance)
-        reports.append(BoxReport(AGENT, at_s + offset_s, boxes))
-    return Announced(tuple(reports), senders)
+    rows, variance = np.zeros((len(senders), 7)), np.tile(DEVIATION**2, (len(senders), 1))
+    velocity = np.zeros((len(senders), 2))
+    for number, sender in enumerate(senders):
+        own = messages[messages.sender == sender]
+        since = at_s - own.time_s
+        near = np.argsort(np.abs(since), kind="stable")[:2]
+        weight = 1 / (np.abs(since[near]) + 0.05)
+        along = heading_vectors(own.heading[near])
+        size = own.size[near[0]] - 0.05  # the middle of what an announced tenth stands for
+        center = own.front[near] + along * (own.speed[near] * since[near] - size[0] / 2)[:, None]
+        rows[number, :2] = weight @ center / weight.sum()
+        rows[number, 3:] = (*size, HEIGHT_M, own.heading[near[0]])
+        variance[number, :2] = own.deviation_m[near[0]] ** 2
+        velocity[number] = along[0] * own.speed[near[0]]
+    rows[:, 2] = ground(rows[:, :2]) + HEIGHT_M / 2
+    boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], label(senders), np.ones(len(senders)), variance)
+    return Announced(BoxReport(AGENT, at_s, boxes), velocity, senders)
 
 
 def shift_onto_returns(box: Array, returns: Array, deviation_m: float) -> Array:

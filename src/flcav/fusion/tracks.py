@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.arrays import Array, Ints, Mask
+from flcav.arrays import Array, Mask
 from flcav.fusion.announced import SURE_M, Announced, is_seen_through, keep_in_ellipse, shift_onto_returns
 from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
 from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
@@ -70,7 +70,7 @@ def track_objects(
     where the sweeps see through it, or where it comes to lie on another object.
     """
     seen_by = [*(BoxReport("vehicle", sweep.time_s, sweep.boxes) for sweep in sweeps), *others]
-    average = average_boxes([*seen_by, *((*announced.reports, *announced.perceived) if announced else ())], at_s)
+    average = average_boxes([*seen_by, *((announced.report, *announced.perceived) if announced else ())], at_s)
     assert average.boxes.score is not None
     kept = np.flatnonzero(average.boxes.score >= least)
     boxes = average.boxes[kept]
@@ -80,7 +80,13 @@ def track_objects(
     feet = _average_feet(sweeps, average)[kept]
     seen = np.isfinite(feet)
     rows[seen, 2] = feet[seen] + rows[seen, 5] / 2
-    told, alone, lost = _match_announced(average, kept, len(seen_by), announced)
+    alone = ~np.isin(kept, np.concatenate([np.zeros(0, np.int64), *average.member[: len(seen_by)]]))
+    told = np.full(len(average.boxes), -1)  # row of the announced vehicle
+    if announced:
+        told[average.member[len(seen_by)]] = np.arange(len(announced.report.boxes))
+        told = told[kept]
+        velocity[alone & (told >= 0)] = announced.velocity[told[alone & (told >= 0)]]
+    lost = np.zeros(len(rows), np.bool_)
     assert boxes.variance is not None
     deviation_m = np.sqrt(boxes.variance[:, 0])
     current = [min(sweeps, key=lambda sweep: abs(sweep.time_s - at_s))]
@@ -96,7 +102,7 @@ def track_objects(
             score[number] = 0.0
             rows[number, 3:5] += 2 * deviation_m[number]
             continue
-        own = announced.middle[told[[number]]] if announced and told[number] >= 0 else None
+        own = announced.report.boxes[told[[number]]] if announced and told[number] >= 0 else None
         rows[number] = fit_vehicle(rows[number], returns, origin, None if own is None else own.size[0, :2])
         if own is not None:
             rows[number, :2] = keep_in_ellipse(rows[number, :2], own)
@@ -106,22 +112,6 @@ def track_objects(
         if rows[number, 3] > LONGEST_M:
             score[number] = 0.0
     return Boxes.from_array(rows, boxes.label, score)[~lost]
-
-
-def _match_announced(
-    average: RoadAverage, kept: Ints, others: int, announced: Announced | None
-) -> tuple[Ints, Mask, Mask]:
-    """Return of the objects `kept` (K,) of an average: the row of the announced vehicle, -1 for none; whether none of
-    the first `others` reports is of it; and whether no report of the time asked for is.
-    """
-    first = np.isin(kept, np.concatenate([np.zeros(0, np.int64), *average.member[:others]]))
-    told = np.full(len(average.boxes), -1)
-    if announced is None:
-        return told[kept], ~first, ~first
-    middle = average.member[others + len(announced.reports) // 2]
-    told[middle] = np.arange(len(middle))
-    now = np.concatenate([middle, *average.member[others + len(announced.reports) :]])
-    return told[kept], ~first, ~first & ~np.isin(kept, now)
 
 
 def _overlaps(box: Array, others: Array) -> bool:

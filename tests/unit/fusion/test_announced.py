@@ -8,7 +8,6 @@ import torch
 
 from flcav.fusion.announced import (
     AGENT,
-    AROUND_S,
     Announced,
     is_seen_through,
     place_senders,
@@ -49,7 +48,7 @@ def announce(*rows, deviation_m):
     """Return vehicles at rest that announce these boxes (7,) with a standard deviation of their positions [m]."""
     variance = np.tile((deviation_m**2, deviation_m**2, 0.04, 0.01, 0.01, 0.04, 0.001), (len(rows), 1))
     boxes = replace(Boxes.from_array(np.array(rows), "Car", np.ones(len(rows))), variance=variance)
-    return Announced(tuple(BoxReport(AGENT, offset_s, boxes) for offset_s in AROUND_S), np.arange(len(rows)))
+    return Announced(BoxReport(AGENT, 0.0, boxes), np.zeros((len(rows), 2)), np.arange(len(rows)))
 
 
 def scan(*boxes, ground=True):
@@ -91,15 +90,13 @@ def test_a_sender_is_where_its_messages_put_its_front() -> None:
     )
     placed = place_senders(heard, 10.0, flat, cars)
     assert placed.senders.tolist() == [3, 7]
-    middle = placed.middle
-    np.testing.assert_allclose(middle.center[1, :2], (102.0 - 4.65 / 2, 0.0), atol=1e-6)
-    np.testing.assert_allclose(middle.center[0, :2], (0.0, 5.0 - 4.65 / 2), atol=1e-6)
-    np.testing.assert_allclose(middle.size[:, :2], ((4.65, 1.85),) * 2)
-    assert middle.variance is not None
-    np.testing.assert_allclose(middle.variance[:, 0], (1.0, 0.25))
-    late = placed.reports[-1]
-    assert late.time_s == 11.0
-    assert late.boxes.center[1, 0] == pytest.approx(112.0 - 4.65 / 2)
+    boxes = placed.report.boxes
+    np.testing.assert_allclose(boxes.center[1, :2], (102.0 - 4.65 / 2, 0.0), atol=1e-6)
+    np.testing.assert_allclose(boxes.center[0, :2], (0.0, 5.0 - 4.65 / 2), atol=1e-6)
+    np.testing.assert_allclose(boxes.size[:, :2], ((4.65, 1.85),) * 2)
+    assert boxes.variance is not None
+    np.testing.assert_allclose(boxes.variance[:, 0], (1.0, 0.25))
+    np.testing.assert_allclose(placed.velocity, ((0.0, 0.0), (10.0, 0.0)), atol=1e-6)
 
 
 @pytest.mark.parametrize("deviation_m", [0.5, 1.5])
@@ -148,3 +145,25 @@ def test_a_truck_that_announces_itself_gives_no_label_and_a_ghost_on_a_car_none_
     detected = Boxes.from_array(CAR, ["Car"], [0.9])
     two = announce(CAR, moved(CAR, 0.4, 0.1), deviation_m=0.5)
     assert len(track_objects(sweeps(CAR, found=detected), 0.0, (), 0.1, two)) == 1
+
+
+def test_an_undetected_sender_that_moves_is_placed_by_its_own_velocity() -> None:
+    velocity = 8.0 * np.array((np.cos(0.3), np.sin(0.3)))
+    drive = [
+        VehicleSweep(at_s, Boxes.empty(), scan(moved(CAR, *velocity * at_s)), ORIGIN)
+        for at_s in np.arange(-1, 1.1, 0.2)
+    ]
+    told = replace(announce(moved(CAR, 0.5, 0.3), deviation_m=0.5), velocity=velocity[None])
+    found = track_objects(drive, 0.0, (), 0.1, told)
+    assert len(found) == 1
+    assert overlap(found, CAR) > 0.7
+
+
+def test_a_message_does_not_vouch_for_another_box_than_its_sender_s() -> None:
+    """A faint detection on the way of a sender that brakes is no more certain than without its messages."""
+    beside = moved(CAR, 0.3, 3.1)
+    found = Boxes.from_array(np.array([CAR, beside]), "Car", [0.8, 0.15])
+    alone = track_objects(sweeps(CAR, found=found), 0.0, (), 0.1)
+    both = track_objects(sweeps(CAR, found=found), 0.0, (), 0.1, announce(CAR, deviation_m=0.5))
+    assert sorted(scores(alone)) == pytest.approx([0.15, 0.8])
+    assert sorted(scores(both)) == pytest.approx([0.15, 1.0])

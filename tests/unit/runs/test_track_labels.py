@@ -182,6 +182,13 @@ def test_sweeps_that_stand_alone_are_refused_in_a_sentence() -> None:
             check_windows(split(*times), (0, 1), "real")
 
 
+def test_where_nobody_sends_there_are_no_labels_by_messages(folder: Path, network) -> None:
+    split = Frames.open(folder)
+    heard = hear_messages(split, split.vehicles[0], MessageSettings(share=0), network)
+    assert (heard.count, heard.bytes, len(heard.announced.senders), heard.announced.perceived) == (0, 0, 0, ())
+    assert len(track_frame(network, split, split.vehicles[0], (), EXACT, heard.announced, detects=False)) == 0
+
+
 def test_messages_need_the_traffic_of_a_town(folder: Path, network, tmp_path: Path) -> None:
     """In the step, and before the run where the region is recorded data."""
     bare = tmp_path / "bare"

@@ -14,7 +14,7 @@ from flcav.arrays import Array, Ints, Words
 from flcav.config import InputError
 from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
-from flcav.fusion.announced import AROUND_S, Announced, place_senders
+from flcav.fusion.announced import HEARD_S, Announced, place_senders
 from flcav.fusion.average import BoxReport, Sighting, report_boxes, state_accuracy
 from flcav.fusion.tracks import LEAST_SCORE
 from flcav.geometry import Boxes, pose
@@ -53,7 +53,7 @@ class HeardMessages:
 
 
 def hear_messages(split: Frames, i: int, how: MessageSettings, network: Second) -> HeardMessages:
-    """Return the vehicles that announce themselves to the vehicle of frame `i` within `AROUND_S` of it.
+    """Return the vehicles that announce themselves to the vehicle of frame `i` within `HEARD_S` of it.
 
     Those that record at the same spin also send what `network` detects in their sweeps, if they are asked to. Raises
     `InputError` for a dataset without its town's traffic, whose vehicles send the messages.
@@ -61,8 +61,10 @@ def hear_messages(split: Frames, i: int, how: MessageSettings, network: Second) 
     data, key, classes = split.data, split.data.keys[i], network.config.classes
     town, walls = _raise_town(data, how.radio.environment)
     trace, messages = _send(data, key.scene, how.model_dump_json())
+    if key.agent not in trace.actor:
+        raise _lacking(data)
     drive = (str(data.manifest.recipe.get("seed")), key.scene)
-    near = messages[np.abs(messages.time_s - key.time_s) <= max(AROUND_S) + SLACK_S]
+    near = messages[np.abs(messages.time_s - key.time_s) <= HEARD_S + SLACK_S]
     heard = near[find_received(near, trace, key.agent, walls, how, *drive, str(key.index))]
     reports, sizes = list[BoxReport](), list[int]()
     for number in data.select(scenes=[key.scene], spins=[key.index]) if how.perceived else ():
