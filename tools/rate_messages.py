@@ -47,6 +47,7 @@ Row = tuple[str, str, str]
 
 
 def main() -> None:
+    """Label the frames of a run in each way, and print the table of their rates."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("run", type=Path, metavar="RUN")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="label every Nth frame alone")
