@@ -18,7 +18,8 @@ from flcav.network.awareness import ELLIPSE, AwarenessMessages
 AGENT = "messages"  # name of the report of announced vehicles
 HEARD_S = 1.0  # time before and after a frame within which messages count
 HEIGHT_M = 1.55  # of an announced vehicle, until returns tell: a message has none
-DEVIATION = np.array((0.0, 0.0, 0.2, 0.1, 0.1, 0.2, 0.03))  # of an announced box, beside that of its position
+DEVIATION = np.array((0.0, 0.0, 0.2, 0.1, 0.1, 0.2, 0.0))  # of an announced box, beside what is stated
+HEADED_RAD = 0.03  # standard deviation of a heading up to which it is kept
 MOTION_M = 0.1  # error of a position that is continued between messages
 SHIFT_M = 0.15  # step of the shifts that are tried
 SHELL_M, BESIDE_M = 0.25, 0.6  # depth of the flanks that returns lie on; reach beside the box where none should be
@@ -62,6 +63,7 @@ def place_senders(
         rows[number, :2] = weight @ center / weight.sum()
         rows[number, 3:] = (*size, HEIGHT_M, own.heading[near[0]])
         variance[number, :2] = own.deviation_m[near[0]] ** 2
+        variance[number, 6] = own.turn_rad[near[0]] ** 2
         velocity[number] = along[0] * own.speed[near[0]]
     rows[:, 2] = ground(rows[:, :2]) + HEIGHT_M / 2
     boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], label(senders), np.ones(len(senders)), variance)

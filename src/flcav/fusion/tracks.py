@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flcav.arrays import Array, Mask
-from flcav.fusion.announced import SURE_M, Announced, is_seen_through, keep_in_ellipse, shift_onto_returns
+from flcav.fusion.announced import HEADED_RAD, SURE_M, Announced, is_seen_through, keep_in_ellipse, shift_onto_returns
 from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
 from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
 
@@ -103,7 +103,7 @@ def track_objects(
             rows[number, 3:5] += 2 * deviation_m[number]
             continue
         own = announced.report.boxes[told[[number]]] if announced and told[number] >= 0 else None
-        rows[number] = fit_vehicle(rows[number], returns, origin, None if own is None else own.size[0, :2])
+        rows[number] = fit_vehicle(rows[number], returns, origin, own)
         if own is not None:
             rows[number, :2] = keep_in_ellipse(rows[number, :2], own)
         if own is not None or alone[number]:
@@ -158,13 +158,14 @@ def gather_returns(box: Array, velocity: Array, sweeps: Sequence[VehicleSweep], 
     return np.concatenate(returns), min(origins, key=lambda origin: float(np.hypot(*origin[:2])))
 
 
-def fit_vehicle(box: Array, returns: Array, origin: Array, known: Array | None = None) -> Array:
+def fit_vehicle(box: Array, returns: Array, origin: Array, known: Boxes | None = None) -> Array:
     """Return the box (7,) of a vehicle fitted to its returns (N, 3), see `gather_returns`; unchanged with too few.
 
     The height of the underside is kept. The heading is aligned with the edges of the returns. Length and width extend
     as far as there are returns without a gap. On the sides that face away from the `origin` (3,), where the LiDAR
     observes none, they are at least as detected, or as usual for the vehicle's height. The top is above the highest
-    return by half the spacing of the beams. `known`: length and width (2,) [m], where they are announced.
+    return by half the spacing of the beams. `known`: one announced box, whose length and width are kept,
+    and whose heading where it is stated to be accurate.
     """
     x, y, _, length, width, height, yaw = box
     along = heading_vectors(yaw)
@@ -173,7 +174,8 @@ def fit_vehicle(box: Array, returns: Array, origin: Array, known: Array | None =
     core = _in_core(plane, box)
     if core.sum() < LEAST_RETURNS:
         return box
-    if core.sum() >= TURNED_RETURNS:
+    headed = known is not None and known.variance is not None and known.variance[0, 6] <= HEADED_RAD**2
+    if core.sum() >= TURNED_RETURNS and not headed:
         turned = heading_vectors(_fit_turn(plane[core]))
         axes = np.array([turned, (-turned[1], turned[0])]) @ axes
         plane = returns[:, :2] @ axes.T
@@ -194,7 +196,7 @@ def fit_vehicle(box: Array, returns: Array, origin: Array, known: Array | None =
     seen_from = axes @ origin[:2]
     if high[0] - low[0] < length or abs(seen_from[1]) < abs(seen_from[0]):  # unless the whole flank is observed
         length = max(length, LENGTH_M[0] + LENGTH_M[1] * height)
-    size = np.maximum((length, width), high - low) if known is None else known
+    size = np.maximum((length, width), high - low) if known is None else known.size[0, :2]
     outside = np.abs(seen_from) > np.array((length, width)) / 2
     # The observed edge stays: the box grows away from a LiDAR outside of it, else towards the detected centre.
     middle -= np.sign(np.where(outside, seen_from, middle)) * (size - (high - low)) / 2

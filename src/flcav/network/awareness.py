@@ -39,6 +39,7 @@ WHITE = 0.2  # share of the position's standard deviation that is drawn for each
 SPEED_MPS = 0.1  # standard deviation of announced speeds
 POSITION_M = 0.01  # unit of latitude and longitude, 0.1 microdegree, rounded
 ELLIPSE = math.sqrt(-2 * math.log(0.05))  # semi-axis of the 95 % ellipse of equal deviations, in standard deviations
+WITHIN = 1.96  # half of the 95 % interval of a normal number, in standard deviations
 SLOT_S = 0.001  # time on the air in which a message is sent over the whole band, else it is not received
 
 LIGHT_S, CERTIFICATE_S = 0.5, 1.0  # least time between low-frequency containers, and between certificates
@@ -108,6 +109,7 @@ class AwarenessMessages:
     front: Array  # (N, 2) middle of the vehicle's front [m, world]
     deviation_m: Array  # (N,) standard deviation along each axis, by the stated ellipse
     heading: Array  # (N,) [rad]
+    turn_rad: Array  # (N,) standard deviation of the heading, by its stated confidence of 95 %
     speed: Array  # (N,) [m/s]
     size: Array  # (N, 2) length and width [m]
     bytes: Ints  # (N,) with security and transport
@@ -133,17 +135,18 @@ def draw_connected(trace: Trace, share: float, *names: str) -> Ints:
 def send_messages(trace: Trace, senders: Sequence[int] | Ints, how: MessageSettings, *names: str) -> AwarenessMessages:
     """Return all messages of the `senders`, actors of a trace; `names` name the random streams of their errors."""
     rows = [message for sender in senders for message in _messages_of(trace, int(sender), how, names)]
-    told = np.array(rows, dtype=np.float64).reshape(-1, 10)
-    numbers = told[:, (0, 9)].astype(np.int64)
-    deviation_m, heading, speed = told[:, 4:7].T
-    front, size = told[:, 2:4], told[:, 7:9]
-    return AwarenessMessages(numbers[:, 0], told[:, 1], front, deviation_m, heading, speed, size, numbers[:, 1])
+    told = np.array(rows, dtype=np.float64).reshape(-1, 11)
+    numbers = told[:, (0, 10)].astype(np.int64)
+    deviation_m, heading, turn_rad, speed = told[:, 4:8].T
+    front, size, count = told[:, 2:4], told[:, 8:10], numbers[:, 1]
+    return AwarenessMessages(numbers[:, 0], told[:, 1], front, deviation_m, heading, turn_rad, speed, size, count)
 
 
 def _messages_of(trace: Trace, sender: int, how: MessageSettings, names: Sequence[str]) -> Iterator[tuple[float, ...]]:
-    """Yield the ten numbers of each message of a sender, in the order of the fields of `AwarenessMessages`."""
+    """Yield the eleven numbers of each message of a sender, in the order of the fields of `AwarenessMessages`."""
     name = str(trace.actor[sender])
     rng, bias, stated_m = stream(0, "announced", *names, name), draw_bias(how, *names, name), state_deviation(how)
+    turn_rad = np.radians(min(max(math.ceil(10 * WITHIN * how.heading_deg), 1), 125) / 10 / WITHIN)
     size = np.ceil(trace.size[sender, :2] * 10 - 1e-6) / 10
     for times_s, place, yaw, speed in _pieces(trace, sender):
         sent = find_sending_times(times_s, place, yaw, speed, int(rng.integers(round(LONGEST_S / STEP_S))))
@@ -157,7 +160,7 @@ def _messages_of(trace: Trace, sender: int, how: MessageSettings, names: Sequenc
             fast = max(speed[row] + SPEED_MPS * rng.standard_normal(), 0.0)
             yield (
                 *(sender, times_s[row], *np.round(front / POSITION_M) * POSITION_M, stated_m),
-                *(np.radians(round(told * 10) / 10), round(min(fast, 163.82) * 100) / 100, *size),
+                *(np.radians(round(told * 10) / 10), turn_rad, round(min(fast, 163.82) * 100) / 100, *size),
                 message_bytes(light=bool(light), certified=bool(certified)),
             )
 

@@ -34,10 +34,9 @@ def cars(senders):
 def messages(*rows):
     """Return messages of sender, time [s], front x, y [m], deviation [m], heading [rad] and speed [m/s]."""
     sender, time_s, x, y, deviation_m, heading, speed = np.array(rows, dtype=np.float64).T
-    size = np.tile((4.7, 1.9), (len(rows), 1))
-    return AwarenessMessages(
-        sender.astype(int), time_s, np.c_[x, y], deviation_m, heading, speed, size, np.full(len(rows), 180)
-    )
+    size, turn_rad = np.tile((4.7, 1.9), (len(rows), 1)), np.full(len(rows), 0.01)
+    about = (deviation_m, heading, turn_rad, speed, size, np.full(len(rows), 180))
+    return AwarenessMessages(sender.astype(int), time_s, np.c_[x, y], *about)
 
 
 def moved(box, x, y):

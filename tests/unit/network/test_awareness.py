@@ -86,6 +86,7 @@ def test_position_errors_are_those_of_the_drive_and_stated() -> None:
     assert mean.std() == pytest.approx(1.5 * np.sqrt(1 - 0.04), rel=0.15)
     assert within.std() == pytest.approx(0.3, rel=0.15)
     np.testing.assert_allclose(messages.deviation_m, 1.5, rtol=0.01)
+    np.testing.assert_allclose(np.degrees(messages.turn_rad), 0.5, atol=0.06)  # rounded up to tenths of a degree
     inside = (off**2).sum(axis=1) <= (ELLIPSE * 1.5) ** 2
     assert inside.mean() == pytest.approx(0.95, abs=0.05)
 
