@@ -206,6 +206,18 @@ def test_vehicles_label_by_tracks_of_sweeps_that_are_recorded_for_them(
     assert len({point.ap50 for points in curves.values() for point in points[:1]}) == 1  # all begin with one network
 
 
+def test_what_vehicles_hear_is_in_the_ledger_of_their_labels(tmp_path: Path) -> None:
+    recipe = shrunk("messages")
+    arms = {name: recipe.arms[name] for name in ("tracks", "messages")}
+    result = run(recipe.model_copy(update={"arms": arms}), tmp_path)
+    heard = {}
+    for arm in (MAIN, *arms):
+        entries = Ledger.load(tmp_path / "work" / result.steps.edge(arm, "grid", "objects") / LEDGER).entries
+        heard[arm] = [(entry.direction, entry.client) for entry in entries if entry.link == "sidelink" and entry.bytes]
+    assert heard == {MAIN: [("down", "grid/cav0")], "tracks": [], "messages": [("down", "grid/cav0")]}
+    assert all(use.used_mb <= use.budget_mb for use in result.arms[MAIN].links.values())
+
+
 def test_three_tasks_share_a_plan_and_a_ledger(three_tasks: tuple[Path, Run]) -> None:
     recipe = shrunk("three_tasks")
     folder, result = three_tasks

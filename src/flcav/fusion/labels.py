@@ -61,10 +61,7 @@ def label_sample(
     for view in views:
         looked |= view.at(view.ground, cells_world) | view.at(view.occupied, cells_world)
     remaining = detections[~_contradicted(detections, roadside, cells, looked)]
-    above = points[:, 2] + height
-    if relief is not None:
-        above = relief.above(transform_points(world_from_lidar, points[:, :3].astype(np.float64)))
-    known = _free_ground(points, above, cells) | looked
+    known = find_free_ground(frame, points, cells, lidar, relief) | looked
     boxes = concatenate([road[targets], remaining])
     exact = np.arange(len(boxes)) < targets.sum() if views else None
     sample = Sample(points, boxes, road[ignored], cells[known].astype(np.float32), exact)
@@ -78,12 +75,14 @@ def label_by_tracks(
     views: Sequence[RoadView],
     config: SecondConfig,
     lidar: str = "lidar",
+    free: Array | None = None,
 ) -> Sample:
     """Return a training sample of a vehicle's `frame`, labelled by the tracks of its drive; network's frame.
 
     Targets are the tracks (LiDAR frame) that score `threshold` or more and from which this sweep has returns; others,
     and boxes of lookalike classes in the `views` of roadside sensors, are ignored in the loss. Elsewhere is background,
-    since tracks of low score are kept, too.
+    since tracks of low score are kept, too; or, where the tracks are not of all objects, only the cells whose centres
+    (K, 2) [m] `free` gives, LiDAR frame.
     """
     assert tracks.score is not None
     points = crop_to_range(frame.lidar[lidar], config)
@@ -91,7 +90,8 @@ def label_by_tracks(
     targets = (tracks.score >= threshold) & (points_in_boxes(points, tracks, margin_m=0.1).sum(axis=1) > 0)
     boxes = replace(tracks, score=None, variance=None)
     ignored = concatenate([boxes[~targets], roadside[is_lookalike(roadside.label, config.classes)]])
-    return move_sample(Sample(points, boxes[targets], ignored), network_from_lidar(frame, config, lidar))
+    background = None if free is None else free.astype(np.float32)
+    return move_sample(Sample(points, boxes[targets], ignored, background), network_from_lidar(frame, config, lidar))
 
 
 def _distinct(boxes: Boxes) -> Ints:
@@ -126,12 +126,15 @@ def _contradicted(detections: Boxes, roadside: Boxes, cells: NDArray, looked: Ma
     return seen | (offset < roadside.size[None, :, 0] / 2).any(axis=1)
 
 
-def _free_ground(points: Array32, above: NDArray, cells: Array) -> Mask:
+def find_free_ground(frame: Frame, points: Array32, cells: Array, lidar: str, relief: Relief | None) -> Mask:
     """Return (K,) whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
-    `points` (N, 4) and the centres `cells` (K, 2) are in the LiDAR frame; `above` (N,) are the points' heights over the
-    ground [m].
+    `points` (N, 4) of the sweep and the centres `cells` (K, 2) are in the LiDAR frame. `relief`: as of `label_sample`.
     """
+    above = points[:, 2] + float(frame.agent_from_sensor[lidar][2, 3])
+    if relief is not None:
+        world_from_lidar = frame.world_from_sensor(lidar)
+        above = relief.above(transform_points(world_from_lidar, points[:, :3].astype(np.float64)))
     origin = cells[0] - CELL_M / 2
     shape = np.round((cells[-1] - cells[0]) / CELL_M).astype(int) + 1
     index = np.floor((points[:, :2] - origin) / CELL_M).astype(np.int64)

@@ -13,9 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.arrays import Array
+from flcav.arrays import Array, Mask
+from flcav.fusion.announced import HEADED_RAD, SURE_M, Announced, is_seen_through, keep_in_ellipse, shift_onto_returns
 from flcav.fusion.average import BoxReport, RoadAverage, average_boxes
-from flcav.geometry import Boxes, concatenate, heading_vectors
+from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
 
 LEAST_SCORE = 0.1  # of a track
 VEHICLE_M = 2.0  # least length of an object that is fitted: pedestrians and two-wheelers are not rigid
@@ -25,6 +26,7 @@ ABOVE_M, BELOW_M = 0.25, 3.6  # heights above an object's underside between whic
 REACH_M = 5.0  # from an object's centre to its farthest return
 MARGIN_M = 0.3  # around a detected box, within which returns belong to the object
 LEAST_RETURNS = 8  # of an object that is fitted
+LEAST_SEEN = 3  # returns of an announced object in the frame that is labelled
 TURN_RAD, TURNS = 0.16, 17  # headings that are tried: greatest deviation from the detected one, and their number
 TURNED_RETURNS = 25  # of an object whose heading is fitted
 BIN_M, BIN_RETURNS = 0.1, 2  # bins of the histogram along an axis, and least returns in an occupied one
@@ -48,7 +50,11 @@ class VehicleSweep:
 
 
 def track_objects(
-    sweeps: Sequence[VehicleSweep], at_s: float, others: Sequence[BoxReport] = (), least: float = 0.0
+    sweeps: Sequence[VehicleSweep],
+    at_s: float,
+    others: Sequence[BoxReport] = (),
+    least: float = 0.0,
+    announced: Announced | None = None,
 ) -> Boxes:
     """Return the objects at `at_s` [s] that a vehicle detects in the sweeps around it, world frame.
 
@@ -57,8 +63,14 @@ def track_objects(
     the vehicle's detections where there are any, since road sensors measure it less well from above. Objects that score
     less than `least` are left out. Vehicles are fitted to their returns, see `fit_vehicle`; trucks and buses then have
     the score 0.
+
+    Boxes of `announced` vehicles join the others, and so do those that these perceive; length and width of the former
+    are known. One that neither this vehicle nor `others` report is moved onto the returns near it; it has the score 0
+    where there are too few of them to place it, and so has any announced one that is hidden at `at_s`. It is left out
+    where the sweeps see through it, or where it comes to lie on another object.
     """
-    average = average_boxes([*(BoxReport("vehicle", sweep.time_s, sweep.boxes) for sweep in sweeps), *others], at_s)
+    seen_by = [*(BoxReport("vehicle", sweep.time_s, sweep.boxes) for sweep in sweeps), *others]
+    average = average_boxes([*seen_by, *((announced.report, *announced.perceived) if announced else ())], at_s)
     assert average.boxes.score is not None
     kept = np.flatnonzero(average.boxes.score >= least)
     boxes = average.boxes[kept]
@@ -68,12 +80,52 @@ def track_objects(
     feet = _average_feet(sweeps, average)[kept]
     seen = np.isfinite(feet)
     rows[seen, 2] = feet[seen] + rows[seen, 5] / 2
+    alone = ~np.isin(kept, np.concatenate([np.zeros(0, np.int64), *average.member[: len(seen_by)]]))
+    told = np.full(len(average.boxes), -1)  # row of the announced vehicle
+    if announced:
+        told[average.member[len(seen_by)]] = np.arange(len(announced.report.boxes))
+        told = told[kept]
+        velocity[alone & (told >= 0)] = announced.velocity[told[alone & (told >= 0)]]
+    lost = np.zeros(len(rows), np.bool_)
+    assert boxes.variance is not None
+    deviation_m = np.sqrt(boxes.variance[:, 0])
+    current = [min(sweeps, key=lambda sweep: abs(sweep.time_s - at_s))]
     for number in np.flatnonzero(boxes.size[:, 0] >= VEHICLE_M):
+        if alone[number]:
+            near, _ = gather_returns(rows[number], velocity[number], sweeps, at_s)
+            rows[number, :2] += shift_onto_returns(rows[number], near, deviation_m[number])
+            around = _move_along(velocity[number], sweeps, at_s)
+            lost[number] |= is_seen_through(rows[number], deviation_m[number], *around)
+            lost[number] |= _overlaps(rows[number], rows[~alone])
         returns, origin = gather_returns(rows[number], velocity[number], sweeps, at_s)
-        rows[number] = fit_vehicle(rows[number], returns, origin)
+        if alone[number] and deviation_m[number] > SURE_M and count_core(rows[number], returns) < LEAST_RETURNS:
+            score[number] = 0.0
+            rows[number, 3:5] += 2 * deviation_m[number]
+            continue
+        own = announced.report.boxes[told[[number]]] if announced and told[number] >= 0 else None
+        rows[number] = fit_vehicle(rows[number], returns, origin, own)
+        if own is not None:
+            rows[number, :2] = keep_in_ellipse(rows[number, :2], own)
+        if own is not None or alone[number]:
+            returns, _ = gather_returns(rows[number], velocity[number], current, at_s)
+            score[number] *= count_core(rows[number], returns) >= LEAST_SEEN
         if rows[number, 3] > LONGEST_M:
             score[number] = 0.0
-    return Boxes.from_array(rows, boxes.label, score)
+    return Boxes.from_array(rows, boxes.label, score)[~lost]
+
+
+def _overlaps(box: Array, others: Array) -> bool:
+    """Return whether the centre of a box (7,) lies within one of the others (N, 7), in bird's-eye view."""
+    place = np.append(box[:2], 0)[None]
+    return bool(points_in_boxes(place, Boxes.from_array(others * (1, 1, 0, 1, 1, 1, 1), "")).any())
+
+
+def _move_along(velocity: Array, sweeps: Sequence[VehicleSweep], at_s: float) -> tuple[list[Array], list[Array]]:
+    """Return returns (N, 3) and origin (3,) of each sweep, moved with an object to where it is at `at_s`."""
+    moves = bool(np.hypot(*velocity) >= STANDING_MPS)
+    near = [sweep for sweep in sweeps if not moves or abs(sweep.time_s - at_s) <= MOVING_S]
+    steps = [np.append(velocity * (sweep.time_s - at_s) * moves, 0) for sweep in near]
+    return [each.points - step for each, step in zip(near, steps)], [e.origin - s for e, s in zip(near, steps)]
 
 
 def _average_feet(sweeps: Sequence[VehicleSweep], average: RoadAverage) -> Array:
@@ -106,22 +158,24 @@ def gather_returns(box: Array, velocity: Array, sweeps: Sequence[VehicleSweep], 
     return np.concatenate(returns), min(origins, key=lambda origin: float(np.hypot(*origin[:2])))
 
 
-def fit_vehicle(box: Array, returns: Array, origin: Array) -> Array:
+def fit_vehicle(box: Array, returns: Array, origin: Array, known: Boxes | None = None) -> Array:
     """Return the box (7,) of a vehicle fitted to its returns (N, 3), see `gather_returns`; unchanged with too few.
 
     The height of the underside is kept. The heading is aligned with the edges of the returns. Length and width extend
     as far as there are returns without a gap. On the sides that face away from the `origin` (3,), where the LiDAR
     observes none, they are at least as detected, or as usual for the vehicle's height. The top is above the highest
-    return by half the spacing of the beams.
+    return by half the spacing of the beams. `known`: one announced box, whose length and width are kept,
+    and whose heading where it is stated to be accurate.
     """
     x, y, _, length, width, height, yaw = box
     along = heading_vectors(yaw)
     axes = np.array([along, (-along[1], along[0])])
     plane = returns[:, :2] @ axes.T
-    core = (np.abs(plane) < np.array((length, width)) / 2 + MARGIN_M).all(1)
+    core = _in_core(plane, box)
     if core.sum() < LEAST_RETURNS:
         return box
-    if core.sum() >= TURNED_RETURNS:
+    headed = known is not None and known.variance is not None and known.variance[0, 6] <= HEADED_RAD**2
+    if core.sum() >= TURNED_RETURNS and not headed:
         turned = heading_vectors(_fit_turn(plane[core]))
         axes = np.array([turned, (-turned[1], turned[0])]) @ axes
         plane = returns[:, :2] @ axes.T
@@ -142,12 +196,22 @@ def fit_vehicle(box: Array, returns: Array, origin: Array) -> Array:
     seen_from = axes @ origin[:2]
     if high[0] - low[0] < length or abs(seen_from[1]) < abs(seen_from[0]):  # unless the whole flank is observed
         length = max(length, LENGTH_M[0] + LENGTH_M[1] * height)
-    size = np.maximum((length, width), high - low)
+    size = np.maximum((length, width), high - low) if known is None else known.size[0, :2]
     outside = np.abs(seen_from) > np.array((length, width)) / 2
     # The observed edge stays: the box grows away from a LiDAR outside of it, else towards the detected centre.
     middle -= np.sign(np.where(outside, seen_from, middle)) * (size - (high - low)) / 2
     x, y = (x, y) + middle @ axes
     return np.array((x, y, box[2] - box[5] / 2 + height / 2, *size, height, np.arctan2(axes[0, 1], axes[0, 0])))
+
+
+def count_core(box: Array, returns: Array) -> int:
+    """Return the number of returns (N, 3), see `gather_returns`, in a box (7,) or within `MARGIN_M` of it."""
+    along = heading_vectors(box[6])
+    return int(_in_core(returns[:, :2] @ np.array([along, (-along[1], along[0])]).T, box).sum())
+
+
+def _in_core(plane: Array, box: Array) -> Mask:
+    return np.asarray((np.abs(plane) < box[3:5] / 2 + MARGIN_M).all(1))
 
 
 def _fit_turn(plane: Array) -> float:

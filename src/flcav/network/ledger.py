@@ -19,10 +19,10 @@ from flcav.arrays import Bytes, Words
 from flcav.config import InputError
 from flcav.storage.files import read_parquet, write_parquet
 
-Link = Literal["wireless", "wireline"]
+Link = Literal["wireless", "wireline", "sidelink"]
 Direction = Literal["up", "down"]
 
-LINKS: tuple[Link, ...] = get_args(Link)
+LINKS: tuple[Link, ...] = ("wireless", "wireline")  # with a budget; from vehicle to vehicle there is none
 BYTES_PER_MB = 1_000_000
 
 
@@ -58,8 +58,8 @@ class LedgerEntry:
     bytes: int  # serialised size
 
     def __post_init__(self) -> None:
-        if self.link not in LINKS:
-            raise ValueError(f"LedgerEntry.link = {self.link!r}, expected one of {LINKS}")
+        if self.link not in get_args(Link):
+            raise ValueError(f"LedgerEntry.link = {self.link!r}, expected one of {get_args(Link)}")
         if self.direction not in get_args(Direction):
             raise ValueError(f"LedgerEntry.direction = {self.direction!r}, expected one of {get_args(Direction)}")
         if self.bytes < 0:
@@ -102,7 +102,7 @@ class Ledger:
 
     def check(self, entry: LedgerEntry) -> None:
         """Raise `BudgetExceeded` if `entry` is an uplink message over the budget."""
-        if entry.direction == "up":
+        if entry.direction == "up" and entry.link in LINKS:
             used = self._up[entry.link]
             budget = self.budget.bytes_on(entry.link)
             if used + entry.bytes > budget:
@@ -115,7 +115,7 @@ class Ledger:
     def enter(self, entry: LedgerEntry) -> None:
         """Append `entry`; raises `BudgetExceeded` and appends nothing if it is an uplink message over the budget."""
         self.check(entry)
-        if entry.direction == "up":
+        if entry.direction == "up" and entry.link in LINKS:
             self._up[entry.link] += entry.bytes
         self._entries.append(entry)
 

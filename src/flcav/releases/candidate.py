@@ -20,6 +20,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from flcav.config import Config, InputError, Json, check_is_file, parse_config
+from flcav.network.ledger import Link
 from flcav.releases.keys import PublicKey, read_private_key
 from flcav.storage.files import sha256, write_bytes
 
@@ -57,7 +58,7 @@ class LedgerSum(Config):
     """The bytes of a candidate's training in one stage, on one link, in one direction."""
 
     stage: str
-    link: Literal["wireless", "wireline"]
+    link: Link
     direction: Literal["up", "down"]
     bytes: int = Field(ge=0)
 

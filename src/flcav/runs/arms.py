@@ -1,6 +1,6 @@
 """Arms of a run: their complete settings, and the names of their steps, which equal arms share."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -13,6 +13,7 @@ from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
+from flcav.network.awareness import MessageSettings
 from flcav.perception.client import Imitates
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
@@ -53,11 +54,12 @@ LEARNED = (  # those that decide a federation
     "repeat",
     "placement",
     "labels",
+    "messages",
     "fault",
     "distillation",
     "federation",
 )
-TRACKED = (*PRETRAINED, "placement", "labels")  # those that decide the vehicles' tracks
+TRACKED = (*PRETRAINED, "placement", "labels", "messages")  # those that decide the vehicles' tracks
 OF_EDGE = (*LEARNED[:-1], "edge_federation")  # those that decide a federation without the cloud
 
 
@@ -80,6 +82,7 @@ class Setting:
     calls: CalledNumbers | None  # vehicles that the plan calls to a group; None: it does not decide
     placement: PlacementSettings
     labels: Mapping[str, str]  # kind of labels, by task
+    messages: MessageSettings  # where labels come from them
     fault: Fault | None  # of the labels, the rest of which are ground truth
     distillation: Distillation  # where the labels are the road average
     federation: Federation
@@ -144,6 +147,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         calls,
         PlacementSettings.model_validate(recipe.placement.model_dump() | dict(arm.placement)),
         dict(labels) | dict(arm.labels),
+        MessageSettings.model_validate(recipe.messages.model_dump() | dict(arm.messages)),
         arm.fault,
         next((resolve(recipe, arm) for resolve in load_all(AVERAGES)), Distillation()),
         federation,
@@ -196,6 +200,7 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             "horizon_s: every task has a fixed plan, so that nothing is planned by time; give a task a 'history' in "
             "place of its 'plan', or leave horizon_s out and have rounds timed by 'federation.network'"
         )
+    _check_messages(recipe, settings)
     for setting in settings:
         try:
             _check_federation(recipe, setting)
@@ -203,6 +208,16 @@ def check_federations(recipe: RunRecipe, settings: Iterable[Setting]) -> None:
             if setting.name == MAIN:
                 raise
             raise InputError(f"arm '{setting.name}': {error}") from None
+
+
+def _check_messages(recipe: RunRecipe, settings: Sequence[Setting]) -> None:
+    """Raise `InputError` where messages are described and no labels come from them."""
+    hear = {each.name for each in settings if any(LABEL_SOURCES[kind].heard for kind in each.labels.values())}
+    given = [f"arms.{name}.messages" for name, arm in recipe.arms.items() if arm.messages and name not in hear]
+    if not hear and recipe.messages.model_dump() != MessageSettings().model_dump():
+        given.append("messages")
+    if given:
+        raise InputError(f"{given[0]}: its labels are without messages; choose 'tracks+messages' or leave it out")
 
 
 def _check_federation(recipe: RunRecipe, setting: Setting) -> None:

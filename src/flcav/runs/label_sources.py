@@ -17,6 +17,7 @@ class LabelSource:
     from_poles: bool = False  # boxes of roadside sensors
     trained: bool = False  # whether these boxes are those of a trained detector instead of an ideal one
     tracked: bool = False  # a vehicle's tracks through the sweeps that it recorded around its frames
+    heard: bool = False  # vehicles that announce themselves by radio
     averaged: bool = False  # the road average of a window's poles and vehicles, renewed before the rounds of stage II
     caveat: str = ""  # stated with every result that depends on them
 
@@ -26,9 +27,14 @@ class LabelSource:
         return self.from_poles or self.tracked
 
     @property
+    def measured(self) -> bool:
+        """Whether the labels come from what vehicles measure or hear, and not from ground truth."""
+        return self.from_detections or self.heard
+
+    @property
     def bound(self) -> bool:
         """Whether the labels are, or depend on, ground truth: figures with them are upper bounds."""
-        return not self.from_detections or (self.from_poles and not self.trained)
+        return not self.measured or (self.from_poles and not self.trained)
 
 
 LABEL_SOURCES: Mapping[str, LabelSource] = {
@@ -37,6 +43,11 @@ LABEL_SOURCES: Mapping[str, LabelSource] = {
     "tracks": LabelSource(from_detections=True, tracked=True),
     "road+tracks": LabelSource(
         from_detections=True, from_poles=True, trained=True, tracked=True, caveat="trained road detector"
+    ),
+    "messages": LabelSource(tracked=True, heard=True),
+    "tracks+messages": LabelSource(from_detections=True, tracked=True, heard=True),
+    "road+tracks+messages": LabelSource(
+        from_detections=True, from_poles=True, trained=True, tracked=True, heard=True, caveat="trained road detector"
     ),
     "ideal-road": LabelSource(from_detections=True, from_poles=True, caveat="ideal road detector, upper bound"),
     "annotated": LabelSource(caveat="ground truth as labels, upper bound"),

@@ -6,12 +6,12 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from flcav.config import InputError
+from flcav.config import InputError, parse_config
 from flcav.fusion.distillation import Distillation
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
 from flcav.runs.analysis.caveats import PLACED_BARE, list_caveats
-from flcav.runs.arms import resolve_settings
+from flcav.runs.arms import Names, check_federations, resolve_settings
 from flcav.runs.extras.distillation import sizes
 from flcav.runs.extras.distillation.sizes import measure_messages
 from flcav.runs.frames import Frames
@@ -66,7 +66,10 @@ def test_groups_are_the_vehicles_within_range_of_a_sensor() -> None:
 
 
 def test_every_kind_that_nobody_could_have_says_that_it_is_an_upper_bound() -> None:
-    measured = ("own-detections", "road", "road-average", "tracks", "road+tracks")
+    heard = ("messages", "tracks+messages", "road+tracks+messages")
+    measured = ("own-detections", "road", "road-average", "tracks", "road+tracks", *heard)
+    assert heard == tuple(name for name, kind in LABEL_SOURCES.items() if kind.heard)
+    assert not any(LABEL_SOURCES[name].bound for name in measured)
     assert all(("upper bound" in kind.caveat) != (name in measured) for name, kind in LABEL_SOURCES.items())
     assert LABEL_SOURCES["road"].caveat != LABEL_SOURCES["ideal-road"].caveat  # reports show which it was
     assert choose_labels("objects", None) == "road"
@@ -131,3 +134,52 @@ def test_a_vehicle_s_messages_are_priced_for_all_spins_of_its_windows(monkeypatc
     assert priced_mb(recorded=False, window_s=0.5) == pytest.approx(3 * 20 * 1e-3 / 2)
     assert priced_mb(recorded=True, window_s=0.0) == pytest.approx(20 * 1e-3 / 2)
     assert priced_mb(recorded=True, window_s=0.5) == pytest.approx(2 * 20 * 1e-3 / 2)  # 4 frames told of for 2
+
+
+def messages_recipe(labels: str, messages: Any = None, **arms: Any) -> RunRecipe:
+    fields = {
+        "tasks": {"objects": {"labels": labels, "plan": {"samples": 4, "edge_rounds": 1, "cloud_rounds": 0}}},
+        "regions": {"suburb": {"role": "pretrain"}, "grid": {"role": "federate"}},
+        "budgets_mb": {"wireless": 100, "wireline": 80},
+        "arms": {name: {"stages": ["edge"], **arm} for name, arm in arms.items()},
+    }
+    return parse_config(RunRecipe, fields | ({} if messages is None else {"messages": messages}), "run.yaml")
+
+
+@pytest.mark.parametrize(
+    ("messages", "arm", "said"),
+    [
+        ({"share": 1.5}, {}, r"^run.yaml: field 'messages.share' = 1.5: "),
+        ({"share": -0.1}, {}, r"^run.yaml: field 'messages.share' = -0.1: "),
+        ({"position_m": -0.5}, {}, r"^run.yaml: field 'messages.position_m' = -0.5: "),
+        ({"lost": 2}, {}, r"^run.yaml: field 'messages.lost' = 2: "),
+        (None, {"messages": {"share": 7}}, r"arms.other.messages: field 'share' = 7: "),
+        (None, {"messages": {"shares": 0.7}}, r"arms.other.messages: .*shares"),
+    ],
+)
+def test_impossible_messages_are_refused_in_a_sentence(messages: Any, arm: Any, said: str) -> None:
+    with pytest.raises(InputError, match=said):
+        messages_recipe("tracks+messages", messages, other=arm)
+
+
+def test_messages_that_no_label_comes_from_are_refused() -> None:
+    def check(recipe: RunRecipe) -> None:
+        check_federations(recipe, resolve_settings(recipe).values())
+
+    check(messages_recipe("tracks", {"share": 0.6}, other={"labels": {"objects": "messages"}}))
+    check(messages_recipe("messages", None, other={"messages": {"share": 0.6}}, bare={"labels": {"objects": "tracks"}}))
+    check(RunRecipe.model_validate(messages_recipe("tracks").model_dump()))  # with all fields, as results have it
+    with pytest.raises(InputError, match=r"^messages: its labels are without messages; choose 'tracks\+messages'"):
+        check(messages_recipe("tracks", {"share": 0.6}))
+    with pytest.raises(InputError, match=r"^arms.other.messages: its labels are without messages"):
+        check(messages_recipe("messages", None, other={"messages": {"share": 1}, "labels": {"objects": "tracks"}}))
+
+
+def test_arms_with_other_messages_have_labels_of_their_own() -> None:
+    recipe = messages_recipe("tracks+messages", None, same={}, more={"messages": {"share": 0.6}})
+    names = Names(resolve_settings(recipe))
+    for step in (names.tracks, names.edge):
+        assert step("main", "grid", "objects") == step("same", "grid", "objects") != step("more", "grid", "objects")
+    assert names.pretrain("more", "objects") == names.pretrain("main", "objects")
+    told = {name: each.messages.share for name, each in resolve_settings(recipe).items()}
+    assert told == {"main": 0.3, "same": 0.3, "more": 0.6}

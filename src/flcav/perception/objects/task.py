@@ -139,7 +139,10 @@ class ObjectsTask(ObjectsOutcomes):
     configurations = CONFIGURATIONS
     practice = Practice(batch=2, learning_rate=2e-3)
     recording: Mapping[str, Json] = {}
-    labels = ("road", "ideal-road", "road-average", "own-detections", "tracks", "road+tracks", "annotated")
+    labels = (
+        *("road", "ideal-road", "road-average", "own-detections", "tracks", "road+tracks"),
+        *("messages", "tracks+messages", "road+tracks+messages", "annotated"),
+    )
     threshold = THRESHOLD
 
     def __init__(self) -> None:

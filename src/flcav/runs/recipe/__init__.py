@@ -16,6 +16,7 @@ from flcav.federation.local_steps import MEASURED, fit_local_steps
 from flcav.federation.rules import Rules
 from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.interface.notebook import Displayed
+from flcav.network.awareness import MessageSettings
 from flcav.network.clock.rounds import NetworkSettings
 from flcav.optimization.problem import Budgets
 from flcav.runs.recipe.splits import (
@@ -173,6 +174,7 @@ class _PlannedArm(Config):
     placement: Mapping[str, Any] = {}  # fields of `PlacementSettings` that differ from the run
     federation: Mapping[str, Any] = {}  # fields of `Federation` that differ from the run
     labels: Mapping[str, str] = {}  # kinds of labels that differ from the run, by task
+    messages: Mapping[str, Any] = {}  # fields of `MessageSettings` that differ from the run
     fault: Fault | None = None  # learn from ground truth with this one fault of the labels, which come from tracks
 
 
@@ -242,6 +244,7 @@ class _Drive(Config):
     navigation: PoseSource = (
         NavigationErrors()
     )  # errors of vehicles' poses and clocks, in labels of tracks and road sensors; or "estimated"
+    messages: MessageSettings = MessageSettings()  # by which vehicles announce themselves, of labels with messages
     recording: Recording = Recording()  # changes to how all regions are recorded
     arms: Mapping[Name, Arm] = {}  # arms of a comparison, by name
 
@@ -350,6 +353,7 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
         parts: list[tuple[type[Config], Config, str]] = [
             (PlacementSettings, self.placement, "placement"),
             (Federation, self.federation, "federation"),
+            (MessageSettings, self.messages, "messages"),
             *((Training, self.training_of(task), "training") for task in self.tasks),
         ]
         for model, given, part in parts:

@@ -44,6 +44,7 @@ class TrackedFrames(Saved):
     region: str
     frames: int
     tracks: int  # of all frames
+    messages: int = 0  # that vehicles heard around these frames
 
 
 @dataclass(frozen=True)

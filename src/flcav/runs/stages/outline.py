@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from flcav.config import InputError, shorten
-from flcav.dataset.layout import navigation_path, read_manifest
+from flcav.dataset.layout import navigation_path, read_manifest, trace_path
 from flcav.federation.strategies import sends_outputs
 from flcav.fusion.average import ESTIMATED, NavigationErrors
 from flcav.fusion.distillation import Distillation
@@ -60,6 +60,8 @@ class Outline:
         self.recorded = {name: self._count_frames(name) for name in self.federating if recipe.regions[name].data}
         for name in self.recorded if any(map(self.estimates, recipe.tasks)) else ():
             self._check_logs(recipe.regions[name])
+        for name in self.recorded if any(map(self.hears, recipe.tasks)) else ():
+            self._check_traffic(recipe.regions[name])
 
     def tested(self, arm: Setting) -> list[tuple[str, str, str]]:
         """Return stage, region and task of every test of an arm.
@@ -116,6 +118,10 @@ class Outline:
     def tracks(self, task: str) -> bool:
         """Return whether vehicles label frames of a task by tracks in any arm."""
         return any(LABEL_SOURCES[arm.labels[task]].tracked for arm in self.settings.values())
+
+    def hears(self, task: str) -> bool:
+        """Return whether labels of a task come from vehicles that announce themselves in any arm."""
+        return any(LABEL_SOURCES[arm.labels[task]].heard for arm in self.settings.values())
 
     def estimates(self, task: str) -> bool:
         """Return whether labels of a task are placed in vehicles' frames by estimated poses in any arm."""
@@ -200,6 +206,7 @@ class Outline:
             labels=arm.labels[task],
             fault=arm.fault,
             distillation=arm.distillation if LABEL_SOURCES[arm.labels[task]].averaged else None,
+            messages=arm.messages if LABEL_SOURCES[arm.labels[task]].heard else None,
             navigation=recipe.navigation if LABEL_SOURCES[arm.labels[task]].placed else NavigationErrors(),
             train_s=recipe.tasks[task].train_s if timed else 0.0,
             speeds=speeds if timed else {},
@@ -221,6 +228,16 @@ class Outline:
                 raise InputError(
                     f"{path}: navigation 'estimated' needs navigation logs, and '{scene}' has none; record with "
                     "'navigation_s', or state errors instead"
+                )
+
+    def _check_traffic(self, region: Region) -> None:
+        """Raise `InputError` where a scene of a region's training data has no traffic whose vehicles send messages."""
+        path = self.find_data(region, EDGE)
+        for scene in read_manifest(path).scenes:
+            if not (path / trace_path(scene)).is_file():
+                raise InputError(
+                    f"{path}: labels by messages need the traffic of a simulated town, and '{scene}' has none; take "
+                    "other labels"
                 )
 
     def _count_frames(self, region: str) -> dict[str, int]:

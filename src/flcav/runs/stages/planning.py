@@ -218,7 +218,8 @@ def replan_step(work: Work, settings: ReplanSettings) -> None:
     for task in problem.tasks:
         reached[task.name] = average_last([Watched.load(work.inputs[step]) for step in settings.watched[task.name]])
         for entry in read_entries(work, *settings.books[task.name]):
-            used[entry.link] += entry.bytes * (entry.direction == "up")  # budgets limit uplinks alone
+            if entry.link in used:  # budgets limit uplinks alone, and none of the sidelink
+                used[entry.link] += entry.bytes * (entry.direction == "up")
     used_mb = LinkMegabytes(*(used[link] / BYTES_PER_MB for link in LINKS))
     remake_plan(done, problem, settings.stage, reached, used_mb).save(work.folder)
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from flcav.dataset.ground import DatasetGround
 from flcav.federation.links.in_process import update_bytes
 from flcav.federation.rules import RegionalModels, Rules
 from flcav.federation.strategies import exchanges_more
@@ -14,7 +15,7 @@ from flcav.federation.trainable import Weights
 from flcav.federation.upload import encode_model
 from flcav.network.clock.records import save_rounds
 from flcav.network.clock.rounds import NetworkSettings
-from flcav.network.ledger import Ledger
+from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.perception.objects.distillation import ImitatingObjects
 from flcav.perception.weights import to_arrays
@@ -25,7 +26,7 @@ from flcav.runs.label_sources import LABEL_SOURCES, LabelSource
 from flcav.runs.labels.faults import give_fault, read_occlusion
 from flcav.runs.labels.pseudo_labels import annotated_samples, label_detected, label_frames, select_frames_near
 from flcav.runs.labels.quality import measure_labels
-from flcav.runs.labels.tracks import label_tracked, load_tracks
+from flcav.runs.labels.tracks import label_tracked, load_heard, load_tracks
 from flcav.runs.poles import find_sites
 from flcav.runs.registry import LABELLERS, LOSSES, load_all
 from flcav.runs.results.plans import Placed
@@ -105,7 +106,7 @@ def label_samples(
     kind = LABEL_SOURCES[settings.labels]
     frames = select_group(work, split, inputs)
     frozen = load_stage_network(task, work.inputs[inputs.pretrain])
-    if not kind.from_detections:
+    if not kind.measured:
         return LabelledSamples(annotated_samples(task, frozen.config, split, frames, inputs.region), ())
     poles = choose_poles(work, split, inputs, kind)
     pretrained = Pretrained.load(work.inputs[inputs.pretrain])
@@ -118,8 +119,14 @@ def label_samples(
     first = book if inputs.edge is None else None  # later labels are those of stage II
     where: Any = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
     if inputs.tracks is not None:
-        tracks = load_tracks(work.inputs[inputs.tracks])
-        samples = label_frames(label_tracked(tracks, threshold, frozen.config), *where)
+        tracks, ground = (
+            load_tracks(work.inputs[inputs.tracks]),
+            None if kind.from_detections else DatasetGround(split.data),
+        )
+        samples = label_frames(label_tracked(tracks, threshold, frozen.config, ground), *where)
+        for i, count in load_heard(work.inputs[inputs.tracks]).items() if first is not None else ():
+            client = f"{inputs.region}/{split.data.keys[i].agent}"
+            book.enter(LedgerEntry(stage, task.name, "sidelink", "down", 0, client, count))
         if settings.fault is not None:
             truth = annotated_samples(task, frozen.config, split, frames, inputs.region)
             hidden = read_occlusion(split, frames, inputs.region, frozen.config)

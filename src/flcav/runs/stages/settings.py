@@ -7,6 +7,7 @@ import numpy as np
 from flcav.config import Config
 from flcav.fusion.average import NavigationErrors, PoseSource
 from flcav.fusion.distillation import Distillation
+from flcav.network.awareness import MessageSettings
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.perception.tasks import task_named
 from flcav.runs.engine import Step, Work
@@ -71,6 +72,7 @@ class FederationSettings(StepSettings):
     labels: str  # kind of labels, see `LABEL_SOURCES`
     fault: Fault | None = None  # of the labels, the rest of which are ground truth
     distillation: Distillation | None = None  # of the labels "road-average"
+    messages: MessageSettings | None = None  # of the labels that vehicles hear
     navigation: PoseSource = NavigationErrors()  # of the vehicles
     train_s: float = 0.0  # time that a vehicle of speed 1 trains in a round [s]; 0 without a radio network
     speeds: Mapping[str, float] = {}  # relative computing speeds by "region/vehicle"; others have 1

@@ -4,11 +4,14 @@ from collections.abc import Iterator, Sequence
 
 from flcav.config import InputError
 from flcav.fusion.average import PoseSource
+from flcav.geometry import Boxes
+from flcav.network.awareness import MessageSettings
 from flcav.perception.tasks import task_named
 from flcav.runs.arms import Setting
 from flcav.runs.engine import Step, Work
 from flcav.runs.frames import Frames, list_window
 from flcav.runs.label_sources import LABEL_SOURCES
+from flcav.runs.labels.heard import HeardMessages, hear_messages
 from flcav.runs.labels.pseudo_labels import road_views
 from flcav.runs.labels.tracks import WINDOW_S, save_tracks, track_frame
 from flcav.runs.recipe import TRACKING
@@ -25,6 +28,7 @@ class TrackSettings(StepSettings):
     task: str
     inputs: RegionInputs
     labels: str  # kind of labels, see `LABEL_SOURCES`
+    messages: MessageSettings | None = None  # of the vehicles that announce themselves; None: none does
     navigation: PoseSource  # of the vehicles
 
     @property
@@ -44,13 +48,17 @@ def track_step(work: Work, settings: TrackSettings) -> None:
     check_windows(split, frames, inputs.region)
     spins = {i: (split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
     views = road_views(split, poles, kind.trained, set(spins.values()))
-    tracks = {}
+    tracks, heard = dict[int, Boxes](), dict[int, HeardMessages]()
     for done, i in enumerate(frames, start=1):
         seen = [*views.get(spins[i], {}).values()]
-        tracks[i] = track_frame(network, split, i, seen, settings.navigation)
+        if settings.messages is not None:
+            heard[i] = hear_messages(split, i, settings.messages, network)
+        announced = heard[i].announced if i in heard else None
+        tracks[i] = track_frame(network, split, i, seen, settings.navigation, announced, kind.from_detections)
         work.report(done, len(frames), "tracks")
-    save_tracks(tracks, work.folder)
-    TrackedFrames(inputs.region, len(tracks), sum(map(len, tracks.values()))).save(work.folder)
+    save_tracks(tracks, work.folder, {i: own.bytes for i, own in heard.items()})
+    count = sum(own.count for own in heard.values())
+    TrackedFrames(inputs.region, len(tracks), sum(map(len, tracks.values())), count).save(work.folder)
 
 
 def check_windows(split: Frames, frames: Sequence[int], region: str) -> None:
@@ -70,6 +78,10 @@ def list_tracks(outline: Outline, arm: Setting, task: str) -> Iterator[Step]:
     for region in arm.regions if LABEL_SOURCES[arm.labels[task]].tracked else ():
         inputs = outline.inputs(arm, region, task, TRACKING)
         settings = TrackSettings(
-            task=task, inputs=inputs, labels=arm.labels[task], navigation=outline.recipe.navigation
+            task=task,
+            inputs=inputs,
+            labels=arm.labels[task],
+            messages=arm.messages if LABEL_SOURCES[arm.labels[task]].heard else None,
+            navigation=outline.recipe.navigation,
         )
         yield make_step(outline.names.tracks(arm.name, region, task), track_step, settings)

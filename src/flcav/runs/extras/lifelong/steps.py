@@ -23,6 +23,7 @@ from flcav.runs.extras.lifelong.checks import find_requests
 from flcav.runs.extras.lifelong.replay import NO_LIMIT, Memory, remember
 from flcav.runs.extras.lifelong.settings import LEARNING, LIFELONG, REPLAY, Lifelong
 from flcav.runs.frames import Frames
+from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
 from flcav.runs.results.saved import LEDGER, WEIGHTS, Saved
 from flcav.runs.results.training import Pretrained, StageResult
@@ -195,7 +196,13 @@ def _track(outline: Outline, main: Setting, task: str, inputs: RegionInputs) -> 
     """Return the step that tracks the objects around a condition's frames by the network that drives."""
     assert inputs.tracks is not None  # called for labels by tracks alone
     before = inputs.model_copy(update={"tracks": None})
-    settings = TrackSettings(task=task, inputs=before, labels=main.labels[task], navigation=outline.recipe.navigation)
+    settings = TrackSettings(
+        task=task,
+        inputs=before,
+        labels=main.labels[task],
+        messages=main.messages if LABEL_SOURCES[main.labels[task]].heard else None,
+        navigation=outline.recipe.navigation,
+    )
     return make_step(inputs.tracks, track_step, settings)
 
 
