@@ -16,10 +16,7 @@ pytestmark = pytest.mark.slow
 
 ROOT = Path(__file__).parents[2]
 EXTRAS = sorted(path.parent.name for path in (ROOT / "src/flcav/runs/extras").glob("*/__init__.py"))
-BUILT_ON = {
-    "groups": ("lifelong", "partition"),
-    "lifelong": ("partition",),
-}  # extras that use another one, and go with it
+BUILT_ON = {"groups": ("lifelong", "partition")}  # extras that use another one, and go with it
 PROGRAM = """
 import sys
 import flcav

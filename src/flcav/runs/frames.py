@@ -194,3 +194,19 @@ def hash_manifest(path: Path) -> str:
     """Return the SHA-256 of a dataset's manifest, which names its version; raises `InputError` where there is none."""
     read_manifest(path)
     return sha256(path / "manifest.json")
+
+
+class Joined(Sequence[Any]):
+    """The concatenation of several sequences of samples, which are read on access."""
+
+    def __init__(self, parts: Sequence[Sequence[Any]]) -> None:
+        self._places = [(part, place) for part in parts for place in range(len(part))]
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: Any) -> Any:
+        if isinstance(index, slice):
+            return [part[place] for part, place in self._places[index]]
+        part, place = self._places[index]
+        return part[place]

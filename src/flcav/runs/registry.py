@@ -1,5 +1,5 @@
 """Registry of the extras of a run: to take one out, delete its folder in `extras` and its lines below
-(what else goes with it: CONTRIBUTING.md).
+(what else goes with it: CONTRIBUTING.md; on groups, lifelong learning and partition are built).
 
 An extra adds fields to the recipe and to the results (the bases of the four classes), and functions that a run calls:
 `load_all` returns those of a table. They are named as `module:NAME`, since their modules import the stages that call

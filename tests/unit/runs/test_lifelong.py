@@ -9,7 +9,7 @@ from flcav.config import InputError, parse_config
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
 from flcav.runs.arms import check_federations
 from flcav.runs.extras.groups.rows import CheckedNetwork, Group
-from flcav.runs.extras.lifelong.replay import NO_LIMIT, Joined, divide_memory, spread_evenly
+from flcav.runs.extras.lifelong.replay import NO_LIMIT, divide_memory, spread_evenly
 from flcav.runs.extras.lifelong.results import find_mended
 from flcav.runs.extras.lifelong.rows import LifelongArm, Passed
 from flcav.runs.extras.lifelong.steps import (
@@ -19,6 +19,7 @@ from flcav.runs.extras.lifelong.steps import (
     name_driving,
     name_learning,
 )
+from flcav.runs.frames import Joined
 from flcav.runs.recipe import RunRecipe
 from flcav.runs.stages.federating import EdgeSettings
 from flcav.runs.stages.graph import Graph

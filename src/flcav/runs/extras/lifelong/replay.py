@@ -6,6 +6,7 @@ from typing import Any
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.runs.engine import Work
 from flcav.runs.extras.groups.members import Picked
+from flcav.runs.frames import Joined
 from flcav.runs.recipe import EDGE
 from flcav.runs.stages.regions import label_samples
 from flcav.runs.stages.settings import FederationSettings, RegionInputs, StepSettings
@@ -49,19 +50,3 @@ def spread_evenly(count: int, kept: int) -> list[int]:
     if kept >= count:
         return [*range(count)]
     return [int((number + 0.5) * count / kept) for number in range(kept)]
-
-
-class Joined(Sequence[Any]):
-    """The concatenation of several sequences of samples, which are read on access."""
-
-    def __init__(self, parts: Sequence[Sequence[Any]]) -> None:
-        self._places = [(part, place) for part in parts for place in range(len(part))]
-
-    def __len__(self) -> int:
-        return len(self._places)
-
-    def __getitem__(self, index: Any) -> Any:
-        if isinstance(index, slice):
-            return [part[place] for part, place in self._places[index]]
-        part, place = self._places[index]
-        return part[place]

@@ -14,7 +14,6 @@ from flcav.perception.tasks import task_named
 from flcav.runs.arms import Setting
 from flcav.runs.engine import Work
 from flcav.runs.extras.groups.members import Picked, count_sample_labels
-from flcav.runs.extras.lifelong.replay import Joined
 from flcav.runs.extras.partition.dealing import (
     deal_by_amount,
     deal_by_class,
@@ -24,7 +23,7 @@ from flcav.runs.extras.partition.dealing import (
 )
 from flcav.runs.extras.partition.rows import Partitioned, VehicleHolding
 from flcav.runs.extras.partition.settings import ALPHA, BY_AMOUNT, BY_CLASS, BY_DIRICHLET, BY_PLACE, SHARDS, Partition
-from flcav.runs.frames import Frames
+from flcav.runs.frames import Frames, Joined
 from flcav.runs.label_sources import LABEL_SOURCES
 from flcav.runs.recipe import RunRecipe
 from flcav.runs.stages.regions import select_group
@@ -46,7 +45,7 @@ def check_partition(recipe: RunRecipe, setting: Setting, strategy: Strategy) -> 
         raise InputError(
             f"{field}: the labels '{setting.labels[averaged[0]]}' are made anew by who recorded the frames"
         )
-    if setting.federation.requests is not None or recipe.lifelong is not None:
+    if setting.federation.requests is not None or getattr(recipe, "lifelong", None) is not None:
         raise InputError(
             f"{field}: vehicles of a group learn from what they recorded; leave out 'requests' and 'lifelong'"
         )
