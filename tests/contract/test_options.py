@@ -104,7 +104,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--min-points": ALWAYS,
         "--calibration": ALWAYS,
     },
-    "import": {"--split": ALWAYS, "--estimate-poses": ALWAYS},
+    "import": dict.fromkeys(("--split", "--estimate-poses", "--lidar-height", "--beams"), ALWAYS),
     "train": {
         "--data": ALWAYS,
         "--validation": ALWAYS,
@@ -120,6 +120,8 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--tracks": ("objects",),
         "--range": ("objects",),
         "--around": ("objects",),
+        "--lidar-height": (),
+        "--beams": (),
         **RUNS,
     },
     "infer": {"--weights": ALWAYS, "--threshold": SCORED, "--around": ("objects",), "--pictures": ALWAYS, **RUNS},

@@ -32,12 +32,6 @@ AROUND = typer.Option(
     "--around",
     help="objects: detect in 360 degrees, in four passes over the rotated sweep, and not ahead alone.",
 )
-LIDAR_HEIGHT = typer.Option(
-    None,
-    "--lidar-height",
-    help="A folder in KITTI's layout: metres of its LiDAR above the ground; by default as its sweeps show.",
-)
-BEAMS = typer.Option(None, "--beams", help="A folder in KITTI's layout: beams of its LiDAR, likewise.")
 JOBS = typer.Option(2, "--jobs", min=1, help="Processes, of one thread each.")
 
 
@@ -107,6 +101,15 @@ def check_finite(parameter: click.Parameter, value: float | None) -> float | Non
     if value is not None and not math.isfinite(value):
         raise InputError(f"{parameter.opts[0]} {value}: a finite number is wanted")
     return value
+
+
+LIDAR_HEIGHT = typer.Option(
+    None,
+    "--lidar-height",
+    callback=check_finite,
+    help="A folder in KITTI's layout: metres of its LiDAR above the ground; by default as its sweeps show.",
+)
+BEAMS = typer.Option(None, "--beams", help="A folder in KITTI's layout: beams of its LiDAR, likewise.")
 
 
 def check_all_finite(parameter: click.Parameter, values: list[float]) -> list[float]:
