@@ -36,7 +36,7 @@ class Measurement(NamedTuple):
 
 
 class Streams:
-    """What clients receive of an episode in every tick; `Episode` moves its world and its actors."""
+    """The streams of an episode: ticks and sensor data to the clients; `Episode` moves its world and its actors."""
 
     id: int
     seed: int

@@ -24,7 +24,7 @@ HEIGHTS_M, MOST_BEAMS = (0.2, 10.0), 1024
 
 @dataclass(frozen=True)
 class StatedLidar:
-    """What a user states of a LiDAR, in place of what its sweeps show; raises `InputError` where it cannot be."""
+    """Height and beams of a LiDAR as the user states them; raises `InputError` for impossible ones."""
 
     height_m: float | None = None  # above the ground
     beams: int | None = None
