@@ -71,10 +71,10 @@ def check_rules(strategy: Strategy, rules: Rules, names: Sequence[str]) -> None:
     if rules.privacy is not None and rules.privacy.amplified(selection) and isinstance(rules.least_clients, int):
         raise InputError(
             f"privacy: epsilon of {selection.rule} selection rests on secret draws, and rounds without an update for a "
-            "number of 'least_clients' would tell of them"
+            "number of 'least_clients' would reveal them"
         )
     if rules.hides_draws and rules.empty_rounds is not None:
-        raise InputError("privacy: epsilon rests on secret draws, and an end after 'empty_rounds' would tell of them")
+        raise InputError("privacy: epsilon rests on secret draws, and an end after 'empty_rounds' would reveal them")
     if isinstance(strategy, FedMD):
         _check_outputs(rules)
     if isinstance(strategy, FedBuff):

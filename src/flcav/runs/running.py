@@ -40,7 +40,7 @@ class RunOptions(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class _Terms:
-    """How and where a run's steps are performed."""
+    """Processes, engine and folders in which the steps of a run are performed."""
 
     beside: Path | str | None = None
     jobs: int = 1

@@ -61,7 +61,7 @@ def measure_streets(town: Town, *, bare: bool = False) -> float:
 
 @dataclass(frozen=True)
 class Located:
-    """Where a site is."""
+    """Position of a site, in the world frame and by latitude and longitude."""
 
     x: float  # [m, world]
     y: float

@@ -354,7 +354,7 @@ def test_noise_that_hides_who_was_drawn_hides_empty_rounds():
     rules = Rules(selection=selection, privacy=Privacy(clip=1.0, noise=1.0))
     _, records, _ = follow(collecting(5, 1), 1, rules=rules)
     assert [(record.clients, record.failed, record.empty) for record in records] == [((), {}, False)]
-    with pytest.raises(InputError, match="an end after 'empty_rounds' would tell of them"):
+    with pytest.raises(InputError, match="an end after 'empty_rounds' would reveal them"):
         follow(collecting(5), rules=rules.model_copy(update={"empty_rounds": 3}))
 
 

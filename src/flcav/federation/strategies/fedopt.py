@@ -4,6 +4,7 @@ FedAdam and FedYogi (Reddi et al., "Adaptive Federated Optimization", ICLR 2021,
 has momentum (Hsu, Qi and Brown, arXiv 1909.06335, 2019, section 4.3).
 """
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated
@@ -21,7 +22,7 @@ Rate = Annotated[float, Field(gt=0, le=1e3)]
 Decay = Annotated[float, Field(ge=0, lt=1)]
 
 
-class _ServerOptimiser:
+class _ServerOptimiser(ABC):
     """An optimiser of the server, which takes the mean of the clients' changes for a gradient."""
 
     def combine(self, start: Weights, updates: Sequence[Update]) -> Weights:
@@ -38,8 +39,8 @@ class _ServerOptimiser:
         """Return the weights after a round, and the optimiser's state by name of array."""
         return self._step(start, updates, state)
 
-    def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]:
-        raise NotImplementedError
+    @abstractmethod
+    def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]: ...
 
 
 @dataclass(frozen=True)
@@ -55,8 +56,8 @@ class _Adaptive(_ServerOptimiser):
     beta2: Decay = 0.99
     tau: Rate = 1e-3  # degree of adaptivity: smaller is more adaptive
 
-    def _second(self, v: Floats, squared: Floats) -> Floats:
-        raise NotImplementedError
+    @abstractmethod
+    def _second(self, v: Floats, squared: Floats) -> Floats: ...
 
     def _step(self, start: Weights, updates: Sequence[Update], state: Weights) -> tuple[Weights, Weights]:
         moments: dict[str, Floats] = {}

@@ -45,7 +45,7 @@ ITSELF_M = 2.0  # a vehicle that is perceived as near as this, and twice the dev
 
 @dataclass(frozen=True)
 class HeardMessages:
-    """What a vehicle hears around a frame."""
+    """Messages that a vehicle receives around a frame, and the objects that they announce."""
 
     announced: Announced  # of the classes of the network; trucks and buses resemble cars
     count: int  # messages, of awareness and of perception

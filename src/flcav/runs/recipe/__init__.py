@@ -166,7 +166,7 @@ Replanning = Annotated[Literal["none", "stages"], BeforeValidator(_name_replanni
 
 
 class _PlannedArm(Config):
-    """How an arm differs from the run in plan, placement, federation and labels."""
+    """Changes of an arm to the plan, placement, federation and labels of the run."""
 
     plan: Literal["joint", "equal-stages", "equal-tasks", "max-throughput"] = (
         "joint"  # joint: optimal under both budgets; otherwise a baseline
@@ -209,7 +209,7 @@ class Arm(ArmFields, _PlannedArm):
 
 
 class _Scene(Config):
-    """What is run: tasks, regions, budgets, rules."""
+    """Tasks, regions, budgets and rules of a run."""
 
     seed: int = Field(default=1, ge=0, lt=2**31)  # of all random draws
     retrainings: int = Field(default=0, ge=0, le=100)  # of every arm, on the same frames with other random numbers
@@ -239,7 +239,7 @@ class _Scene(Config):
 
 
 class _Drive(Config):
-    """How vehicles and recordings of a run differ from the defaults, and its arms."""
+    """Changes of a run to the defaults of vehicles and recordings, and its arms."""
 
     navigation: PoseSource = (
         NavigationErrors()

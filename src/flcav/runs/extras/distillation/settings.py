@@ -18,12 +18,12 @@ AVERAGED = {  # labels, renewed before each round of stage II, by name: fields o
 
 
 class DistillationFields(Config):
-    """What distillation adds to a recipe."""
+    """The fields of distillation in a recipe."""
 
     distillation: Distillation | None = None  # of labels "road-average"; None: the defaults
 
 
 class ArmDistillation(Config):
-    """What distillation adds to an arm."""
+    """The fields of distillation in an arm."""
 
     distillation: Mapping[str, Any] = {}  # fields of `Distillation` that differ from the run

@@ -27,6 +27,6 @@ class Requests(Config):
 
 
 class RequestFields(Config):
-    """What groups add to the settings of federated learning."""
+    """The fields of groups on request in the settings of federated learning."""
 
     requests: Requests | None = None  # stage II with groups on request; default: all vehicles of a region

@@ -34,6 +34,6 @@ class Lifelong(Config):
 
 
 class LifelongFields(Config):
-    """What lifelong learning adds to a recipe."""
+    """The fields of lifelong learning in a recipe."""
 
     lifelong: Lifelong | None = None  # conditions that come one after another; None: no lifelong learning

@@ -33,6 +33,6 @@ class Partition(Config):
 
 
 class PartitionFields(Config):
-    """What the partition adds to the settings of federated learning."""
+    """The fields of non-IID partitions in the settings of federated learning."""
 
     partition: Partition | None = None  # of a region's training samples; default: each vehicle has what it recorded

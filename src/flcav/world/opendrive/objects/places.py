@@ -61,7 +61,7 @@ def outline_object(road: Road, thing: ElementTree.Element) -> Array | None:
 
 @dataclass(frozen=True)
 class TakenOver(Generic[Part]):
-    """What a town takes over from the things of one kind in a map."""
+    """Parts of a town made of the objects of one kind in a map, and the objects left out."""
 
     found: tuple[Part, ...]  # parts of the town
     left: Counter[str]  # reason -> number of things that were left out
