@@ -8,7 +8,7 @@ for autonomous driving? The KITTI vision benchmark suite", CVPR 2012, sec. 2.5, 
 over scenes, see `flcav.statistics`.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -52,12 +52,28 @@ def match(
 
     Raises ValueError where there are detections without scores.
     """
-    parts = [_match_frame(*one, overlap, kind) for one in zip(detections, targets, neutral, strict=True)]
-    frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _ in parts])
-    score, turned = (np.concatenate(column) for column in zip(*parts)) if parts else (np.zeros(0), np.zeros(0))
-    order = np.argsort(-score, kind="stable")
+    (matches,) = match_at_each(detections, targets, neutral, [(kind, overlap)])
+    return matches
+
+
+def match_at_each(
+    detections: Sequence[Boxes],
+    targets: Sequence[Boxes],
+    neutral: Sequence[Boxes],
+    overlaps: Sequence[tuple[Kind, float]],
+) -> Iterator[Matches]:
+    """Yield the result of `match` at each of `overlaps`: kinds and least values of IoU, which is computed once."""
+    pairs = [
+        (one, on, {kind: measure_iou(one, on, kind) for kind, _ in overlaps}, ~on_neutral(one, off))
+        for one, on, off in zip(detections, targets, neutral, strict=True)
+    ]
     wanted = np.array([len(boxes) for boxes in targets], dtype=np.int64)
-    return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], wanted)
+    for kind, least in overlaps:
+        parts = [_match_frame(one, on, ious[kind], least, aside) for one, on, ious, aside in pairs]
+        frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _ in parts])
+        score, turned = (np.concatenate(column) for column in zip(*parts)) if parts else (np.zeros(0), np.zeros(0))
+        order = np.argsort(-score, kind="stable")
+        yield Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], wanted)
 
 
 def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> Ints:
@@ -65,10 +81,14 @@ def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind
 
     `overlap` is the least IoU of `kind` for a match. Raises ValueError where there are detections without scores.
     """
+    return _assign(detections, measure_iou(detections, targets, kind), overlap)
+
+
+def measure_iou(detections: Boxes, targets: Boxes, kind: Kind = "3d") -> Array:
+    """Return the IoU (D, T) of `kind` of each detection with each target."""
     if not len(detections) or not len(targets):
-        return np.full(len(detections), -1)
-    ious = iou(torch.from_numpy(detections.array()), torch.from_numpy(targets.array()), kind).numpy()
-    return match_greedily(ious, overlap, np.argsort(-_scores(detections), kind="stable"))
+        return np.zeros((len(detections), len(targets)))
+    return iou(torch.from_numpy(detections.array()), torch.from_numpy(targets.array()), kind).numpy()
 
 
 def match_greedily(overlap: Array, least: float, order: Iterable[int] | None = None) -> Ints:
@@ -115,14 +135,21 @@ def lies_on(detections: Boxes, objects: Boxes) -> Mask:
     return out
 
 
-def _match_frame(detections: Boxes, targets: Boxes, neutral: Boxes, overlap: float, kind: Kind) -> tuple[Array, Array]:
-    """Return the scores (D,) of a frame's detections that count, and their heading errors (D,), see `Matches`."""
-    target = assign_targets(detections, targets, overlap, kind)
+def _match_frame(detections: Boxes, targets: Boxes, ious: Array, least: float, aside: Mask) -> tuple[Array, Array]:
+    """Return the scores (D,) of a frame's detections that count, and their heading errors (D,), see `Matches`.
+
+    `aside` (D,) tells the detections that lie on no neutral object.
+    """
+    target = _assign(detections, ious, least)
     hit = target >= 0
     turned = np.full(len(target), np.nan)
     turned[hit] = np.abs(wrap_angle(detections.yaw[hit] - targets.yaw[target[hit]]))
-    counts = hit | ~on_neutral(detections, neutral)
+    counts = hit | aside
     return _scores(detections)[counts], turned[counts]
+
+
+def _assign(detections: Boxes, ious: Array, least: float) -> Ints:
+    return match_greedily(ious, least, np.argsort(-_scores(detections), kind="stable"))
 
 
 def _scores(detections: Boxes) -> Array:

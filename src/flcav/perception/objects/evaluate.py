@@ -25,7 +25,7 @@ from flcav.perception.metrics import (
     bootstrap_interval,
     count_found_cars,
     interval_words,
-    match,
+    match_at_each,
     orientation_similarity,
     right_headings,
     round_or_none,
@@ -169,8 +169,7 @@ def score_detections(
     for name in classes:
         found, targets, neutral = select_sides(detections, truths, name)
         hidden = sum(len(select_class(truth.hidden, name)) for truth in truths)
-        for kind, overlap in OVERLAPS:
-            matches = match(found, targets, neutral, overlap, kind)
+        for (kind, overlap), matches in zip(OVERLAPS, match_at_each(found, targets, neutral, OVERLAPS), strict=True):
             low, high = bootstrap_interval(matches, scenes, rng=stream(seed, "bootstrap"))
             ap, aos, right = average_precision(matches), orientation_similarity(matches), right_headings(matches)
             numbers = map(round_or_none, (ap, low, high, aos, right))
@@ -231,8 +230,9 @@ def break_down(
                 continue
             others = [t.targets[o & ~w] for t, o, w in zip(truths, is_class, part.wanted, strict=True)]
             neutral = [concatenate([select_class(t.neutral, label), o]) for t, o in zip(truths, others, strict=True)]
-            for kind, overlap in OVERLAPS:
-                ap = average_precision(match(of_class, targets, neutral, overlap, kind), part.frames)
+            by_overlap = match_at_each(of_class, targets, neutral, OVERLAPS)
+            for (kind, overlap), matches in zip(OVERLAPS, by_overlap, strict=True):
+                ap = average_precision(matches, part.frames)
                 rows.append(BreakdownRow(part.by, part.name, label, kind, overlap, round_or_none(ap), count))
     return tuple(rows)
 
@@ -322,9 +322,8 @@ class ObjectsOutcomes:
         hidden = [sum(int((truth.hidden.label == name).sum()) for truth in truths) for name in classes]
         arrays: dict[str, NDArray] = {CLASSES: np.array(classes), HIDDEN: np.array(hidden)}
         for name in classes:
-            sides = select_sides(found, truths, name)
-            for key, (kind, overlap) in KEPT.items():
-                matches = match(*sides, overlap, kind)
+            by_overlap = match_at_each(*select_sides(found, truths, name), [*KEPT.values()])
+            for key, matches in zip(KEPT, by_overlap, strict=True):
                 arrays |= {f"{name}/{key}/{field}": value for field, value in vars(matches).items()}
         return Outcomes(np.array([truth.scene for truth in truths]), arrays)
 
