@@ -16,6 +16,7 @@ import ast
 import json
 import os
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -193,7 +194,7 @@ def main() -> None:
         names = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True, text=True).stdout
         for name in filter(None, names.split("\0")):
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
-            (copy / name).write_bytes((ROOT / name).read_bytes())
+            shutil.copy2(ROOT / name, copy / name, follow_symlinks=False)
         for package in asked.package or PACKAGES:
             drawn = draw_mutants(package, asked.mutants, asked.seed)
             if {mutant.key for mutant in drawn} <= finished:

@@ -18,6 +18,7 @@ CASES = 100  # the first ones take each of `CALLS` once
 LIMIT_S = 60.0  # of computing; not less: an interrupted compiler may fail the next case
 CALLS = [call for call in calls() if call.seconds <= 2.0]  # the others are the tool's
 QUICK = [call for call in CALLS if call.seconds <= 0.2]
+OFTEN = [number for number, call in enumerate(CALLS) if call.seconds <= 0.7]  # numbers of cases; the others are slow
 
 
 @pytest.fixture(scope="module")
@@ -27,7 +28,9 @@ def inputs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize("number", range(CASES))
+@pytest.mark.parametrize(
+    "number", [pytest.param(each, marks=[] if each in OFTEN else [pytest.mark.slow]) for each in range(CASES)]
+)
 def test_a_mutated_input_is_used_or_refused_in_a_sentence(number: int, inputs: Path, tmp_path: Path) -> None:
     choices = [CALLS[number]] if number < len(CALLS) else QUICK
     outcome = run_case(inputs, number, tmp_path / "case", choices, LIMIT_S)

@@ -14,6 +14,7 @@ from flcav.runs.stages.graph import Graph
 TOY = Path(__file__).parents[1] / "integration" / "toy.yaml"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("batch", range(4))
 def test_a_mutated_run_recipe_is_refused_in_a_sentence_or_has_steps(batch: int, tmp_path: Path) -> None:
     refused = 0

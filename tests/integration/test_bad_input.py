@@ -336,6 +336,7 @@ def test_a_full_disk_while_a_picture_is_written(data: Path, tmp_path: Path) -> N
     assert left_in(out.parent) == []
 
 
+@pytest.mark.slow
 def test_a_demo_into_the_folder_of_another(tmp_path: Path, refused: Callable[..., str]) -> None:
     step = tmp_path / "work" / "suburb-pool-objects"
     step.mkdir(parents=True)

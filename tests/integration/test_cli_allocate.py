@@ -62,6 +62,7 @@ def test_every_recipe_gives_a_plan_within_its_budgets(recipe, capsys, solved_onc
     assert plan["tasks"][0]["name"] in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_a_weighted_error_is_told_with_its_mean(tmp_path, capsys, solved_once):
     values = yaml.safe_load(RECIPES[-1].read_text())
     for task in values["tasks"]:
@@ -272,6 +273,7 @@ def test_time_to_train_is_kept_and_said(tmp_path, capsys):
     assert "within the 100 s that vehicles may be busy" in (tmp_path / "named.html").read_text()
 
 
+@pytest.mark.slow
 def test_the_area_says_that_it_has_no_certificate(tmp_path, capsys):
     values = yaml.safe_load(RECIPES[-1].read_text()) | {"objective": "area"}
     (tmp_path / "problem.yaml").write_text(yaml.safe_dump(values))

@@ -62,6 +62,7 @@ def test_an_imported_dataset_goes_through_all_commands(tmp_path: Path, flcav: Ca
         assert "needs --town, or --data whose town is known" in flcav(*refused)
 
 
+@pytest.mark.slow
 def test_a_folder_of_kitti_is_evaluated_as_the_benchmark_does(tmp_path: Path, flcav: Callable[..., str]) -> None:
     record(PaintedSource(SCENES, spins=1), tmp_path / "painted")
     export(Dataset.open(tmp_path / "painted"), "kitti", tmp_path / "kitti", ExportOptions(validation=0.5))

@@ -153,6 +153,7 @@ def test_other_folders_are_refused(tmp_path: Path) -> None:
         import_dataset("kitti-tracking", tmp_path / "in", tmp_path / "out")
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (DATA / "kitti_tracking_0000").is_dir(), reason=f"no {DATA / 'kitti_tracking_0000'}")
 def test_the_real_sequence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["unpack.py", str(tmp_path / "in")])

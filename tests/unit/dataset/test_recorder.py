@@ -39,6 +39,7 @@ def uninterrupted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     return digests(out)
 
 
+@pytest.mark.slow
 def test_same_seed_same_bytes_whatever_the_jobs(tmp_path: Path, uninterrupted: dict[str, str]):
     counts = []
     record(ToySource(), tmp_path / "data", jobs=2, progress=lambda done, total, note: counts.append((done, total)))

@@ -96,6 +96,7 @@ def test_a_liar_sends_a_multiple_of_its_change():
     assert told.samples == honest.samples == 48
 
 
+@pytest.mark.slow
 def test_lies_mislead_the_mean_and_not_the_median(drives: Drives, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(faults, "ROUNDS", 4)
     liars = choose_liars(drives, 1)
@@ -144,6 +145,7 @@ def test_membership_is_told_by_ranks_and_by_the_mean_loss():
     assert membership_advantage(np.array([0.0, 2.0, 1.0]), np.array([0.5, 3.0])) == pytest.approx(2 / 3 - 1 / 2)
 
 
+@pytest.mark.slow
 def test_an_attack_leaves_the_secure_federation_s_accuracy(drives: Drives):
     known = np.concatenate([each.features for each in drives.vehicles.values()])
     seen, secure = attack(drives, known, Rules(), 1), attack(drives, known, Rules(secure=SecureAggregation()), 1)

@@ -55,6 +55,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return own
 
 
+@pytest.mark.slow
 def test_a_folder_of_ones_own_is_run_in_processes_and_fills_its_page(folder: Path, capsys: pytest.CaptureFixture[str]):
     with pytest.raises(SystemExit) as ended:
         run(["reproduce", str(folder), "--seeds", "3", "--jobs", "2", "--out", str(folder / "out")])

@@ -49,6 +49,7 @@ def test_pretraining_lacks_the_rare_weathers_and_three_vehicles_meet_them() -> N
     assert len(open_fleet(DRIVES, 1, alike=True, held_back=0.25).meet) == 10
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("setting", [UNLIKE, ALIKE])
 def test_those_that_meet_what_the_network_does_not_know_ask_and_the_group_spends_less(setting: str) -> None:
     fleet = open_fleet(DRIVES, 1, alike=setting == ALIKE, held_back=0.25)

@@ -106,6 +106,7 @@ def test_it_goes_on_in_the_rounds_of_an_edge_server():
     assert all(np.any(own["optimiser"]["velocity"]) for own in server.state.clients.values())
 
 
+@pytest.mark.slow
 def test_adamw_goes_on_as_in_one_training():
     """One sample and two times three steps are six steps of PyTorch's own AdamW."""
     torch.manual_seed(1)

@@ -207,6 +207,7 @@ def test_a_pair_less_likely_than_staying_alone_is_made_of_what_stays_alone():
     assert pair(PairedShot(cars[:1], np.concatenate((aside, boxes[:1]))), LARGE).box.tolist() == [1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("together", [False, True], ids=["each by itself", "all four of a car together"])
 def test_extrinsics_are_as_sure_as_they_are_right_however_sides_err(together: bool):
     squared = []

@@ -159,6 +159,7 @@ def test_errors_are_what_the_covariance_says_and_small_between_near_frames() -> 
     assert rms[2] < np.radians(0.05)
 
 
+@pytest.mark.slow
 def test_a_log_beyond_the_last_frame_is_used_for_it() -> None:
     """The smoothed pose of a frame is nearer to the truth than that from the log up to it."""
     off: dict[str, list[float]] = {"all": [], "past": []}

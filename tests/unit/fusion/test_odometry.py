@@ -75,6 +75,7 @@ def folder(tmp_path: Path, drive: list[Frame]) -> Path:
     return root
 
 
+@pytest.mark.slow
 def test_a_drive_is_imported_with_the_poses_of_odometry(folder: Path, tmp_path: Path, drive: list[Frame]) -> None:
     notes = import_dataset("kitti", folder, tmp_path / "out", posed=DrivenSource)
     assert [note for note in notes if "image_2" in note]

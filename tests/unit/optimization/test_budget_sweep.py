@@ -39,6 +39,7 @@ def test_what_more_of_a_budget_saves_is_what_trying_every_plan_finds(model: str,
     assert any(each.saved > 0 for each in found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("objective", ["weighted", "max-min"])
 def test_what_more_megabytes_save_is_printed_as_trying_every_plan_finds_it(
     objective: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -179,6 +179,7 @@ def test_after_stage_two_the_number_called_stays_and_what_was_not_sent_is_left()
         condition_problem(asked, PlanState.model_validate({"tasks": {"objects": {**state, "called": 9}}}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
 def test_baselines_call_the_most_and_are_no_better(name: str) -> None:
     values = calling(5, 2, "effective")

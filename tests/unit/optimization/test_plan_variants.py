@@ -55,6 +55,7 @@ def test_an_unknown_baseline_is_refused_by_name():
         baseline(parsed(written(1, 1, "additive", LIMITS)), "best")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
 @pytest.mark.parametrize(
     ("tasks", "model", "k"),

@@ -67,6 +67,7 @@ def test_without_a_gradient_nothing_changes() -> None:
     assert all(torch.equal(value, before[name]) for name, value in own.state_dict().items())
 
 
+@pytest.mark.slow
 def test_training_does_without_the_compiler() -> None:
     code = """
 import sys

@@ -187,6 +187,7 @@ def test_a_killed_training_ends_where_an_uninterrupted_one_does(data, tmp_path):
     assert all(np.array_equal(whole[name], cut[name]) for name in whole)
 
 
+@pytest.mark.slow
 def test_python_trains_the_same_weights_as_the_shell(data: Path, tmp_path: Path):
     """One thread by default, in both: threads decide the order of sums, and so the last bits."""
     torch.set_num_threads(2)

@@ -107,6 +107,7 @@ def test_the_grouped_product_follows_autocast(keys):
         assert torch.cosine_similarity(ours.flatten(), theirs.flatten(), dim=0) > 0.999
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("bfloat16", [False, True])
 def test_the_network_is_the_same_from_tensor_operations(sample, bfloat16, monkeypatch):
     compiled = loss_and_gradient(network(CPU), sample)

@@ -97,6 +97,7 @@ def boxes_of(weights: Mapping[str, np.ndarray], sample: Sample, where: Tensor) -
         return predict(network.eval(), [sample.points]).box[where]
 
 
+@pytest.mark.slow
 def test_a_network_that_imitates_keeps_its_boxes_nearer_to_those_it_had() -> None:
     """It learns low cars, then the labels say that the same points are of high ones."""
     start: Second = build_network(OBJECTS, CONFIG, 1)

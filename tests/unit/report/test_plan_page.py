@@ -69,6 +69,7 @@ def test_vehicles_add_up_to_what_the_plan_uses(fleet: dict[str, Any]) -> None:
     )
 
 
+@pytest.mark.slow
 def test_stragglers_are_named() -> None:
     results = results_of(FLEET.model_copy(update={"horizon_s": 900.0}))
     assert (
@@ -88,6 +89,7 @@ def test_more_of_a_budget_is_said_as_solved_anew(fleet: dict[str, Any]) -> None:
     assert f"more of it would lower the weighted error by {by}." in sentence
 
 
+@pytest.mark.slow
 def test_many_tasks_are_drawn_as_a_few(fleet: dict[str, Any]) -> None:
     tasks = [ONE.tasks[0].model_copy(update={"name": f"task {i}", "sample_mb": 0.1 + 0.1 * i}) for i in range(8)]
     budgets = ONE.budgets_mb.model_copy(update={"wireless": 40000.0, "wireline": 40000.0})

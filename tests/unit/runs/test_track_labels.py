@@ -52,6 +52,7 @@ def network():
     return load_network(OBJECTS, find_shipped(OBJECTS))
 
 
+@pytest.mark.slow
 def test_tracks_find_more_than_one_sweep_does_and_fit_better(folder: Path, network) -> None:
     split = Frames.open(folder)
     assert [len(list_window(split, (i,), 1.0)) for i in split.vehicles] == [7] * 4
@@ -67,6 +68,7 @@ def test_tracks_find_more_than_one_sweep_does_and_fit_better(folder: Path, netwo
     assert hits["tracks"] >= hits["single"] > 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("labels", ["tracks", "messages", "tracks+messages"])
 def test_no_annotation_has_a_part_in_a_label(folder: Path, network, tmp_path: Path, labels: str) -> None:
     """Scrambled annotations give the same bytes of tracks and of samples; so does traffic that sends nothing."""

@@ -59,6 +59,7 @@ def pid() -> int:
     return client._idle[-1][1].pid
 
 
+@pytest.mark.slow
 def test_a_run_does_not_depend_on_those_before_it(tmp_path: Path):
     names = ("first", "other", "again")
     jobs = [asked(tmp_path / name, seed=2 if name == "other" else 1) for name in names]

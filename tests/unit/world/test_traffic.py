@@ -214,6 +214,7 @@ def test_drives_are_the_same_motion_at_every_step(name: str) -> None:
     assert late.time_s[0] == 0.1
 
 
+@pytest.mark.slow
 def test_pole_8_of_grid_is_the_densest() -> None:
     town = load_town("grid")
     for seed in range(3):
