@@ -10,7 +10,7 @@ from flcav.perception.metrics import Matches
 from flcav.perception.objects.evaluate import CLASSES, HIDDEN, KEPT
 from flcav.perception.outcomes import Outcomes, as_measurable, count_once, difference, further_measures
 from flcav.perception.tasks import TASKS, task_named
-from flcav.runs.analysis.costs import list_home_costs, tell_gain
+from flcav.runs.analysis.costs import list_home_costs
 from flcav.runs.results.run import Run
 from flcav.runs.results.tests import HomeCost
 from flcav.runs.running import RESULTS
@@ -61,17 +61,3 @@ def test_results_tell_the_cost_of_every_measure_at_home() -> None:
     assert list_home_costs(replace(run, home=(kept,))) == [own, kept]
     again = Run.from_json(replace(run, home=(kept,)).as_json(), "again")
     assert again.home == (kept,)
-
-
-def test_two_sentences_tell_the_gain_its_megabytes_and_its_cost_at_home() -> None:
-    run = Run.load(RUNS / "demo_road", RESULTS)
-    gain, cost = tell_gain(run)
-    tests = {(test.stage, test.region): test.estimate.mean for test in run.tested if test.arm == "main"}
-    for number in (
-        *(np.mean([tests[stage, region] for region in ("grid", "ring")]) for stage in ("pretrain", "cloud")),
-    ):
-        assert f"{number:.3f}" in gain
-    links = run.arms["main"].links
-    assert all(f"{use.used_mb:.1f} MB of {link} uplink" in gain for link, use in links.items())
-    assert f"AP50 from {tests['pretrain', 'suburb']:.3f} to {tests['cloud', 'suburb']:.3f}" in cost
-    assert "AP70 from" in cost

@@ -21,8 +21,9 @@ from flcav.report.charts import figures
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
+from flcav.runs.analysis.answer import answer_question, list_stage_means
 from flcav.runs.analysis.caveats import PLACED_BARE
-from flcav.runs.analysis.costs import list_arm_costs, list_home_costs, tell_gain
+from flcav.runs.analysis.costs import list_arm_costs, list_home_costs
 from flcav.runs.arms import Names
 from flcav.runs.driving import CLOCK
 from flcav.runs.frames import Frames
@@ -68,15 +69,13 @@ def write_report(run: Run, out: Path | str) -> Path:
 def page(run: Run) -> dict[str, Any]:
     """Return the values of the page for its template."""
     recipe, main = run.recipe, run.arms[MAIN]
-    first = recipe.with_role("federate")[0]
     return {
         **vars(main),
         **vars(run),
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
-        "first": first,
-        "stages": select(run.tested, arm=MAIN, region=first),
-        "gains": tell_gain(run),
+        "stages": list_stage_means(run),
+        "answer": answer_question(run),
         "plans": main.plans,
         "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},

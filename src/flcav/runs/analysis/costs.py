@@ -70,26 +70,6 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
     )
 
 
-def tell_gain(run: Run) -> tuple[str, ...]:
-    """Describe the run's gain by task, the megabytes that it took, and what it cost in the towns of pretraining."""
-    sentences = []
-    home = list_home_costs(run)
-    arm = run.arms[MAIN]
-    for cost in select(list_arm_costs(run), arm=MAIN):
-        links = [f"{arm.sent_mb(cost.task, link):.1f} MB of {link} uplink" for link in arm.links]
-        sentences.append(
-            f"Federated learning took {cost.measure} of {cost.task} from {cost.before:.3f} to {cost.after.mean:.3f} on "
-            f"{' and '.join(cost.regions)}, for {' and '.join(links)}, pretraining included."
-        )
-        for region in dict.fromkeys(change.region for change in select(home, task=cost.task)):
-            changes = [
-                f"{change.measure} from {change.before:.3f} to {change.after:.3f}"
-                for change in select(home, region=region, task=cost.task)
-            ]
-            sentences.append(f"On {region}, where it was pretrained, it took {' and '.join(changes)}.")
-    return tuple(sentences)
-
-
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
     """Collect the costs in the towns of pretraining in the tasks' further measures, such as AP70.
 

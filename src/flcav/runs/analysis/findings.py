@@ -37,6 +37,8 @@ from flcav.statistics.verdicts import (
 )
 
 Kind = Literal["claim", "primary", "secondary", "loss"]
+OVER_PRETRAINING = "Does federated learning beat pretraining alone?"
+OVER_EDGE = "Does cloud FL add to edge FL?"
 
 
 @dataclass(frozen=True)
@@ -121,9 +123,9 @@ def _is_bound(setting: Setting, other: Setting, task: str) -> bool:
 def _question(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting]) -> str:
     if each.before_arm == MAIN:
         if each.stage == EDGE:
-            return "Does federated learning beat pretraining alone?"
+            return OVER_PRETRAINING
         if each.before_stage == EDGE:
-            return "Does cloud FL add to edge FL?"
+            return OVER_EDGE
         home = recipe.regions[each.region].role == "pretrain"
         return f"Does federated learning help {'in the town of pretraining, too' if home else 'where nobody learned'}?"
     main, other = (settings[arm] for arm in (MAIN, each.before_arm))
