@@ -261,7 +261,7 @@ def _open_wires(topics: RosTopics, clients: Sequence[str]) -> Iterator[dict[str,
         from cyclonedds.core import DDSException
         from cyclonedds.domain import DomainParticipant
     except ImportError:
-        command = f"pip install 'flcav[ros]', or {format_install_command('ros')}"
+        command = format_install_command("ros")
         raise InputError(f"parameters on ROS 2 topics need the extra 'ros': {command}") from None
     found: dict[str, tuple[Topic, Topic]] = {}
     try:
