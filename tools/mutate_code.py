@@ -33,7 +33,7 @@ FLEET = [f"{FEDERATION}/test_fleet_*.py", f"{FEDERATION}/test_vehicle_app.py", f
 PACKAGES: dict[str, tuple[list[str], list[str]]] = {  # name: (sources, tests)
     "messages": (
         ["federation/wire.py", "federation/acceptance.py", "federation/conduct.py"],
-        [FEDERATION, "tests/contract/test_strategies.py"],
+        [FEDERATION, "tests/contract/test_strategies.py", "tests/contract/test_replies.py"],
     ),
     "secure": (["federation/secure", "federation/modes/masked.py"], [FEDERATION]),
     "fleet": (["fleet"], FLEET),
