@@ -24,12 +24,14 @@ MOST, ALMOST_ALL = 0.5, 0.95  # shares of close points above which the view is b
 LONGEST_STEP_S = 1.0  # longer steps are skipped: the velocities at both ends do not predict the motion
 DRIFT_M, DRIFT_MPS = 0.3, 2.5  # tolerance of a position predicted from velocities: constant, and per second
 NEAR_M = 40.0  # distance up to which every LiDAR has points of a box
-OUT_OF_REACH_M = 1000.0  # no LiDAR measures as far
+BEYOND_M, OUT_OF_REACH_M = 250.0, 1000.0  # beyond it no LiDAR has points of a car; no LiDAR measures as far
 NEAR_SIZES = 10.0  # the same for smaller boxes, in lengths of their longest side
 LIFT_M = 0.2  # height of a box's lower part, whose points may be the ground's [m]
 HIDDEN = 0.5  # occlusion above which a box may be empty
 SECTOR_DEG = 2.0  # width of the azimuth sectors for which a LiDAR's range is determined
 FEWEST_BOXES, FEWEST_OBJECTS = 5, 3  # boxes, and different objects among them, from which a share is judged
+FEWEST_FILLED = 0.2  # share of boxes with points below which labels and points are not in one frame
+CHECK = "check the units and the order of angles, the units of lengths, and the frames"
 
 
 class BlockedViews:
@@ -68,6 +70,9 @@ class _Tally:
     empty: int = 0  # near boxes without a point
     objects: set[tuple[str, str]] = field(default_factory=set)  # scene and track of the empty ones
     first: str = ""  # track and frame of the first empty or far one
+    judged: Counter[bool] = field(default_factory=Counter)  # near or beyond all LiDARs, by: at a height with beams
+    filled: Counter[bool] = field(default_factory=Counter)  # those of them with points
+    bare: set[tuple[str, str]] = field(default_factory=set)  # scene and track of the others
 
     def problem(self) -> str:
         """Return what is wrong with most of the boxes; "" where nothing is."""
@@ -79,10 +84,20 @@ class _Tally:
         if self.near >= FEWEST_BOXES and len(self.objects) >= FEWEST_OBJECTS and self.empty > MOST * self.near:
             return (
                 f"{self.empty} of {self.near} boxes within {NEAR_M:g} m in view of the LiDARs have no points "
-                f"above the ground, as {self.first} has none: boxes, poses and points do not fit together; check the "
-                "units and the order of angles, the units of lengths, and the frames"
+                f"above the ground, as {self.first} has none: boxes, poses and points do not fit together; {CHECK}"
             )
         return ""
+
+    def refusal(self) -> str:
+        """Return that hardly any box has points, whether something hides it or not; "" where more have."""
+        few = all(self.filled[kind] < FEWEST_FILLED * count for kind, count in self.judged.items() if kind)
+        boxes, full = self.judged.total(), self.filled.total()
+        if boxes < FEWEST_BOXES or len(self.bare) < FEWEST_OBJECTS or not few or full >= FEWEST_FILLED * boxes:
+            return ""
+        return (
+            f"{full} of {boxes} boxes within {NEAR_M:g} m of the LiDARs, or more than {BEYOND_M:g} m away, have points "
+            f"above the ground: labels and points are not in one frame; {CHECK}"
+        )
 
 
 class EmptyBoxes:
@@ -98,32 +113,60 @@ class EmptyBoxes:
 
     def add(self, frame: Frame) -> None:
         """Add the boxes of a frame to the counts; a frame with points or boxes that are not finite is skipped."""
-        boxes = frame.annotations.boxes
+        clouds = [(cloud, frame.world_from_sensor(name)) for name, cloud in frame.lidar.items()]
+        truth = frame.annotations
+        self.count(truth.boxes, clouds, truth.track, truth.occlusion, frame.agent, frame.scene, str(frame.key))
+
+    def count(
+        self,
+        boxes: Boxes,
+        clouds: Sequence[tuple[NDArray[np.float32], Array]],
+        track: NDArray[np.str_],
+        occlusion: Array,
+        agent: str,
+        scene: str,
+        key: str,
+    ) -> None:
+        """Add M boxes to the counts of an agent, with the tracks and occlusions (M,) of their objects.
+
+        Each cloud has points (N, 4) x, y, z [m], intensity, and the pose (4, 4) [m] of its LiDAR in the boxes' frame.
+        """
         if not len(boxes) or not np.isfinite(boxes.array()).all():
             return
-        near = np.zeros(len(boxes), bool)
+        near, beamed = np.zeros((2, len(boxes)), bool)
         away = np.full(len(boxes), np.inf)
         points = np.zeros(len(boxes), np.int64)
         raised = _raise_floors(boxes)
-        for name, cloud in frame.lidar.items():
-            world_from_lidar = frame.world_from_sensor(name)
+        for cloud, world_from_lidar in clouds:
             if not len(cloud) or not np.isfinite(cloud).all() or not np.isfinite(world_from_lidar).all():
                 continue
             local = raised.transform(inverse(world_from_lidar))
             away = np.minimum(away, np.linalg.norm(local.center, axis=1))
-            near |= _are_in_view(local, cloud)
+            level = _have_beams(local, cloud)
+            beamed |= level
+            near |= level & _are_in_view(local, cloud)
             points += count_points_in_boxes(cloud, raised, world_from_lidar)
-        near &= ~(frame.annotations.occlusion > HIDDEN)
+        hidden = occlusion > HIDDEN
+        near &= ~hidden
         far = (away > OUT_OF_REACH_M) & np.isfinite(away)
         empty = near & (points == 0)
-        for tally in (self._all, self._tallies[frame.agent]):
+        for tally in (self._all, self._tallies[agent]):
             tally.boxes += int(np.isfinite(away).sum())
             tally.far += int(far.sum())
             tally.near += int(near.sum())
             tally.empty += int(empty.sum())
-            named = frame.annotations.track[empty | far].tolist()
-            tally.objects |= {(frame.scene, track) for track in named}
-            tally.first = tally.first or (f"'{named[0]}' in {frame.key}" if named else "")
+            judged = ((away <= NEAR_M) | (away > BEYOND_M)) & np.isfinite(away) & ~hidden
+            tally.judged.update(beamed[judged].tolist())
+            tally.filled.update(beamed[judged & (points > 0)].tolist())
+            tally.bare |= {(scene, name) for name in track[judged & (points == 0)].tolist()}
+            named = track[empty | far].tolist()
+            tally.objects |= {(scene, name) for name in named}
+            tally.first = tally.first or (f"'{named[0]}' in {key}" if named else "")
+
+    def refuse(self, folder: Path) -> None:
+        """Raise `InputError` where fewer than one in five of all boxes have points."""
+        if refusal := self._all.refusal():
+            raise InputError(f"{folder}: {refusal}")
 
     def problems(self) -> Iterator[str]:
         """Yield a sentence where most boxes of all agents are wrong, else one for every agent of which most are."""
@@ -144,10 +187,9 @@ def _raise_floors(boxes: Boxes) -> Boxes:
 def _are_in_view(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Return the mask (M,) of boxes in the LiDAR's frame near it, with `points` (N, 4) returned from beyond them.
 
-    Returns from beyond are in the same direction, at any height; boxes below all beams or between two are not in view.
+    Returns from beyond are in the same direction, at any height.
     """
-    x, y, z = points[:, :3].T.astype(np.float64)
-    level = np.hypot(x, y)
+    x, y = points[:, :2].T.astype(np.float64)
     away = np.hypot(*boxes.center[:, :2].T)
     sectors = round(360 / SECTOR_DEG)
 
@@ -155,15 +197,20 @@ def _are_in_view(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]
         return np.floor(np.degrees(np.arctan2(left, ahead)) / SECTOR_DEG).astype(np.int64) % sectors
 
     reach = np.zeros(sectors)
-    np.maximum.at(reach, sector(x, y), level)
+    np.maximum.at(reach, sector(x, y), np.hypot(x, y))
     beyond = reach[sector(*boxes.center[:, :2].T)] > away + np.linalg.norm(boxes.size, axis=1) / 2
-    slopes = np.sort(z / np.maximum(level, 1e-9))
-    half = boxes.size[:, 2] / 2
+    return beyond & (away <= np.minimum(NEAR_M, NEAR_SIZES * boxes.size.max(axis=1)))
+
+
+def _have_beams(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Return the mask (M,) of boxes in the LiDAR's frame that are at a height with beams, by its `points`."""
+    x, y, z = points[:, :3].T.astype(np.float64)
+    slopes = np.sort(z / np.maximum(np.hypot(x, y), 1e-9))
+    away, half = np.hypot(*boxes.center[:, :2].T), boxes.size[:, 2] / 2
     low, high = (
         np.searchsorted(slopes, (boxes.center[:, 2] + side) / np.maximum(away, 1e-9)) for side in (-half, half)
     )
-    near = away <= np.minimum(NEAR_M, NEAR_SIZES * boxes.size.max(axis=1))
-    return near & beyond & ((low < high) | (low == len(slopes)))
+    return (low < high) | (low == len(slopes))
 
 
 def check_motion(scene: str, trace: Trace) -> Iterator[str]:
