@@ -70,8 +70,14 @@ def find_rig(
 ) -> Rig:
     """Return the LiDAR of sweeps by those of them that are evenly spread.
 
-    `read` returns the points (N, 4) x, y, z [m], intensity of a file. Raises `InputError` where a file is damaged, and
-    where the points are in another frame than x ahead, y left, z up, or not in metres.
+    Raises `InputError` where a file is damaged, and where the points are in another frame than x ahead, y left, z up, or
+    not in metres.
+
+    Args:
+        sweeps: the files of the sweeps.
+        read: function that returns the points (N, 4) x, y, z [m], intensity of a file.
+        stated: height and beams that the user states; by default as the sweeps show.
+        usual: the LiDAR that the sweeps are taken to be of, unless they show another.
     """
     chosen = sorted({sweeps[round(i)] for i in np.linspace(0, len(sweeps) - 1, LOOKED)}) if sweeps else []
     clouds = [read(path) for path in chosen]
