@@ -9,12 +9,13 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import fftconvolve
 
 from flcav.config import InputError
 from flcav.dataset.layout import FILES, payload_path, read_manifest, table_path
 from flcav.dataset.payloads import POINTS
 from flcav.dataset.tables import read_table
-from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse
+from flcav.geometry import Array, Boxes, count_points_in_boxes, inverse, points_in_boxes, transform_points
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
@@ -28,6 +29,14 @@ BEYOND_M, OUT_OF_REACH_M = 250.0, 1000.0  # beyond it no LiDAR has points of a c
 NEAR_SIZES = 10.0  # the same for smaller boxes, in lengths of their longest side
 LIFT_M = 0.2  # height of a box's lower part, whose points may be the ground's [m]
 HIDDEN = 0.5  # occlusion above which a box may be empty
+LOW_M, CLEAR_M = 0.5, 3.0  # height above the ground, and distance from the vehicle, of points that are compared
+SHARED_M, CELL_M, SHIFT_M = (
+    30.0,
+    0.5,
+    8.0,
+)  # half of the square that two vehicles share, its cells, largest shift looked for
+FEWEST_POINTS, FEWEST_CELLS = 200, 30  # of a vehicle in the square, and that coincide
+APART_M, CONTRADICT, MOST_PAIRS = 2.0, 0.2, 50  # shift that is a contradiction, share of such; pairs compared
 SECTOR_DEG = 2.0  # width of the azimuth sectors for which a LiDAR's range is determined
 FEWEST_BOXES, FEWEST_OBJECTS = 5, 3  # boxes, and different objects among them, from which a share is judged
 FEWEST_FILLED = 0.2  # share of boxes with points below which labels and points are not in one frame
@@ -164,9 +173,12 @@ class EmptyBoxes:
             tally.first = tally.first or (f"'{named[0]}' in {key}" if named else "")
 
     def refuse(self, folder: Path) -> None:
-        """Raise `InputError` where fewer than one in five of all boxes have points."""
+        """Raise `InputError` where fewer than one in five boxes have points, of all or of an agent's."""
         if refusal := self._all.refusal():
             raise InputError(f"{folder}: {refusal}")
+        for agent, tally in self._tallies.items():
+            if refusal := tally.refusal():
+                raise InputError(f"{folder}: {agent}: {refusal}")
 
     def problems(self) -> Iterator[str]:
         """Yield a sentence where most boxes of all agents are wrong, else one for every agent of which most are."""
@@ -211,6 +223,79 @@ def _have_beams(boxes: Boxes, points: NDArray[np.float32]) -> NDArray[np.bool_]:
         np.searchsorted(slopes, (boxes.center[:, 2] + side) / np.maximum(away, 1e-9)) for side in (-half, half)
     )
     return (low < high) | (low == len(slopes))
+
+
+@dataclass
+class SharedPoints:
+    """Detector of poses that contradict each other: static points that two vehicles see at once lie metres apart.
+
+    Points above the ground and outside labelled boxes are compared, as occupied cells of the world's plane between the
+    vehicles: it is counted whether another shift than none lets twice as many cells coincide.
+    """
+
+    pairs: int = 0  # of vehicles that see the same at one time
+    apart: list[tuple[float, str]] = field(default_factory=list)  # shift [m] and frames of pairs that contradict
+    _spin: list[Frame] = field(default_factory=list)  # the frames so far of the latest spin
+    _static: dict[str, Array] = field(default_factory=dict)  # their points (N, 2), of those that were compared
+
+    def add(self, frame: Frame) -> None:
+        """Compare a frame with the others of its spin, which come before it."""
+        if self._spin and (frame.scene, frame.index) != (self._spin[0].scene, self._spin[0].index):
+            self._spin, self._static = [], {}
+        for other in self._spin if self.pairs < MOST_PAIRS else ():
+            places = frame.world_from_agent[:2, 3], other.world_from_agent[:2, 3]
+            if np.linalg.norm(places[0] - places[1]) < NEAR_M:
+                middle = (places[0] + places[1]) / 2
+                one, two = (
+                    points[np.abs(points).max(axis=1) < SHARED_M]
+                    for points in (self._find(each) - middle for each in (frame, other))
+                )
+                if min(len(one), len(two)) >= FEWEST_POINTS:
+                    self.pairs += 1
+                    if (shift_m := _find_shift(one, two)) >= APART_M:
+                        self.apart.append((shift_m, f"{other.key} and {frame.key}"))
+        self._spin.append(frame)
+
+    def _find(self, frame: Frame) -> Array:
+        if frame.agent not in self._static:
+            self._static[frame.agent] = _find_static(frame)
+        return self._static[frame.agent]
+
+    def refuse(self, folder: Path) -> None:
+        """Raise `InputError` where many pairs contradict each other; those of two vehicles wrong alike do not."""
+        if len(self.apart) > max(1, CONTRADICT * self.pairs):
+            shift_m, where = self.apart[0]
+            raise InputError(
+                f"{folder}: the static points of two vehicles lie metres apart in {len(self.apart)} of {self.pairs} "
+                f"pairs of frames, first {shift_m:.1f} m in {where}: their poses do not fit together; {CHECK}"
+            )
+
+
+def _find_static(frame: Frame) -> Array:
+    """Return the points (N, 2) [m, world] of a frame that are above the ground and in no labelled box."""
+    found = [np.zeros((0, 2))]
+    for name, cloud in frame.lidar.items():
+        if np.isfinite(cloud).all():
+            local = transform_points(frame.agent_from_sensor[name], cloud[:, :3])
+            high = local[(local[:, 2] > LOW_M) & (np.hypot(*local[:, :2].T) > CLEAR_M)]
+            world = transform_points(frame.world_from_agent, high)
+            boxed = points_in_boxes(world, frame.annotations.boxes, LOW_M).any(axis=0)
+            found.append(world[~boxed, :2])
+    return np.concatenate(found)
+
+
+def _find_shift(one: Array, other: Array) -> float:
+    """Return the shift [m] by which twice as many cells of two sets of points (N, 2) [m] coincide as by none, or 0."""
+    edges = np.arange(-SHARED_M, SHARED_M + CELL_M, CELL_M)
+    grids = [np.histogram2d(*points.T, bins=edges)[0] > 0 for points in (one, other)]
+    wide = np.lib.stride_tricks.sliding_window_view(np.pad(grids[0], 1), (3, 3)).any(axis=(2, 3))
+    most = round(SHIFT_M / CELL_M)
+    inner = grids[1][most:-most, most:-most].astype(float)
+    matches = fftconvolve(wide.astype(float), inner[::-1, ::-1], mode="valid")
+    best = np.unravel_index(matches.argmax(), matches.shape)
+    if matches[best] < FEWEST_CELLS or matches[best] < 2 * matches[most, most]:
+        return 0.0
+    return float(CELL_M * np.linalg.norm(np.array(best) - most))
 
 
 def check_motion(scene: str, trace: Trace) -> Iterator[str]:

@@ -19,7 +19,7 @@ from flcav.dataset.frame_checks import check_triggers
 from flcav.dataset.ground import POLE
 from flcav.dataset.layout import WORK
 from flcav.dataset.recording.recorder import drop_unbegun, record
-from flcav.dataset.scene_checks import EmptyBoxes
+from flcav.dataset.scene_checks import EmptyBoxes, SharedPoints
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.locks import LOCK, only_writer
@@ -95,6 +95,7 @@ class _Checked:
     source: Source
     folder: Path
     boxes: EmptyBoxes = field(default_factory=EmptyBoxes)
+    shared: SharedPoints = field(default_factory=SharedPoints)
     sweeps: list[Array32] = field(default_factory=list)  # some of vehicles', (N, 3) x ahead, y left, z up [m]
     strays: list[str] = field(default_factory=list)  # a sentence per inconsistent pose
 
@@ -118,6 +119,7 @@ class _Checked:
         for frame in self.source.frames(scene):
             yield frame
             self.boxes.add(frame)
+            self.shared.add(frame)
             self.strays.extend(check_triggers(frame))
             if not frame.agent.startswith(POLE) and len(self.sweeps) < LOOKED:
                 self.sweeps.extend(  # as in the vehicle's axes, about the LiDAR
@@ -133,6 +135,7 @@ class _Checked:
             if other := find_other_frame(self.sweeps, placed=True):
                 raise InputError(f"{self.folder}: {other}")
             self.boxes.refuse(self.folder)
+            self.shared.refuse(self.folder)
         except InputError as error:
             raise _OtherFrame(str(error)) from None
 

@@ -70,8 +70,8 @@ def find_rig(
 ) -> Rig:
     """Return the LiDAR of sweeps by those of them that are evenly spread.
 
-    Raises `InputError` where a file is damaged, and where the points are in another frame than x ahead, y left, z up, or
-    not in metres.
+    Raises `InputError` where a file is damaged, and where the points are in another frame than x ahead, y left, z up,
+    or not in metres.
 
     Args:
         sweeps: the files of the sweeps.
