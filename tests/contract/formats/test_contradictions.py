@@ -254,6 +254,13 @@ def test_a_row_that_cannot_be_is_refused(
         import_dataset("nuscenes", folder, tmp_path / "out")
 
 
+def test_nuscenes_without_pictures_of_its_maps_is_read(copied: Callable[[str], Path], tmp_path: Path):
+    folder = copied("nuscenes")
+    (path,) = folder.glob("maps/*.png")
+    path.unlink()
+    assert import_dataset("nuscenes", folder, tmp_path / "out") == ()
+
+
 def test_samples_of_one_time_are_refused_by_name(copied: Callable[[str], Path], tmp_path: Path):
     folder = copied("nuscenes")
     path = change_rows(folder, "sample", lambda rows: rows[1].update(timestamp=rows[0]["timestamp"]))
