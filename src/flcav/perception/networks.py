@@ -251,7 +251,7 @@ def infer(
     files = [path for path in paths if driven and path not in chosen]
     if lidar != UNSTATED and not files:
         raise InputError("--lidar-height and --beams: only point clouds of a vehicle in files have a use for them")
-    rigs = find_rigs(files, looking.config, lidar)
+    rigs = find_rigs(files, looking.config, lidar) if files else {}
     unlike = {
         files[0] if len(files) == 1 else folder: compare_files_rig(rig, lidar, looking.config, trained)
         for folder, rig in rigs.items()

@@ -15,13 +15,12 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, path_within, read_file
-from flcav.dataset.formats.clouds import describe_numbers, has_kitti_layout
+from flcav.dataset.formats.clouds import describe_numbers, find_millimetres, has_kitti_layout
 from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
 from flcav.dataset.payloads import open_image, turn_upright
 from flcav.geometry import Array, Boxes, heading_vectors, inverse, transform_points, wrap_angle
 
 LAYOUT, POINT = "4 columns of float32", "x, y, z [m], intensity 0 to 1"
-MILLIMETRES = 1000.0  # in a metre
 POINT_BYTES = 16  # x, y, z [m], reflectance [0, 1], each float32
 LABEL_FIELDS = 15  # of a ground-truth label; a detection has a 16th, its score
 MATRICES = {"P2": (3, 4), "R0_rect": (3, 3), "Tr_velo_to_cam": (3, 4)}
@@ -60,17 +59,15 @@ def read_points(path: Path) -> NDArray[np.float32]:
 
 def _refuse_points(data: bytes, path: Path) -> Never:
     """Raise `InputError`, naming what the bytes are instead of a point cloud."""
+    if (largest := find_millimetres(data)) is not None:
+        raise InputError(f"{path}: coordinates up to {largest:.0f}, millimetres by their size; wanted are metres")
     if (layout := describe_numbers(data)) not in ("", LAYOUT):
         raise InputError(f"{path}: {layout} by its numbers; wanted are {LAYOUT}: {POINT}")
     if len(data) % POINT_BYTES:
         raise InputError(
             f"{path}: truncated; {len(data)} bytes are not a multiple of {POINT_BYTES}, the size of a point"
         )
-    rows = np.frombuffer(data, "<f4").reshape(-1, 4)
-    check_cloud(rows, path)
-    if has_kitti_layout((rows / np.array([*[MILLIMETRES] * 3, 1], np.float32)).astype("<f4").tobytes()):
-        largest = np.abs(rows[:, :3]).max()
-        raise InputError(f"{path}: coordinates up to {largest:.0f}, millimetres by their size; wanted are metres")
+    check_cloud(np.frombuffer(data, "<f4").reshape(-1, 4), path)
     raise InputError(f"{path}: no point cloud by its numbers; wanted are {LAYOUT}: {POINT}")
 
 
