@@ -1,6 +1,8 @@
 """Points and labels that are not in metres, x ahead, y left, z up: named by what shows it; genuine ones are not."""
 
+import contextlib
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +12,11 @@ from kitti_folders import LABEL, cast, write_folder
 from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.dataset.formats.conversion import import_dataset
+from flcav.dataset.formats.kitti import KittiFolder
 from flcav.dataset.formats.mounting import estimate_mounting, find_other_frame
 from flcav.dataset.formats.rig import StatedLidar
 from flcav.dataset.formats.sweeps import read_cloud_file
+from flcav.dataset.scene_checks import EmptyBoxes
 from flcav.geometry import inverse, pose, transform_points
 from flcav.perception.networks import evaluate, infer
 from flcav.perception.objects.model import second_tiny
@@ -154,3 +158,22 @@ def test_the_first_line_says_what_is_corrected(tmp_path: Path, capsys: pytest.Ca
 def test_height_and_beams_are_of_files_alone(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="--lidar-height and --beams: only point clouds of a vehicle in files"):
         infer("weather", tmp_path, lidar=StatedLidar(1.5))
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason=f"no real frames at {DATA}; set FLCAV_REAL_DATA")
+def test_labels_of_real_frames_are_refused_moved_and_left_alone_as_they_are() -> None:
+    folder = KittiFolder.open(DATA / "kitti_frame", pictures=False)
+    frame = folder.frame(0)
+    boxes, names = frame.objects.boxes, np.array([str(row) for row in range(len(frame.objects.boxes))])
+    moved = {
+        "": boxes,
+        "lifted": replace(boxes, center=boxes.center + np.array((0, 0, 3))),
+        "in millimetres": replace(boxes, center=1000 * boxes.center),
+        "in the camera's frame": replace(boxes, center=boxes.center @ [[0, 0, 1], [-1, 0, 0], [0, -1, 0]]),
+        "in the world's": replace(boxes, center=boxes.center + np.array((300, 100, 0))),
+    }
+    for how, found in moved.items():
+        checked = EmptyBoxes()
+        checked.count(found, [(frame.points, np.eye(4))], names, np.zeros(len(names)), "ego", "scene", "frame")
+        with pytest.raises(InputError, match="0 of 6 boxes") if how else contextlib.nullcontext():
+            checked.refuse(DATA)
