@@ -2,12 +2,12 @@
 flcav import 10_your_own_recordings:IMPORT ASTYX --split train --out data/train
 flcav import 10_your_own_recordings:IMPORT ASTYX --split val --out data/val"""
 
+import json
 from itertools import pairwise
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from flcav.config import read_json
 from flcav.dataset import ImportFormat, LogSource, UsualLidar, annotate, find_rig
 from flcav.geometry import transform_points, turned_boxes
 from flcav.sensors import Calibration, Frame
@@ -53,13 +53,13 @@ class Recordings(LogSource):
 
 def read_points(path):  # (N, 4) x ahead, y left, z up [m], intensity 0 to 1, in the frame of the boxes: the radar's
     rows = np.loadtxt(path, skiprows=1, ndmin=2)  # X Y Z Reflectivity LaserID Timestamp
-    sensors = read_json(folder_of(path) / "calibration" / f"{path.stem}.json")["sensors"]
+    sensors = json.loads((folder_of(path) / "calibration" / f"{path.stem}.json").read_text())["sensors"]
     (pose,) = (each["calib_data"]["T_to_ref_COS"] for each in sensors if each["sensor_uid"] == "lidar_vlp16")
     return np.column_stack((transform_points(np.array(pose), rows[:, :3]), rows[:, 3] / 255)).astype(np.float32)
 
 
 def read_boxes(path):
-    objects = read_json(path)["objects"]
+    objects = json.loads(path.read_text())["objects"]
     center, size = (np.array([row[name] for row in objects]).reshape(-1, 3) for name in ("center3d", "dimension3d"))
     quaternions = np.array([row["orientation_quat"] for row in objects]).reshape(-1, 4)[
         :, [1, 2, 3, 0]

@@ -89,11 +89,11 @@ def is_shown(boxes: Boxes, frame: Frame) -> Mask:
     return (depth > 0) & (x / ahead >= 0) & (x / ahead < width) & (y / ahead >= 0) & (y / ahead < height)
 
 
-def rate(labels: list[Boxes], truths: list[FrameTruth]) -> list[list[object]]:
+def rate(labels: list[Boxes], truths: list[FrameTruth]) -> list[list[str | float]]:
     """Return the rows of the table, by class and distance from the LiDAR."""
     sure = [replace(boxes, score=np.ones(len(boxes))) for boxes in labels]
     classes = sorted({str(label) for truth in truths for label in truth.targets.label})
-    rows = list[list[object]]()
+    rows = list[list[str | float]]()
     for each in count_objects(sure, truths, classes):
         low, high = each.distance_m
         errors = np.concatenate([_errors(*pair, each.label, low, high) for pair in zip(labels, truths, strict=True)])

@@ -276,7 +276,9 @@ def compare_kitti_rig(path: Path, rig: Rig, config: SecondConfig, trained: Known
 
     The words are those of `find_rig` and `describe_rig`. Neither beams nor range are known of an export of flcav.
     """
-    here = KnownLidar() if (path / FRAMES).is_file() else KnownLidar((rig.beams, rig.beams), RANGE_M)
+    here = KnownLidar()
+    if rig.beams is not None and not (path / FRAMES).is_file():
+        here = KnownLidar((rig.beams, rig.beams), RANGE_M)
     return "; ".join(filter(None, (*rig.notes, describe_rig([rig.agent_from_lidar], here, config, trained))))
 
 

@@ -113,7 +113,7 @@ def test_velocities_are_those_over_ground(folder: Path, tmp_path: Path, drive: l
             rows.append(f"{number} {track} Car 0 0 0 560 160 640 220 1.5 1.7 4.0 {-y} {0.75 - z} {x} -1.57\n")
     (part / "label_02" / "0000.txt").write_text("".join(rows))
     import_dataset("kitti-tracking", tmp_path / "in", tmp_path / "out", posed=DrivenSource)
-    data = Dataset.open(tmp_path / "out")
+    data, true = Dataset.open(tmp_path / "out"), np.zeros(3)
     for number in range(1, len(drive) - 1):
         ahead, parked = data.frame(number).annotations.velocity
         before, after = (

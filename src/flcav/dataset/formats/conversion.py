@@ -69,6 +69,7 @@ def import_dataset(
                 raise InputError(f"{folder}: is no folder of '{name}' but of '{other}'")
     with only_writer(out):
         begun = (out / WORK).exists()  # by an earlier call
+        source: LogSource | None = None
         try:
             source = chosen.read(folder, split, lidar) if chosen.takes_lidar else chosen.read(folder, split)
             checked = _Checked(posed(source), folder)
@@ -76,7 +77,7 @@ def import_dataset(
         except (ValueError, OSError) as error:
             if not begun:
                 drop_unbegun(out, whole=isinstance(error, _OtherFrame))
-            if isinstance(error, _OtherFrame):
+            if isinstance(error, _OtherFrame) and source is not None:
                 raise InputError("; ".join((str(error), *source.contradictions))) from None
             if isinstance(error, InputError | OSError):
                 raise
