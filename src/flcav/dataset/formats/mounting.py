@@ -82,15 +82,17 @@ SECTORS = 36  # of a turn, in which points are looked for
 WANTED = "wanted are x ahead, y left, z up, in metres"
 
 
-def find_other_frame(clouds: Sequence[Array32], *, placed: bool = False) -> str:
+def find_other_frame(clouds: Sequence[Array32], *, placed: bool = False, grounded: bool = False) -> str:
     """Return what shows that sweeps (N, >= 3) are not in metres, x ahead, y left, z up; "" where nothing does.
 
     A sweep to all sides looks the same whichever way it is turned about z. `placed` LiDARs have a calibration, and may
-    look to any side.
+    look to any side. `grounded`: most sweeps are known to show ground below the LiDAR.
     """
     clouds = [cloud for cloud in clouds if len(cloud)]
     if not clouds:
         return ""
+    if grounded:
+        return "" if placed else _find_side(clouds)
     median = float(np.median([np.median(np.linalg.norm(cloud[:, :3], axis=1)) for cloud in clouds]))
     if median > MEDIAN_M:
         units = [name for scale, name in UNITS.items() if _count_grounds([cloud / scale for cloud in clouds])]

@@ -81,9 +81,9 @@ def find_rig(
     """
     chosen = sorted({sweeps[round(i)] for i in np.linspace(0, len(sweeps) - 1, LOOKED)}) if sweeps else []
     clouds = [read(path) for path in chosen]
-    if other := find_other_frame(clouds):
-        raise InputError(f"{chosen[0] if len(chosen) == 1 else chosen[0].parent}: {other}")
     found = estimate_mounting(clouds)
+    if other := find_other_frame(clouds, grounded=found is not None):
+        raise InputError(f"{chosen[0] if len(chosen) == 1 else chosen[0].parent}: {other}")
     beams = stated.beams or (usual.beams if found is None else found.beams)
     notes = list[str]()
     if stated.beams is None and usual.beams is not None and beams != usual.beams:
