@@ -25,7 +25,8 @@ from flcav.perception.device import select_device
 from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti, open_evaluated
 from flcav.perception.objects.evaluate import ObjectsEvaluation
-from flcav.perception.objects.predict import compare_files_rig, find_rigs, look_around
+from flcav.perception.objects.predict import look_around
+from flcav.perception.objects.samples import compare_files_rig, find_rigs
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.objects.truth import narrow_range
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task

@@ -20,7 +20,8 @@ from flcav.dataset.scene_checks import EmptyBoxes
 from flcav.geometry import inverse, pose, transform_points
 from flcav.perception.networks import evaluate, infer
 from flcav.perception.objects.model import second_tiny
-from flcav.perception.objects.predict import find_rigs, read_point_clouds
+from flcav.perception.objects.predict import read_point_clouds
+from flcav.perception.objects.samples import find_rigs
 from flcav.perception.objects.task import OBJECTS
 
 DATA = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4] / "shared" / "data"))

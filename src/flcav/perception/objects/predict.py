@@ -6,7 +6,6 @@ and the ratio of squared errors to predicted variances. Point clouds are read fr
 
 import copy
 import math
-from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -19,9 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.arrays import Array, Array32
-from flcav.config import InputError
-from flcav.dataset.formats.rig import Rig, StatedLidar, UsualLidar, find_rig
-from flcav.dataset.formats.sweeps import list_sweeps, read_cloud_file
+from flcav.dataset.formats.sweeps import list_cloud_files, read_cloud_file
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse, pose
@@ -35,7 +32,7 @@ from flcav.perception.metrics import calibration_error, fit_logistic, match, rou
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.loss import anchor_boxes, anchor_classes, decode_residuals, decode_variance
 from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second, SecondConfig
-from flcav.perception.objects.samples import describe_rig, move_points, validate_points
+from flcav.perception.objects.samples import move_points, validate_points
 from flcav.perception.objects.truth import (
     QUARTERS,
     FrameTruth,
@@ -49,7 +46,7 @@ from flcav.perception.objects.truth import (
 )
 from flcav.perception.ops.boxes import nms
 from flcav.perception.ops.sparse import SparseTensor
-from flcav.perception.task import Finding, KnownLidar, Result
+from flcav.perception.task import Finding, Result
 from flcav.sensors.frame import Frame
 from flcav.storage.records import Class
 
@@ -285,8 +282,8 @@ def detect_objects(
     """Yield the objects of score `threshold` or more in each point cloud of `path`, in the frame of its points.
 
     `path` is a point cloud file, see `read_cloud_file`, a folder of them, or a dataset folder, with its `frames` (None:
-    all). `mount` (4, 4) [m] is that of the LiDAR of files, see `find_rigs` (None: as the network expects). Raises
-    `InputError` as `read_point_clouds` does.
+    all). `mount` (4, 4) [m] is that of the LiDAR of files, see `find_rigs` of `samples` (None: as the network expects).
+    Raises `InputError` as `read_point_clouds` does.
     """
     for cloud in read_point_clouds(path, frames, network.config, mount):
         (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)
@@ -309,38 +306,6 @@ def read_point_clouds(
         InputCloud(file, validate_points(read_cloud_file(file), file), move, partial(view_beside, file))
         for file in list_cloud_files(path)
     )
-
-
-def list_cloud_files(path: Path) -> list[Path]:
-    """Return the point cloud files of a folder, or the file itself; raises `InputError` where there are none."""
-    if not path.is_dir():
-        if not path.is_file():
-            raise InputError(f"{path}: no such file or folder")
-        return [path]
-    files = list_sweeps(path)
-    if not files:
-        raise InputError(f"{path}: neither a dataset nor a folder with .bin or .pcd files")
-    return files
-
-
-def find_rigs(paths: Sequence[Path], config: SecondConfig, lidar: StatedLidar) -> dict[Path, Rig]:
-    """Return the LiDAR of point cloud files by their folder, given files and folders of them.
-
-    It is the one that a network of `config` expects, unless the sweeps or `lidar` say otherwise. Raises `InputError` as
-    `find_rig` and `list_cloud_files` do.
-    """
-    files = defaultdict[Path, list[Path]](list)
-    for path in paths:
-        files[path if path.is_dir() else path.parent] += list_cloud_files(path)
-    usual = UsualLidar("the network's", -config.ground_z_m)
-    return {folder: find_rig(sweeps, read_cloud_file, lidar, usual) for folder, sweeps in files.items()}
-
-
-def compare_files_rig(rig: Rig, lidar: StatedLidar, config: SecondConfig, trained: KnownLidar) -> str:
-    """Return how the LiDAR of files by `find_rigs` differs from that of a network's training, in words; "" if not."""
-    here = KnownLidar() if rig.beams is None else KnownLidar((rig.beams, rig.beams))
-    stated = [] if lidar.height_m is None else [rig.agent_from_lidar]  # the notes tell a height that is found
-    return "; ".join(filter(None, (*rig.notes, describe_rig(stated, here, config, trained))))
 
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
