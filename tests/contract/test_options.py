@@ -124,7 +124,15 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         "--beams": (),
         **RUNS,
     },
-    "infer": {"--weights": ALWAYS, "--threshold": SCORED, "--around": ("objects",), "--pictures": ALWAYS, **RUNS},
+    "infer": {
+        "--weights": ALWAYS,
+        "--threshold": SCORED,
+        "--around": ("objects",),
+        "--lidar-height": ("objects",),
+        "--beams": ("objects",),
+        "--pictures": ALWAYS,
+        **RUNS,
+    },
     "errors": {
         "--data": ALWAYS,
         "--weights": ALWAYS,

@@ -95,7 +95,7 @@ def import_(
     Files that need no conversion are linked to, so they have to stay where they are.
     """
     from flcav.dataset.formats.conversion import import_dataset
-    from flcav.dataset.formats.kitti.rig import StatedLidar
+    from flcav.dataset.formats.rig import StatedLidar
     from flcav.dataset.layout import read_manifest
     from flcav.dataset.scene_checks import find_copies
     from flcav.dataset.validation import find_leaks

@@ -107,9 +107,9 @@ LIDAR_HEIGHT = typer.Option(
     None,
     "--lidar-height",
     callback=check_finite,
-    help="A folder in KITTI's layout: metres of its LiDAR above the ground; by default as its sweeps show.",
+    help="Point clouds of KITTI's layout, or files: metres of their LiDAR above the ground; by default as they show.",
 )
-BEAMS = typer.Option(None, "--beams", help="A folder in KITTI's layout: beams of its LiDAR, likewise.")
+BEAMS = typer.Option(None, "--beams", help="Likewise: beams of their LiDAR.")
 
 
 def check_all_finite(parameter: click.Parameter, values: list[float]) -> list[float]:

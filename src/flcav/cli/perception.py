@@ -119,7 +119,7 @@ def evaluate(
     KITTI are counted as its benchmark does: easy, moderate, hard.
     """
     use_threads(threads)
-    from flcav.dataset.formats.kitti.rig import StatedLidar
+    from flcav.dataset.formats.rig import StatedLidar
     from flcav.interface import progress
     from flcav.perception import networks
     from flcav.perception.tasks import task_named
@@ -166,15 +166,19 @@ def infer(
     pictures: Path | None = typer.Option(None, "--pictures", help="Folder for a picture of each input with findings."),
     agents: str | None = AGENTS,
     around: bool = AROUND,
+    lidar_height: float | None = LIDAR_HEIGHT,
+    beams: int | None = BEAMS,
     threads: int = THREADS,
 ) -> Answer:
     """Run a network on files or datasets.
 
-    Boxes of objects are in the LiDAR frame: x forward, y left, z up, metres and radians. Boxes of signs are in pixels
+    Boxes of objects are in the LiDAR frame, of a file in that of its points: x forward, y left, z up, metres and
+    radians. Boxes of signs are in pixels
     from the upper left corner of the picture. Paths are in the world's frame, all modes with their probabilities,
     with "constant_velocity" beside them and "truth" where the recording goes on for long enough.
     """
     use_threads(threads)
+    from flcav.dataset.formats.rig import StatedLidar
     from flcav.perception import networks
     from flcav.perception.task import Scores
     from flcav.perception.tasks import task_named
@@ -186,7 +190,15 @@ def infer(
     if not isinstance(learned, Scores):
         refuse_unused(f"infer {task}", "threshold")
     found = networks.infer(
-        learned, inputs, weights, threshold=threshold, around=around, agents=agents, device=device, threads=threads
+        learned,
+        inputs,
+        weights,
+        threshold=threshold,
+        around=around,
+        agents=agents,
+        lidar=StatedLidar(lidar_height, beams),
+        device=device,
+        threads=threads,
     )
     findings = []
     for number, finding in enumerate(found):
@@ -195,7 +207,10 @@ def infer(
             _draw_finding(finding, pictures / f"{number:05d}_{finding.path.stem}.png")
     datasets = [{"path": str(path), **choice.summary()} for path, choice in found.chosen.items()]
     results = [{"path": path, **result.as_json()} for path, result in findings]
-    yield {"datasets": datasets, "inputs": results}
+    lidars = [{"path": str(path), "rig": unlike} for path, unlike in found.lidars.items()]
+    yield {"datasets": datasets, "inputs": results} | ({"lidars": lidars} if lidars else {})
+    for path, unlike in found.lidars.items():
+        yield f"{path}: {unlike}"
     for path, choice in found.chosen.items():
         yield f"{path}: {choice.sentence}"
     for path, result in findings:

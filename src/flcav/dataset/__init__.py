@@ -8,6 +8,7 @@ if TYPE_CHECKING:
     from flcav.dataset.formats.conversion import export, import_dataset
     from flcav.dataset.formats.formats import EXPORTS, IMPORTS
     from flcav.dataset.formats.reading import ImportFormat, LogSource, annotate
+    from flcav.dataset.formats.rig import StatedLidar, UsualLidar, find_rig
     from flcav.dataset.formats.writing import Exported, ExportFormat, ExportOptions, read_frame
     from flcav.dataset.recording.recorder import record
     from flcav.dataset.store import Dataset
@@ -28,6 +29,9 @@ PLACES = {
     "ImportFormat": "flcav.dataset.formats.reading",
     "LogSource": "flcav.dataset.formats.reading",
     "annotate": "flcav.dataset.formats.reading",
+    "find_rig": "flcav.dataset.formats.rig",
+    "StatedLidar": "flcav.dataset.formats.rig",
+    "UsualLidar": "flcav.dataset.formats.rig",
 }
 __all__ = [*PLACES]  # pyright: ignore[reportUnsupportedDunderAll]
 __getattr__, __dir__ = lazy_names(__name__, PLACES)

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from flcav.arrays import Array
 from flcav.config import InputError, Json
+from flcav.dataset.formats.reading import difference_tracks
 from flcav.geometry import inverse
 from flcav.interface.wording import format_install_command
 from flcav.sensors.frame import Frame
@@ -148,15 +149,35 @@ class DrivenSource:
         return
 
     def frames(self, scene: str) -> Iterator[Frame]:
-        """Yield the frames of a scene with estimated poses; raises `InputError` where a frame has no LiDAR sweep."""
+        """Yield the frames of a scene with estimated poses, and velocities of tracks where the source knows none.
+
+        The source is read twice, since velocities are differences of neighbouring labels in the world of those poses.
+        Raises `InputError` where a frame has no LiDAR sweep.
+        """
         odometry_of: dict[str, Odometry] = {}
+        poses, tracks = list[Array](), list[tuple[list[str], float, Array]]()
         for frame in self.source.frames(scene):
             if not frame.lidar:
                 raise InputError(f"{frame.key}: no LiDAR sweep, which poses are estimated from")
             name = next(iter(frame.lidar))
             odometry = odometry_of.setdefault(frame.agent, Odometry())
             mount = frame.agent_from_sensor[name]
-            yield move_frame(frame, mount @ odometry.step(frame.lidar[name]) @ inverse(mount))
+            poses.append(mount @ odometry.step(frame.lidar[name]) @ inverse(mount))
+            known = move_frame(frame, poses[-1]).annotations
+            named = [f"{frame.agent}/{track}" for track in known.track.tolist()]  # each agent has a world of its own
+            tracks.append((named, frame.time_s, known.boxes.center))
+        counts = [len(named) for named, _, _ in tracks]
+        moving = difference_tracks(
+            np.array([track for named, _, _ in tracks for track in named], np.str_),
+            np.repeat([time_s for _, time_s, _ in tracks], counts),
+            np.concatenate([np.zeros((0, 3)), *(center for _, _, center in tracks)]),
+        )
+        velocities = np.split(moving, np.cumsum(counts)[:-1])
+        for frame, pose, velocity in zip(self.source.frames(scene), poses, velocities, strict=True):
+            moved = move_frame(frame, pose)
+            known = moved.annotations
+            filled = np.where(np.isnan(known.velocity), velocity, known.velocity)
+            yield replace(moved, annotations=replace(known, velocity=filled))
 
 
 def move_frame(frame: Frame, world_from_agent: Array) -> Frame:

@@ -21,9 +21,10 @@ from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
-from flcav.dataset.formats.kitti.rig import RANGE_M, KittiRig
 from flcav.dataset.formats.kitti.write import FRAMES
+from flcav.dataset.formats.rig import LOOKED, RANGE_M, Rig
 from flcav.dataset.layout import MANIFEST
+from flcav.dataset.scene_checks import EmptyBoxes
 from flcav.geometry import Boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
@@ -270,12 +271,14 @@ def is_kitti(path: Path) -> bool:
     return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / MANIFEST).exists())
 
 
-def compare_kitti_rig(path: Path, rig: KittiRig, config: SecondConfig, trained: KnownLidar) -> str:
+def compare_kitti_rig(path: Path, rig: Rig, config: SecondConfig, trained: KnownLidar) -> str:
     """Return how the LiDAR of the KITTI folder `path` differs from KITTI's and from that of the network's training.
 
     The words are those of `find_rig` and `describe_rig`. Neither beams nor range are known of an export of flcav.
     """
-    here = KnownLidar() if (path / FRAMES).is_file() else KnownLidar((rig.beams, rig.beams), RANGE_M)
+    here = KnownLidar()
+    if rig.beams is not None and not (path / FRAMES).is_file():
+        here = KnownLidar((rig.beams, rig.beams), RANGE_M)
     return "; ".join(filter(None, (*rig.notes, describe_rig([rig.agent_from_lidar], here, config, trained))))
 
 
@@ -288,9 +291,7 @@ def open_evaluated(path: Path) -> tuple[KittiFolder, str | None]:
     return KittiFolder.open(path, split, pictures=False), split
 
 
-def evaluate_kitti(
-    network: Second, path: Path, rig: KittiRig, progress: Report = ignore_progress
-) -> BenchmarkEvaluation:
+def evaluate_kitti(network: Second, path: Path, rig: Rig, progress: Report = ignore_progress) -> BenchmarkEvaluation:
     """Return the AP|R40 of each class on the frames of `open_evaluated`, whose LiDAR is that of `rig`.
 
     Raises `InputError` where a file is missing, truncated or malformed.
@@ -298,6 +299,7 @@ def evaluate_kitti(
     folder, split = open_evaluated(path)
     if not len(folder):
         raise InputError(f"{path}: no frames to evaluate")
+    _check_labels(folder)
     found = list(_detect(network, folder, rig, progress))
     classes = [name for name in network.config.classes if name in LIMITS]
     inside = [in_image(one.boxes, one.frame) for one in found]
@@ -315,7 +317,18 @@ def evaluate_kitti(
     )
 
 
-def _detect(network: Second, folder: KittiFolder, rig: KittiRig, progress: Report) -> Iterator[_Found]:
+def _check_labels(folder: KittiFolder) -> None:
+    """Raise `InputError` where hardly any labelled box has points, by frames that are evenly spread."""
+    boxes = EmptyBoxes()
+    for number in sorted({round(i) for i in np.linspace(0, len(folder) - 1, LOOKED)}):
+        frame = folder.frame(number)
+        labelled = frame.objects.boxes
+        track = np.array([str(row) for row in range(len(labelled))], np.str_)
+        boxes.count(labelled, [(frame.points, np.eye(4))], track, np.zeros(len(track)), "ego", frame.name, frame.name)
+    boxes.refuse(folder.folder)
+
+
+def _detect(network: Second, folder: KittiFolder, rig: Rig, progress: Report) -> Iterator[_Found]:
     move = level_mount(rig.agent_from_lidar, network.config)
     for number in range(len(folder)):
         frame = folder.frame(number)

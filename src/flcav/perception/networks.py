@@ -13,7 +13,8 @@ from typing import Any, cast
 from torch import nn
 
 from flcav.config import DamagedFile, InputError, Json
-from flcav.dataset.formats.kitti.rig import UNSTATED, StatedLidar, find_rig
+from flcav.dataset.formats.kitti import read_points
+from flcav.dataset.formats.rig import UNSTATED, StatedLidar, find_rig
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.interface.notebook import resumable
@@ -25,6 +26,7 @@ from flcav.perception.errors import RegistersErrors, Registry
 from flcav.perception.kitti_benchmark import compare_kitti_rig, evaluate_kitti, is_kitti, open_evaluated
 from flcav.perception.objects.evaluate import ObjectsEvaluation
 from flcav.perception.objects.predict import look_around
+from flcav.perception.objects.samples import compare_files_rig, find_rigs
 from flcav.perception.objects.task import ObjectsTask
 from flcav.perception.objects.truth import narrow_range
 from flcav.perception.task import ConfigT, Finding, KnownLidar, NetworkT, SampleT, Scores, Task
@@ -67,6 +69,7 @@ class Inference:
 
     chosen: Mapping[Path, FrameSelection]  # the selected frames of each input that is a dataset
     findings: Iterator[Finding]
+    lidars: Mapping[Path, str]  # folder of point clouds -> what its LiDAR is taken to be, where not as expected
 
     def __iter__(self) -> Iterator[Finding]:
         return self.findings
@@ -193,7 +196,7 @@ def _evaluate_benchmark(
     task: ObjectsTask, folder: Path, network: Weights, device: str, lidar: StatedLidar, progress: Report
 ) -> Evaluation:
     tested = resolve_network(task, network, device)
-    rig = find_rig(open_evaluated(folder)[0].sweeps, lidar)
+    rig = find_rig(open_evaluated(folder)[0].sweeps, read_points, lidar)
     evaluated = evaluate_kitti(tested, folder, rig, progress)
     unlike = compare_kitti_rig(folder, rig, tested.config, find_trained_lidar(task, network))
     chosen = FrameSelection(tuple(range(evaluated.frames)), ("ego",), {"vehicle": evaluated.frames}, {}, unlike)
@@ -208,12 +211,14 @@ def infer(
     threshold: float | None = None,
     around: bool = False,
     agents: str | None = None,
+    lidar: StatedLidar = UNSTATED,
     device: str = "auto",
     threads: int = 1,
 ) -> Inference:
     """Run a network on files, folders of files, or dataset folders: point clouds or images, by task.
 
-    Raises `InputError` if task, weights, device or agents are unusable; for a bad file, when the iteration reaches it.
+    Raises `InputError` if task, weights, device or agents are unusable, and for a bad file, at the latest when the
+    iteration reaches it.
 
     Args:
         task: a name of `TASKS`, `module:NAME`, or the task itself.
@@ -222,6 +227,7 @@ def infer(
         threshold: score below which detections are left out; None: the task's default.
         around: whether to detect in 360°, in four passes over the rotated sweep; of the task `objects`.
         agents: whose frames: "vehicles", "poles", "all", or names with commas; None: those that the network fits.
+        lidar: height and beams of the LiDAR of point cloud files; by default as they show.
         device: "auto", "cpu" or "cuda".
         threads: number of CPU threads.
 
@@ -242,9 +248,24 @@ def infer(
     chosen = {
         path: choose_frames(learned, looking.config, Dataset.open(path), agents, trained=trained) for path in recorded
     }
-    frames = {path: choice.frames for path, choice in chosen.items()}
+    driven = isinstance(learned, ObjectsTask) and not looking.config.foreground
+    files = [path for path in paths if driven and path not in chosen]
+    if lidar != UNSTATED and not files:
+        raise InputError("--lidar-height and --beams: only point clouds of a vehicle in files have a use for them")
+    rigs = find_rigs(files, looking.config, lidar) if files else {}
+    unlike = {
+        files[0] if len(files) == 1 else folder: compare_files_rig(rig, lidar, looking.config, trained)
+        for folder, rig in rigs.items()
+    }
     lowest = threshold_of(learned, threshold)
-    return Inference(chosen, (f for path in paths for f in learned.infer(looking, path, lowest, frames.get(path))))
+
+    def found() -> Iterator[Finding]:
+        for path in paths:
+            choice, rig = chosen.get(path), rigs.get(path) or rigs.get(path.parent)
+            mounted = {} if choice or rig is None else {"mount": rig.agent_from_lidar}
+            yield from learned.infer(looking, path, lowest, choice and choice.frames, **mounted)
+
+    return Inference(chosen, found(), {folder: words for folder, words in unlike.items() if words})
 
 
 def register_errors(

@@ -4,37 +4,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from kitti_folders import write_folder
+from kitti_folders import cast, write_folder
 
 from flcav.config import InputError
 from flcav.dataset.formats.conversion import import_dataset
-from flcav.dataset.formats.kitti.rig import HEIGHT_M, UNSTATED, KittiRig, StatedLidar, find_rig
+from flcav.dataset.formats.kitti.files import read_points
 from flcav.dataset.formats.mounting import estimate_mounting
+from flcav.dataset.formats.rig import HEIGHT_M, UNSTATED, Rig, StatedLidar, find_rig
 from flcav.dataset.store import Dataset
 from flcav.geometry.poses import pose
-
-ELEVATIONS = {16: (-15, 15), 32: (-30.67, 10.67), 64: (-24.8, 2), 128: (-25, 15)}  # of the beams, evenly spaced [deg]
-
-
-def cast(beams: int, height_m: float, pitch: float, roll: float, seed: int, *, ground: bool = True) -> np.ndarray:
-    """Return a sweep of a street: level ground, walls 9 m to either side, a box of a car's size ahead."""
-    rng = np.random.default_rng(seed)
-    low, high = ELEVATIONS[beams]
-    elevation = np.radians(np.linspace(low, high, beams))
-    azimuth = np.radians(np.arange(0, 360, 0.4) + rng.uniform(0, 0.4))
-    up, around = (each.ravel() for each in np.meshgrid(elevation, azimuth, indexing="ij"))
-    rays = np.column_stack((np.cos(up) * np.cos(around), np.cos(up) * np.sin(around), np.sin(up)))
-    mount = pose(0, 0, height_m, 0, pitch, roll)
-    world = rays @ mount[:3, :3].T
-    far = [np.where(world[:, 2] < 0, height_m / -world[:, 2].clip(max=-1e-9), np.inf)] if ground else []
-    far.append(np.where(np.abs(world[:, 1]) > 1e-9, 9.0 / np.abs(world[:, 1]).clip(min=1e-9), np.inf))
-    ahead = np.where(world[:, 0] > 0, 12.0 / world[:, 0].clip(min=1e-9), np.inf)
-    at = world * ahead.clip(max=1e4)[:, None] + (0, 0, height_m)
-    far.append(np.where((np.abs(at[:, 1]) < 2) & (at[:, 2] > 0) & (at[:, 2] < 1.5), ahead, np.inf))
-    distance = np.min(far, axis=0)
-    seen = (distance < 100) & ((world[:, 2] * distance + height_m) < 8)
-    noisy = rays[seen] * (distance[seen] + rng.normal(0, 0.02, seen.sum()))[:, None]
-    return np.column_stack((noisy, np.full(len(noisy), 0.3))).astype(np.float32)
 
 
 @pytest.mark.parametrize("beams", [16, 32, 64, 128])
@@ -50,11 +28,11 @@ def test_a_sweep_without_ground_shows_none() -> None:
     assert estimate_mounting([cast(64, 1.7, 0, 0, seed, ground=False) for seed in range(2)]) is None
 
 
-def rig(tmp_path: Path, clouds: list[np.ndarray], stated: StatedLidar = UNSTATED) -> KittiRig:
+def rig(tmp_path: Path, clouds: list[np.ndarray], stated: StatedLidar = UNSTATED) -> Rig:
     paths = [tmp_path / f"{number:06d}.bin" for number in range(len(clouds))]
     for path, cloud in zip(paths, clouds, strict=True):
         cloud.tofile(path)
-    return find_rig(paths, stated)
+    return find_rig(paths, read_points, stated)
 
 
 def test_kittis_own_is_taken_as_it_is(tmp_path: Path) -> None:

@@ -251,3 +251,13 @@ def test_real_sweeps_are_read_as_they_are() -> None:
         data = path.read_bytes()
         assert not has_nuscenes_layout(data)
         assert read_cloud_file(path).tobytes() == data, path
+
+
+@pytest.mark.parametrize("encode", [lambda p: p.tobytes(), lambda p: encode_lidar(p, np.zeros(0))])
+def test_millimetres_are_named(encode: Callable[[Points], bytes], tmp_path: Path):
+    points = sweep(3, 4000, 60.0, 1.7, "rings", 0.0)
+    (tmp_path / "a.bin").write_bytes(encode((points * (1000, 1000, 1000, 1)).astype("<f4")))
+    with pytest.raises(
+        InputError, match=r"a\.bin: coordinates up to \d+, millimetres by their size; wanted are metres"
+    ):
+        read_cloud_file(tmp_path / "a.bin")

@@ -68,8 +68,11 @@ def folder(tmp_path: Path, drive: list[Frame]) -> Path:
     (root / "velodyne").mkdir(parents=True)
     (root / "label_2").mkdir()
     (root / "calib.txt").write_text(CALIBRATION)
+    rng = np.random.default_rng(0)
     for number, frame in enumerate(drive):
-        frame.lidar[LIDAR].astype("<f4").tofile(root / "velodyne" / f"{number:06d}.bin")
+        at = np.array((20 - number / 10, 0, -0.85))
+        car = np.column_stack((at + rng.uniform(-0.7, 0.7, (40, 3)), np.full(40, 0.5)))
+        np.vstack((frame.lidar[LIDAR], car)).astype("<f4").tofile(root / "velodyne" / f"{number:06d}.bin")
         row = f"Car {number % 3} 0 0 560 160 640 220 1.5 1.7 4.0 0 1.6 {20 - number / 10} -1.57\n"
         (root / "label_2" / f"{number:06d}.txt").write_text(row)
     return root
@@ -80,10 +83,7 @@ def test_a_drive_is_imported_with_the_poses_of_odometry(folder: Path, tmp_path: 
     notes = import_dataset("kitti", folder, tmp_path / "out", posed=DrivenSource)
     assert [note for note in notes if "image_2" in note]
     data = Dataset.open(tmp_path / "out")
-    (problem,) = validate(tmp_path / "out")
-    assert (
-        "16 of 16 boxes within 40 m in view of the LiDARs have no points" in problem
-    )  # no car of the drive is labelled
+    assert validate(tmp_path / "out") == []
     assert [key.time_s for key in data.keys] == pytest.approx([number / 10 for number in range(16)])
     assert {key.scene for key in data.keys} == {"kitti-drive_1"}
     first = inverse(drive[0].world_from_agent)
@@ -97,6 +97,33 @@ def test_a_drive_is_imported_with_the_poses_of_odometry(folder: Path, tmp_path: 
     assert all((plain.world_from_agent(number) == np.eye(4)).all() for number in range(16))
     assert data.manifest.recipe["poses"] == "estimated"
     assert "poses" not in plain.manifest.recipe
+
+
+def test_velocities_are_those_over_ground(folder: Path, tmp_path: Path, drive: list[Frame]) -> None:
+    part = tmp_path / "in" / "training"
+    (part / "label_02").mkdir(parents=True)
+    (part / "calib").mkdir()
+    (part / "velodyne").mkdir()
+    (folder / "velodyne").rename(part / "velodyne" / "0000")
+    (part / "calib" / "0000.txt").write_text(CALIBRATION)
+    stands = (drive[0].world_from_sensor(LIDAR) @ (25.0, 4.0, -0.85, 1.0))[:3]
+    rows = []
+    for number, frame in enumerate(drive):
+        (parked,) = transform_points(inverse(frame.world_from_sensor(LIDAR)), stands[None])
+        for track, (x, y, z) in ((3, (20 - number / 10, 0.0, -0.85)), (7, parked)):
+            rows.append(f"{number} {track} Car 0 0 0 560 160 640 220 1.5 1.7 4.0 {-y} {0.75 - z} {x} -1.57\n")
+    (part / "label_02" / "0000.txt").write_text("".join(rows))
+    import_dataset("kitti-tracking", tmp_path / "in", tmp_path / "out", posed=DrivenSource)
+    data, true = Dataset.open(tmp_path / "out"), np.zeros(3)
+    for number in range(1, len(drive) - 1):
+        ahead, parked = data.frame(number).annotations.velocity
+        before, after = (
+            drive[n].world_from_sensor(LIDAR) @ (20 - n / 10, 0, -0.85, 1) for n in (number - 1, number + 1)
+        )
+        true = inverse(drive[0].world_from_agent)[:3, :3] @ ((after - before)[:3] / 0.2)
+        np.testing.assert_allclose(ahead[:2], true[:2], atol=0.4)
+        np.testing.assert_allclose(parked[:2], 0, atol=0.4)
+    assert np.linalg.norm(true) > 4
 
 
 def _import(folder: Path, out: Path) -> Path:

@@ -13,7 +13,8 @@ import pytest
 
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration
-from flcav.dataset.formats.kitti.rig import find_rig
+from flcav.dataset.formats.kitti.files import read_points
+from flcav.dataset.formats.rig import find_rig
 from flcav.geometry import Boxes
 from flcav.perception import networks
 from flcav.perception.kitti_benchmark import (
@@ -170,7 +171,7 @@ def test_a_lidar_unlike_that_of_the_training_is_said(tmp_path: Path, monkeypatch
     unlike = "1 vehicle frame; unlike in the network's training the LiDAR"
     assert told(16, 40.0) == f"{unlike} has 64 beams, not 16 and reaches 120 m, not 40 m"
     assert told(64, 120.0) == "1 vehicle frame"
-    rig = find_rig([])
+    rig = find_rig([], read_points)
     higher = compare_kitti_rig(tmp_path, rig, replace(OBJECTS.configurations["tiny"], ground_z_m=-2.2), KnownLidar())
     assert higher == "unlike in the network's training the LiDAR is 1.73 m above the ground, not 2.2 m (corrected)"
     (tmp_path / "frames.csv").write_text("number,frame,agent,time_s\n")  # an export: its LiDAR may be any

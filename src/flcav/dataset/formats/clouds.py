@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from flcav.config import InputError, read_file
 
 FARTHEST_M = 1e4  # largest coordinate that a LiDAR is assumed to measure
+MILLIMETRES = 1000.0  # in a metre
 NEAREST_M = 1.0  # the farthest point of a sweep is farther than this
 TINY = 1e-30  # smallest number above 0; a smaller one shows another type
 BRIGHTEST = 255  # largest intensity of nuScenes
@@ -41,6 +42,17 @@ def has_nuscenes_layout(data: bytes) -> bool:
     ring, intensity = rows[:, 4], rows[:, 3]
     whole = bool((ring == np.rint(ring)).all())
     return whole and _within(ring, BRIGHTEST) and _within(intensity, BRIGHTEST) and bool(intensity.max() > 1)
+
+
+def find_millimetres(data: bytes) -> float | None:
+    """Return the largest coordinate of bytes in one of the layouts but for millimetres in place of metres, or None."""
+    for columns, has_layout in ((4, has_kitti_layout), (5, has_nuscenes_layout)):
+        rows = _rows(data, columns)
+        if rows is not None and np.isfinite(rows).all() and np.abs(rows[:, :3]).max() > FARTHEST_M:
+            scaled = rows / np.array((*(MILLIMETRES,) * 3, *(1,) * (columns - 3)), np.float32)
+            if has_layout(scaled.astype("<f4").tobytes()):
+                return float(np.abs(rows[:, :3]).max())
+    return None
 
 
 def describe_numbers(data: bytes) -> str:

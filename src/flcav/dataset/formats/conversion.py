@@ -6,15 +6,20 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from flcav.arrays import Array32
 from flcav.config import InputError, Json
 from flcav.dataset.formats.formats import IMPORTS, export_format, import_format
-from flcav.dataset.formats.kitti.rig import UNSTATED, StatedLidar
+from flcav.dataset.formats.mounting import find_other_frame
 from flcav.dataset.formats.reading import LogSource
+from flcav.dataset.formats.rig import UNSTATED, StatedLidar
 from flcav.dataset.formats.writing import Exported, ExportOptions
 from flcav.dataset.frame_checks import check_triggers
+from flcav.dataset.ground import POLE
 from flcav.dataset.layout import WORK
 from flcav.dataset.recording.recorder import drop_unbegun, record
-from flcav.dataset.scene_checks import EmptyBoxes
+from flcav.dataset.scene_checks import EmptyBoxes, SharedPoints
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.locks import LOCK, only_writer
@@ -22,6 +27,8 @@ from flcav.sensors.frame import Frame
 from flcav.sources.source import Source
 from flcav.storage.files import flush_tree
 from flcav.world.trace import Trace
+
+LOOKED = 10  # sweeps whose ground is looked for
 
 
 def import_dataset(
@@ -39,7 +46,8 @@ def import_dataset(
     Points and pictures whose encoding is one of flcav's are linked to, others are rewritten. Returns sentences on what
     the files lack and where they contradict themselves. Raises `InputError` where `folder` is missing, of another
     format or damaged, and as `record` does; scenes that were complete by then stay in `out`, and the same call resumes
-    from there.
+    from there. Also where labels and points are not in one frame, or points not in metres, x ahead, y left, z up; then
+    nothing stays.
 
     Args:
         name: a name in `IMPORTS`, or a user's format as `module:NAME`.
@@ -61,25 +69,35 @@ def import_dataset(
                 raise InputError(f"{folder}: is no folder of '{name}' but of '{other}'")
     with only_writer(out):
         begun = (out / WORK).exists()  # by an earlier call
+        source: LogSource | None = None
         try:
             source = chosen.read(folder, split, lidar) if chosen.takes_lidar else chosen.read(folder, split)
-            checked = _Checked(posed(source))
+            checked = _Checked(posed(source), folder)
             record(checked, out, progress=progress)
         except (ValueError, OSError) as error:
             if not begun:
-                drop_unbegun(out)
+                drop_unbegun(out, whole=isinstance(error, _OtherFrame))
+            if isinstance(error, _OtherFrame) and source is not None:
+                raise InputError("; ".join((str(error), *source.contradictions))) from None
             if isinstance(error, InputError | OSError):
                 raise
             raise InputError(f"{folder}: cannot be imported ({error})") from None  # names that a dataset cannot hold
     return (*source.notes, *checked.problems())
 
 
+class _OtherFrame(InputError):
+    """Labels or points of another frame, in all of a folder."""
+
+
 @dataclass(frozen=True)
 class _Checked:
-    """A source whose poses and boxes are checked as its frames are recorded."""
+    """A source whose poses, boxes and points are checked as its frames are recorded."""
 
     source: Source
+    folder: Path
     boxes: EmptyBoxes = field(default_factory=EmptyBoxes)
+    shared: SharedPoints = field(default_factory=SharedPoints)
+    sweeps: list[Array32] = field(default_factory=list)  # some of vehicles', (N, 3) x ahead, y left, z up [m]
     strays: list[str] = field(default_factory=list)  # a sentence per inconsistent pose
 
     def problems(self) -> Iterator[str]:
@@ -102,7 +120,25 @@ class _Checked:
         for frame in self.source.frames(scene):
             yield frame
             self.boxes.add(frame)
+            self.shared.add(frame)
             self.strays.extend(check_triggers(frame))
+            if not frame.agent.startswith(POLE) and len(self.sweeps) < LOOKED:
+                self.sweeps.extend(  # as in the vehicle's axes, about the LiDAR
+                    cloud[:, :3] @ frame.agent_from_sensor[name][:3, :3].T.astype(np.float32)
+                    for name, cloud in frame.lidar.items()
+                )
+        if scene == self.source.scenes()[-1]:
+            self._check_frames()
+
+    def _check_frames(self) -> None:
+        """Raise `InputError` where points are in another frame than the calibration says, or labels than the points."""
+        try:
+            if other := find_other_frame(self.sweeps, placed=True):
+                raise InputError(f"{self.folder}: {other}")
+            self.boxes.refuse(self.folder)
+            self.shared.refuse(self.folder)
+        except InputError as error:
+            raise _OtherFrame(str(error)) from None
 
     def trace(self, scene: str) -> Trace | None:
         return self.source.trace(scene)

@@ -41,6 +41,7 @@ class LogSource(ABC):
 
     FORMAT: ClassVar[str]
     notes: tuple[str, ...] = ()  # sentences for the user on what the files lack
+    contradictions: tuple[str, ...] = ()  # those of `notes` on what contradicts itself, known once frames are read
     folder: Path
     split: str | None  # the requested one
     split_of: Mapping[str, str | None]  # scene -> its split

@@ -48,6 +48,18 @@ def list_sweeps(folder: Path) -> list[Path]:
     return sorted(file for file in folder.iterdir() if file.suffix in ENDINGS and not file.name.endswith(f".{TIMES}"))
 
 
+def list_cloud_files(path: Path) -> list[Path]:
+    """Return the point cloud files of a folder, or the file itself; raises `InputError` where there are none."""
+    if not path.is_dir():
+        if not path.is_file():
+            raise InputError(f"{path}: no such file or folder")
+        return [path]
+    files = list_sweeps(path)
+    if not files:
+        raise InputError(f"{path}: neither a dataset nor a folder with .bin or .pcd files")
+    return files
+
+
 def _read_fields(path: Path) -> NDArray[np.float32]:
     rows = read_pcd(path)
     if missing := [name for name in FIELDS if name not in (rows.dtype.names or ())]:

@@ -125,10 +125,13 @@ def record(
     return begun or bool(damaged)
 
 
-def drop_unbegun(out: Path) -> None:
-    """Remove what a failed recording left in `out` where no part was completed; otherwise it can be resumed."""
+def drop_unbegun(out: Path, *, whole: bool = False) -> None:
+    """Remove what a failed recording left in `out` where no part was completed; otherwise it can be resumed.
+
+    With `whole`, completed parts are removed, too.
+    """
     work = out / WORK
-    if work.is_dir() and not any(path.is_dir() and path.suffix != ".part" for path in work.glob("*/*")):
+    if work.is_dir() and (whole or not any(p.is_dir() and p.suffix != ".part" for p in work.glob("*/*"))):
         shutil.rmtree(work)
         if not any(out.iterdir()):
             out.rmdir()

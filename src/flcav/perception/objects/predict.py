@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.arrays import Array, Array32
-from flcav.config import InputError
-from flcav.dataset.formats.sweeps import list_sweeps, read_cloud_file
+from flcav.dataset.formats.sweeps import list_cloud_files, read_cloud_file
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse, pose
@@ -40,6 +39,7 @@ from flcav.perception.objects.truth import (
     asked_of,
     choose_lidar,
     in_range,
+    level_mount,
     network_from_lidar,
     select_class,
     select_sides,
@@ -273,40 +273,39 @@ class InputCloud(NamedTuple):
 
 
 def detect_objects(
-    network: Second, path: Path, threshold: float, frames: Sequence[int] | None = None
+    network: Second,
+    path: Path,
+    threshold: float,
+    frames: Sequence[int] | None = None,
+    mount: Array | None = None,
 ) -> Iterator[Finding]:
-    """Yield the objects of score `threshold` or more in each point cloud of `path`.
+    """Yield the objects of score `threshold` or more in each point cloud of `path`, in the frame of its points.
 
     `path` is a point cloud file, see `read_cloud_file`, a folder of them, or a dataset folder, with its `frames` (None:
-    all). Raises `InputError` as `read_point_clouds` does.
+    all). `mount` (4, 4) [m] is that of the LiDAR of files, see `find_rigs` of `samples` (None: as the network expects).
+    Raises `InputError` as `read_point_clouds` does.
     """
-    for cloud in read_point_clouds(path, frames, network.config):
+    for cloud in read_point_clouds(path, frames, network.config, mount):
         (found,) = detect_moved(network, [cloud.points], [cloud.move], score_threshold=threshold)
         yield Finding(cloud.path, cloud.points, ObjectsFound(boxes_to_rows(found)), (CloudBoxes(found),), cloud.view)
 
 
-def read_point_clouds(path: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
+def read_point_clouds(
+    path: Path, frames: Sequence[int] | None, config: SecondConfig, mount: Array | None = None
+) -> Iterator[InputCloud]:
     """Yield the point clouds of a file, of a folder of them, or of `frames` (None: all) of a dataset folder.
 
-    Those of a dataset are as a network of `config` sees them. Raises `InputError` where `path` is none of these, a
-    frame has no LiDAR, or a cloud is empty, truncated, of an unknown layout or not of numbers in range.
+    They are as a network of `config` sees them. `mount` is that of the LiDAR of files, see `detect_objects`. Raises
+    `InputError` where `path` is none of these, a frame has no LiDAR, or a cloud is empty, truncated, of an unknown
+    layout or not of numbers in range.
     """
     if (path / MANIFEST).is_file():
-        clouds = _recorded(path, frames, config)
-    elif path.is_dir():
-        files = list_sweeps(path)
-        if not files:
-            raise InputError(f"{path}: neither a dataset nor a folder with .bin or .pcd files")
-        clouds = map(_of_file, files)
-    elif path.is_file():
-        clouds = map(_of_file, [path])
-    else:
-        raise InputError(f"{path}: no such file or folder")
-    return clouds
-
-
-def _of_file(path: Path) -> InputCloud:
-    return InputCloud(path, validate_points(read_cloud_file(path), path), None, partial(view_beside, path))
+        return _recorded(path, frames, config)
+    move = None if mount is None else level_mount(mount, config)
+    return (
+        InputCloud(file, validate_points(read_cloud_file(file), file), move, partial(view_beside, file))
+        for file in list_cloud_files(path)
+    )
 
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:

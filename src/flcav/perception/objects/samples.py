@@ -4,6 +4,7 @@ In a message the sweep is whole and uncompressed, 16 bytes per point, with the b
 """
 
 import math
+from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -13,6 +14,8 @@ import numpy as np
 
 from flcav.arrays import Array, Array32, Mask
 from flcav.config import InputError
+from flcav.dataset.formats.rig import Rig, StatedLidar, UsualLidar, find_rig
+from flcav.dataset.formats.sweeps import list_cloud_files, read_cloud_file
 from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
@@ -179,6 +182,26 @@ def describe_rig(mounts: Sequence[Array], here: KnownLidar, config: SecondConfig
     if turned:
         differences.append(f"is turned by {', '.join(turned)} degrees (corrected)")
     return f"unlike in the network's training the LiDAR {' and '.join(differences)}" if differences else ""
+
+
+def find_rigs(paths: Sequence[Path], config: SecondConfig, lidar: StatedLidar) -> dict[Path, Rig]:
+    """Return the LiDAR of point cloud files by their folder, given files and folders of them.
+
+    It is the one that a network of `config` expects, unless the sweeps or `lidar` say otherwise. Raises `InputError` as
+    `find_rig` and `list_cloud_files` do.
+    """
+    files = defaultdict[Path, list[Path]](list)
+    for path in paths:
+        files[path if path.is_dir() else path.parent] += list_cloud_files(path)
+    usual = UsualLidar("the network's", -config.ground_z_m)
+    return {folder: find_rig(sweeps, read_cloud_file, lidar, usual) for folder, sweeps in files.items()}
+
+
+def compare_files_rig(rig: Rig, lidar: StatedLidar, config: SecondConfig, trained: KnownLidar) -> str:
+    """Return how the LiDAR of files by `find_rigs` differs from that of a network's training, in words; "" if not."""
+    here = KnownLidar() if rig.beams is None else KnownLidar((rig.beams, rig.beams))
+    stated = [] if lidar.height_m is None else [rig.agent_from_lidar]  # the notes tell a height that is found
+    return "; ".join(filter(None, (*rig.notes, describe_rig(stated, here, config, trained))))
 
 
 def _covers(beams: tuple[int, int], others: tuple[int, int]) -> bool:

@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 from torch import Tensor
 
+from flcav.arrays import Array
 from flcav.config import Json
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, points_in_boxes, transform_points
@@ -264,10 +265,19 @@ class ObjectsTask(ObjectsOutcomes):
         return [unpack_sample(message, config) for message in messages]
 
     def infer(
-        self, network: Second, path: Path, threshold: float = THRESHOLD, frames: Sequence[int] | None = None
+        self,
+        network: Second,
+        path: Path,
+        threshold: float = THRESHOLD,
+        frames: Sequence[int] | None = None,
+        *,
+        mount: Array | None = None,
     ) -> Iterator[Finding]:
-        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.predict`."""
-        yield from detect_objects(network, path, threshold, frames)
+        """Yield the objects detected in each point cloud of `path`, see `flcav.perception.objects.predict`.
+
+        `mount` (4, 4) [m] is that of the LiDAR of files; None: as the network expects.
+        """
+        yield from detect_objects(network, path, threshold, frames, mount)
 
     def register_errors(
         self,

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from flcav.config import InputError, path_within, read_file
-from flcav.dataset.formats.clouds import describe_numbers, has_kitti_layout
+from flcav.dataset.formats.clouds import describe_numbers, find_millimetres, has_kitti_layout
 from flcav.dataset.formats.reading import LARGEST_M, check_cloud, check_headings, check_rotation
 from flcav.dataset.payloads import open_image, turn_upright
 from flcav.geometry import Array, Boxes, heading_vectors, inverse, transform_points, wrap_angle
@@ -59,6 +59,8 @@ def read_points(path: Path) -> NDArray[np.float32]:
 
 def _refuse_points(data: bytes, path: Path) -> Never:
     """Raise `InputError`, naming what the bytes are instead of a point cloud."""
+    if (largest := find_millimetres(data)) is not None:
+        raise InputError(f"{path}: coordinates up to {largest:.0f}, millimetres by their size; wanted are metres")
     if (layout := describe_numbers(data)) not in ("", LAYOUT):
         raise InputError(f"{path}: {layout} by its numbers; wanted are {LAYOUT}: {POINT}")
     if len(data) % POINT_BYTES:

@@ -30,7 +30,6 @@ from flcav.dataset.formats.kitti.files import (
     read_points,
     read_split,
 )
-from flcav.dataset.formats.kitti.rig import RANGE_M, UNSTATED, KittiRig, StatedLidar, find_rig
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.reading import (
     AgentNames,
@@ -44,6 +43,7 @@ from flcav.dataset.formats.reading import (
     name_some,
     unseen_views,
 )
+from flcav.dataset.formats.rig import RANGE_M, UNSTATED, Rig, StatedLidar, find_rig
 from flcav.geometry import Boxes, inverse
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
@@ -93,7 +93,7 @@ class KittiSource(LogSource):
         self._calibration: dict[str, Calibration] = {}
         every = [shot for shot in shots if shot.scene in chosen]
         _check_complete(every)
-        names, rig = AgentNames(), find_rig([_path(shot, "velodyne") for shot in every], stated)
+        names, rig = AgentNames(), find_rig([_path(shot, "velodyne") for shot in every], read_points, stated)
         self._rig = rig
         for shot in every:
             calibration = _path(shot, "calib")
@@ -129,7 +129,7 @@ class KittiSource(LogSource):
 IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne/*.bin"), takes_lidar=True)
 
 
-def mount_sensors(calibrated: KittiCalibration, rig: KittiRig) -> Calibration:
+def mount_sensors(calibrated: KittiCalibration, rig: Rig) -> Calibration:
     """Return the mounts of LiDAR and camera on a vehicle with the LiDAR of `rig`."""
     agent_from_lidar = rig.agent_from_lidar
     projection = calibrated.image_from_camera
@@ -142,7 +142,7 @@ def mount_sensors(calibrated: KittiCalibration, rig: KittiRig) -> Calibration:
     )
 
 
-def _read_frame(shot: KittiShot, agent: str, calibration: Calibration, rig: KittiRig) -> LinkedFrame:
+def _read_frame(shot: KittiShot, agent: str, calibration: Calibration, rig: Rig) -> LinkedFrame:
     pictures = {CAMERA: path} if (path := _path(shot, CAMERA)).is_file() else {}
     files = {LIDAR: _path(shot, "velodyne"), **pictures}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))

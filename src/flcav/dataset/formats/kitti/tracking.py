@@ -35,7 +35,6 @@ from flcav.dataset.formats.kitti.read import (
     OCCLUSION,
     mount_sensors,
 )
-from flcav.dataset.formats.kitti.rig import RANGE_M, UNSTATED, KittiRig, StatedLidar, find_rig
 from flcav.dataset.formats.reading import (
     ImportFormat,
     LogSource,
@@ -48,6 +47,7 @@ from flcav.dataset.formats.reading import (
     name_some,
     unseen_views,
 )
+from flcav.dataset.formats.rig import RANGE_M, UNSTATED, Rig, StatedLidar, find_rig
 from flcav.geometry import inverse
 from flcav.geometry.poses import rotations
 from flcav.interface.wording import plural
@@ -79,7 +79,8 @@ class KittiTrackingSource(LogSource):
         self._sequences = {scene: _Sequence(names[scene]) for scene in self.split_of}
         for sequence in self._sequences.values():
             sequence.check()
-        rig = find_rig([sweep for each in self._sequences.values() for sweep in each.sweeps.values()], stated)
+        sweeps = [sweep for each in self._sequences.values() for sweep in each.sweeps.values()]
+        rig = find_rig(sweeps, read_points, stated)
         for sequence in self._sequences.values():
             sequence.rig = rig
         self.beams = rig.beams
@@ -121,7 +122,7 @@ class _Labels:
 class _Sequence:
     """A sequence of the benchmark: its files, by the folder of its sweeps."""
 
-    rig: KittiRig
+    rig: Rig
 
     def __init__(self, velodyne: Path) -> None:
         self._part, self.name = velodyne.parents[1], velodyne.name

@@ -153,7 +153,8 @@ class Opv2vSource(LogSource):
         """Yield the frames of a scenario; raises `InputError` where a file is missing, truncated or malformed."""
         for shot in self._shots[scene]:
             yield self._frame(scene, shot)
-            self.notes = (*self._lacking, *self._pairs.notes())
+            self.contradictions = self._pairs.notes()
+            self.notes = (*self._lacking, *self.contradictions)
 
     def _frame(self, scene: str, shot: Opv2vShot) -> LinkedFrame:
         calibration = self._calibration[shot.agent]
