@@ -9,6 +9,7 @@ on other seeds; all are corrected together.
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from flcav.config import Json
 from flcav.experiments.comparison import average_arms
@@ -23,12 +24,13 @@ from flcav.runs.results.run import Run
 from flcav.runs.results.tests import Tested
 from flcav.runs.training.learning import load_stage_network
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
-from flcav.statistics.verdicts import Claim, describe_aims
+from flcav.statistics.verdicts import REACHED, Claim, describe_aims, judge, signed
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
 
 TASK, HOME, UNSEEN = "objects", "suburb", "arterial"
 REGIONS = ("grid", "ring")
+TOWNS = (HOME, *REGIONS, UNSEEN)
 PRETRAINED = "pretrained"
 EDGES = {region: f"edge FL in {region}" for region in REGIONS}  # by region
 ARMS: Mapping[str, str] = {  # name in the tables -> arm
@@ -84,12 +86,16 @@ class CloudResult(Record):
 
     def sentences(self) -> list[str]:
         """Return the verdicts on the aims of the chosen arm, in words."""
-        return describe_aims({aim: Claim(self.changes[aim][CHOSEN], than=least) for aim, least in AIMS.items()})
+        return describe_aims(self.claims())
+
+    def claims(self) -> dict[str, Claim]:
+        """Return the claims that the chosen arm reaches the aims, by aim."""
+        return {aim: Claim(self.changes[aim][CHOSEN], than=least) for aim, least in AIMS.items()}
 
 
 def read_seed(run: Run, work: Path) -> CloudSeed:
     """Return the results of a run whose steps are in the folder `work`; edge FL is tested in the other towns, too."""
-    steps, towns = run.steps, (*run.recipe.regions,)
+    steps = run.steps
 
     def tested(arm: str, stage: str, town: str) -> Score:
         found = Tested.load(work / steps.test(steps.stage(arm, stage, town, TASK), town))
@@ -115,7 +121,7 @@ def read_seed(run: Run, work: Path) -> CloudSeed:
                 **{name: edge(region, town) for region, name in EDGES.items()},
                 **{name: tested(arm, CLOUD, town) for name, arm in ARMS.items()},
             }
-            for town in towns
+            for town in TOWNS
         },
         max(REGIONS, key=valid),
     )
@@ -124,7 +130,7 @@ def read_seed(run: Run, work: Path) -> CloudSeed:
 def compare_cloud(recipe: RunRecipe, seeds: Mapping[str, CloudSeed]) -> CloudResult:
     """Return the results of the arms of `recipe`, from those of each seed."""
     networks = (PRETRAINED, *EDGES.values(), *ARMS)
-    towns = {town: {name: seed.scores[town] for name, seed in seeds.items()} for town in recipe.regions}
+    towns = {town: {name: seed.scores[town] for name, seed in seeds.items()} for town in TOWNS}
     return CloudResult(
         seeds=seeds,
         ap50={town: average_arms(own, networks, lambda score: score.ap50) for town, own in towns.items()},
@@ -141,38 +147,61 @@ def compare_cloud(recipe: RunRecipe, seeds: Mapping[str, CloudSeed]) -> CloudRes
 @style.styled
 def draw_cloud(results: CloudResult) -> bytes:
     """Return the changes of all arms as a PNG: a panel for each aim, in which what misses it is shaded."""
-    figure = style.canvas(11.0, 1.1 + 0.36 * len(ARMS))
+    figure = style.canvas(11.0, 1.5 + 0.42 * len(ARMS))
     panels = figure.subplots(1, len(AIMS), sharey=True)
     for axes, (aim, least) in zip(panels, AIMS.items(), strict=True):
-        for y, arm in enumerate(ARMS):
-            change = results.changes[aim][arm]
-            colour = style.BLUE if change.mean >= least else style.VERMILLION
-            if change.low is not None and change.high is not None:
-                axes.plot([change.low, change.high], [y, y], color=colour, linewidth=2)
-            axes.plot(change.mean, y, "s", color=colour, markersize=6)
-        axes.axvline(0, color=style.RULE, linewidth=0.8)
+        rows = [[seed.change(arm, aim) for seed in results.seeds.values()] for arm in ARMS]
+        low, high = min(least, *map(min, rows)), max(0.0, least, *map(max, rows))
+        room = 0.25 * (high - low)  # for the numbers
+        axes.set_xlim(low - room, high + room)
+        axes.axvspan(low - room, least, color=style.SIDEWALK, zorder=0)
         axes.axvline(least, color=style.INK, linewidth=1, linestyle=(0, (4, 3)))
-        axes.axvspan(min(axes.get_xlim()[0], least - 0.01), least, color=style.SIDEWALK, zorder=0)
-        axes.set_title(f"{aim}\naim: {least:+.2f} or more", fontweight="bold")
+        axes.axvline(0, color=style.MUTED, linewidth=0.8)
+        for y, by_seed in enumerate(rows):
+            mean = sum(by_seed) / len(by_seed)
+            colour = style.BLUE if mean >= least else style.VERMILLION
+            axes.plot(by_seed, [y] * len(by_seed), "o", color=colour, markersize=5, markerfacecolor="white")
+            axes.plot(mean, y, "s", color=colour, markersize=7)
+            where: Any = {"textcoords": "offset points", "ha": "center", "fontsize": style.SMALL}
+            axes.annotate(signed(mean), (mean, y), (0, 8), bbox={"fc": "white", "ec": "none", "pad": 0.8}, **where)
+        axes.set_title(f"{aim}\naim: at least {signed(least, 2)}", fontweight="bold")
+        axes.locator_params(axis="x", nbins=3)
         axes.grid(axis="x")
     panels[0].set_yticks(range(len(ARMS)), list(ARMS))
-    panels[0].set_ylim(len(ARMS) - 0.5, -0.5)
-    figure.supxlabel("change in AP against edge FL, at home against pretraining (95 % intervals over seeds)")
+    panels[0].set_ylim(len(ARMS) - 0.5, -0.7)
+    figure.supxlabel(
+        "change in AP against edge FL (unseen town: against the better of both), at home against pretraining; "
+        "circles: seeds, squares: means; shaded: the aim is missed",
+        fontsize=style.SMALL,
+        color=style.MUTED,
+    )
     return style.png(figure)
 
 
 def cloud_tables(results: CloudResult) -> dict[str, str]:
-    """Return Markdown by name: changes, towns, seeds."""
+    """Return Markdown by name: changes, aims, towns."""
+    own = {aim: results.changes[aim][CHOSEN] for aim in AIMS}
     changes = [[arm, *(results.changes[aim][arm].describe(sign=True) for aim in AIMS)] for arm in ARMS]
-    towns = [*results.recipe["regions"]]  # type: ignore[misc]
     networks = (PRETRAINED, *EDGES.values(), *ARMS)
     return {
-        "changes": format_table(("arm", *(f"{aim}, aim {least:+.2f}" for aim, least in AIMS.items())), changes),
-        "aims": "\n".join(f"- {sentence}" for sentence in results.sentences()),
-        "towns": format_table(
-            ("AP50, AP70", *towns),
+        "changes": format_table(("arm", *(f"{aim}, aim {signed(least, 2)}" for aim, least in AIMS.items())), changes),
+        "aims": format_table(
+            (f"aim of {CHOSEN}", "change", "p, corrected", "aim", "if undecided: seeds that decide"),
             [
-                [name, *(f"{results.ap50[town][name].mean:.3f}, {results.ap70[town][name].mean:.3f}" for town in towns)]
+                [
+                    f"{aim}, at least {signed(least, 2)}",
+                    own[aim].describe(sign=True),
+                    one.p_cell,
+                    REACHED[one.verdict],
+                    one.takes_cell,
+                ]
+                for (aim, least), one in zip(AIMS.items(), judge([*results.claims().values()]), strict=True)
+            ],
+        ),
+        "towns": format_table(
+            ("AP50, AP70", *TOWNS),
+            [
+                [name, *(f"{results.ap50[town][name].mean:.3f}, {results.ap70[town][name].mean:.3f}" for town in TOWNS)]
                 for name in networks
             ],
         ),

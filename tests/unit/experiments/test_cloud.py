@@ -14,6 +14,7 @@ from flcav.reproductions.cloud.run import (
     EDGES,
     PRETRAINED,
     REGIONS,
+    TOWNS,
     CloudResult,
     CloudSeed,
     Score,
@@ -25,7 +26,6 @@ from flcav.sources.recipe import recipe_path
 from flcav.statistics.estimates import Estimate
 
 RECIPE = load_run_recipe(recipe_path("runs/cloud"))
-TOWNS = ("suburb", "grid", "ring", "arterial")
 
 
 def seed_of(more: float) -> CloudSeed:
@@ -64,7 +64,8 @@ def test_changes_are_against_the_region_s_edge_fl_the_preferred_one_and_pretrain
     shown = study.cloud_tables(found)
     assert f"| {CHOSEN} | -0.080 (" in shown["changes"]
     assert f"| {EDGES['grid']} | 0.400, 0.200 | 0.700, 0.350 | 0.400, 0.200 | 0.500, 0.250 |" in shown["towns"]
-    assert shown["aims"].count("- *") == len(AIMS)
+    assert "| unseen town, AP50, at least +0.03 | +0.070 (" in shown["aims"]
+    assert found.sentences()[0].startswith("*grid, AP50*: **")
     assert study.draw_cloud(found).startswith(b"\x89PNG")
 
 
