@@ -80,7 +80,7 @@ def test_the_networks_of_all_updates_teach_their_mean_on_the_cloud_s_samples() -
 
 
 @dataclass(frozen=True)
-class AddsRate(FedAvg):
+class AddsRound(FedAvg):
     """The mean of the updates, plus the number of the round."""
 
     work: RoundWork
@@ -90,21 +90,31 @@ class AddsRate(FedAvg):
         return {name: np.asarray(array + self.work().round, array.dtype) for name, array in mean.items()}
 
 
-def test_every_cloud_round_is_taught_by_its_own_work(tmp_path: Path) -> None:
-    """Two rounds without local steps: 1 is added in the first, from which edge servers go on, and 2 in the second."""
+def test_every_cloud_round_is_taught_by_its_own_work_also_after_a_kill(tmp_path: Path) -> None:
+    """The first average is higher by 1; a resumed stage goes on with round 2, and ends with the same weights."""
     learning = Learning(cast(Task, LineTask()), None, Training(local_steps=1, average_rounds=1), 3)
     network = learning.build_network()
-    start = {name: np.zeros_like(array) for name, array in to_arrays(network).items()}
     clients = make_clients(learning, Slope(), {"a/cav0": [np.float32(0)] * 3})
-    ends = {}
-    for folder, distil in (("plain", None), ("taught", AddsRate)):
-        where: Any = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / folder, ignore_progress)
-        regions = {"a": RegionStart(clients, start, 0)}
-        own = cloud_federation(learning, network, regions, {"a": 1}, *where, distil=distil)
-        federate_cloud(own, 1, Rules())
-        ends[folder] = to_arrays(load_stage_network(learning.task, tmp_path / folder))
-    for name, array in ends["plain"].items():
-        np.testing.assert_allclose(ends["taught"][name], array + 1, rtol=1e-6)
+
+    def end(folder: str, rounds: int, distil: Any, report: Any = ignore_progress) -> Weights:
+        where: Any = (Strategies(FEDAVG, FEDAVG), Ledger(LinkMegabytes(1.0, 1.0)), tmp_path / folder, report)
+        regions = {"a": RegionStart(clients, to_arrays(network), 0)}
+        federate_cloud(cloud_federation(learning, network, regions, {"a": 1}, *where, distil=distil), rounds, Rules())
+        return to_arrays(load_stage_network(learning.task, tmp_path / folder))
+
+    def die(done: int, *_: Any) -> None:
+        if done == 1:
+            raise KeyboardInterrupt
+
+    plain, once = end("plain", 1, None), end("once", 1, AddsRound)
+    for name, array in plain.items():
+        np.testing.assert_allclose(once[name], array + 1, rtol=1e-6)
+    with pytest.raises(KeyboardInterrupt):
+        end("killed", 2, AddsRound, die)
+    resumed, whole = end("killed", 2, AddsRound), end("whole", 2, AddsRound)
+    for name, array in whole.items():
+        np.testing.assert_array_equal(resumed[name], array)
+        assert not np.allclose(array, once[name] + 1)  # the second round adds 2
 
 
 @pytest.mark.parametrize(
