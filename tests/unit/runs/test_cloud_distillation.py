@@ -143,8 +143,10 @@ def test_other_tasks_and_plans_without_samples_are_refused() -> None:
     with pytest.raises(InputError, match="detectors teach by scores, and 'weather' has none"):
         check_federations(weather, resolve_settings(weather).values())
     recipe["tasks"] = {"objects": {"plan": {**plan, "samples": 0}, "weights": "packaged"}}
-    with pytest.raises(ValueError, match="cloud_distillation: the cloud trains on samples of stage I, and a plan has"):
-        RunRecipe.model_validate(recipe)
+    for how in ({"steps": 2}, {}):
+        recipe["arms"] = {"taught": {"federation": {"cloud_distillation": how}}}
+        with pytest.raises(ValueError, match="cloud_distillation: the cloud trains on samples of stage I"):
+            RunRecipe.model_validate(recipe)
     recipe["federation"] = {"cloud_distillation": {"steps": 0}}
     with pytest.raises(ValueError, match="steps"):
         RunRecipe.model_validate(recipe)

@@ -336,7 +336,8 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
             raise ValueError("stragglers: time counts with 'horizon_s' or 'federation.network' alone; give one of them")
         hows = (self.federation.model_dump(), *(arm.federation for arm in self.arms.values()))
         for field in ("replay", "cloud_distillation"):
-            if any(how.get(field) for how in hows) and not all(task.pretrains for task in self.tasks.values()):
+            trains = any(how.get(field) not in (None, 0) for how in hows)
+            if trains and not all(task.pretrains for task in self.tasks.values()):
                 raise ValueError(f"federation.{field}: the cloud trains on samples of stage I, and a plan has none")
         for check in load_all(RECIPE_CHECKS):
             check(self)
