@@ -24,6 +24,7 @@ from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient
 from flcav.perception.objects.distillation import SEEN, TaughtObjects, ensemble_loss
 from flcav.perception.objects.model import CONFIGURATIONS
+from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task, build_network
@@ -64,6 +65,8 @@ def test_the_networks_of_all_updates_teach_their_mean_on_the_cloud_s_samples() -
     boxes = Boxes.from_array(np.array([(x, y, -1, 4.2, 1.8, 1.5, 0.0) for x, y in places]), "Car")
     client = TaskClient(OBJECTS, CONFIG, [Sample(points.astype(np.float32), boxes)], batch=1)
     networks = [build_network(OBJECTS, CONFIG, seed) for seed in (1, 2)]
+    for more, network in enumerate(networks, start=1):
+        network.head.bias.data += more  # untrained ones all see nothing
     updates = [LocalUpdate(to_arrays(each), samples, 0.0) for each, samples in zip(networks, (3, 1), strict=True)]
     mean = average([each.weights for each in updates], [3, 1])
     rates = {"steps": 2, "learning_rate": 1e-3, "seed": derive_seed(7, "cloud-distillation")}
@@ -74,6 +77,12 @@ def test_the_networks_of_all_updates_teach_their_mean_on_the_cloud_s_samples() -
         pupil = TaskClient(TaughtObjects(networks, weight), CONFIG, client.samples, batch=1)
         for name, array in pupil.train(mean, **cast(Any, rates)).weights.items():
             np.testing.assert_array_equal(found[weight][name], array)
+    own, *teachers = (each.eval() for each in (build_network(OBJECTS, CONFIG, 3), *networks))
+    scores = [predict(each, [client.samples[0].points]).score for each in (own, *teachers)]
+    both, first = (float(ensemble_loss(scores[0], seen)) for seen in (scores[1:], scores[1:2]))
+    assert both != pytest.approx(first, rel=0.01)
+    taught, plain = (float(task.loss(own, client.samples)) for task in (TaughtObjects(teachers, 1e6), OBJECTS))
+    assert (taught - plain) / 1e6 == pytest.approx(both, rel=1e-3)
     labels_alone = client.train(mean, **cast(Any, rates)).weights
     assert all(np.array_equal(found[0.0][name], array) for name, array in labels_alone.items())
     assert not np.array_equal(found[2.0]["head.weight"], labels_alone["head.weight"])
