@@ -8,6 +8,7 @@ from flcav.config import InputError
 from flcav.federation.checks import check_rules
 from flcav.federation.privacy import affordable_rounds, find_noise
 from flcav.federation.strategies import Strategy, of_servers, strategy_named
+from flcav.federation.strategies.fedavg import FedAvg
 from flcav.federation.strategies.fedbuff import FedBuff
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.strategies.strategy import Corrects, needs_known_number
@@ -108,6 +109,7 @@ class Setting:
             "cloud_rate",
             "cloud_start_share",
             "replay",
+            "cloud_distillation",
             "score_statistics",
             "cloud_topics",
         )
@@ -242,6 +244,7 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         raise InputError("federation.replay: the cloud's own training, which no topic is for; leave out 'cloud_topics'")
     if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
+    _check_distillation(setting, edge, cloud)
     _check_imitation(setting)
     _check_numbers(recipe, setting, edge)
     if isinstance(edge, FedMD) and setting.central is None:
@@ -260,6 +263,21 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
             raise InputError(f"cloud_strategy{given}, among edge servers: {error}") from None
     for task in recipe.tasks if how.personal or how.upload.layers or how.score_statistics else ():
         _check_arrays(task, recipe.tasks[task].network, setting)
+
+
+def _check_distillation(setting: Setting, edge: Strategy, cloud: Strategy) -> None:
+    """Raise `InputError` where the regions' networks cannot teach the cloud's average."""
+    how = setting.federation
+    if how.cloud_distillation is None:
+        return
+    field = "federation.cloud_distillation"
+    if how.personal or how.upload.layers or isinstance(edge, FedMD):
+        raise InputError(f"{field}: whole networks teach; leave out 'personal', 'upload.layers' and fedmd")
+    if type(cloud) is not FedAvg:
+        raise InputError(f"{field}: it teaches the mean of fedavg, not of the strategy {type(cloud).__name__}")
+    for task in setting.training:
+        if task != OBJECTS.name:
+            raise InputError(f"{field}: detectors teach by scores, and '{task}' has none; leave 'objects' alone")
 
 
 def _check_imitation(setting: Setting) -> None:

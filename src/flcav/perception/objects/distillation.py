@@ -1,4 +1,4 @@
-"""Two further losses of a detector: federated distillation from the road average, and imitation of an earlier network.
+"""Further losses of a detector: federated distillation from the road average, imitation, and ensemble distillation.
 
 Wang et al. (IEEE Network 37(3), 2023), "federated distillation": each vehicle updates itself by a contrastive loss
 between its boxes and those of the road average. The loss of a batch is the sum of
@@ -14,6 +14,10 @@ Imitation is knowledge distillation against forgetting (Li and Hoiem, "Learning 
 detectors Shmelkov, Schmid, Alahari, "Incremental Learning of Object Detectors without Catastrophic Forgetting", ICCV
 2017). It adds to the loss on labels the distance of box residuals and headings from those of the earlier network, the
 teacher, where that detects an object. It needs no samples of what was learned before.
+
+Ensemble distillation (FedDF: Lin et al., "Ensemble Distillation for Robust Model Fusion in Federated Learning", NeurIPS
+2020) adds to the loss on labels the divergence of the scores from those of an ensemble of networks, whose logits are
+averaged. Boxes are learned from the labels alone: those of the teachers fit the objects of other places.
 """
 
 from collections.abc import Sequence
@@ -183,3 +187,31 @@ def imitation_loss(output: HeadOutput, teacher: HeadOutput) -> Tensor:
     box = smooth_l1(residual_errors(output.box[where], teacher.box[where])).sum(1)
     direction = F.cross_entropy(output.direction[where], teacher.direction[where].softmax(1), reduction="none")
     return ((BOX_WEIGHT * box + DIRECTION_WEIGHT * direction) * share).sum()
+
+
+class TaughtObjects(ObjectsTask):
+    """3D object detection that learns from labels and, with a `weight`, from the mean scores of `teachers`."""
+
+    def __init__(self, teachers: Sequence[Second], weight: float) -> None:
+        super().__init__()
+        self.teachers = [teacher.eval().requires_grad_(False) for teacher in teachers]
+        self.weight = weight
+
+    def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
+        """Return SECOND's loss on a batch plus that of the ensemble, differentiable in the network's parameters."""
+        voxels = voxels_of(network, [sample.points for sample in samples])
+        output, seen = network(voxels), [teacher(voxels).score for teacher in self.teachers]
+        targets = [assign_anchors(sample, network.config) for sample in samples]
+        return second_loss(output, targets, network.config) + self.weight * ensemble_loss(output.score, seen)
+
+
+def ensemble_loss(score: Tensor, teachers: Sequence[Tensor]) -> Tensor:
+    """Return the scalar divergence KL(p || q) of a batch's scores from those of an ensemble; all are logits (B, A, K).
+
+    q is the sigmoid of `score`, p that of the teachers' mean. It is summed over the anchors, and divided by the number
+    of those where the ensemble detects an object, or 1.
+    """
+    mean = torch.stack([*teachers]).mean(0)
+    wanted = mean.sigmoid()
+    cross, entropy = (F.binary_cross_entropy_with_logits(each, wanted, reduction="sum") for each in (score, mean))
+    return (cross - entropy) / (wanted >= SEEN).sum().clamp(min=1)

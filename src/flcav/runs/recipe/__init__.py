@@ -131,6 +131,13 @@ class PlacementSettings(Config):
 StrategySpec = str | Mapping[str, Mapping[str, Any]]  # a name, or a name with settings
 
 
+class CloudDistillation(Config):
+    """Ensemble distillation in the cloud: after each average the regions' networks teach it, see `TaughtObjects`."""
+
+    steps: int = Field(default=24, ge=1, le=10**6)  # optimiser steps after each average, on the samples of stage I
+    weight: float = Field(default=1.0, ge=0)  # of the ensemble's scores, beside the loss on labels
+
+
 class _Strategies(Rules):
     """Strategies, and the rules of the vehicles' rounds."""
 
@@ -146,6 +153,7 @@ class _Strategies(Rules):
     replay: float = Field(
         default=0.0, ge=0, lt=1
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
+    cloud_distillation: CloudDistillation | None = None  # of stage III's averages; None: they stay as they are
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 
@@ -154,6 +162,11 @@ class Federation(FederationFields, _Strategies):
     """Settings of federated learning: strategies, the rules of the vehicles' rounds, and those of extras."""
 
     cloud_topics: RosNamespace | None = None  # edge servers and cloud exchange parameters by ROS 2 topics below it
+
+    @property
+    def trains_in_cloud(self) -> bool:
+        """Whether the cloud trains on the samples of stage I, by replay or ensemble distillation."""
+        return bool(self.replay) or self.cloud_distillation is not None
 
 
 def _name_replanning(value: Any) -> Any:
@@ -321,11 +334,11 @@ class RunRecipe(Displayed, RecipeFields, _Drive, LabelFields, _Scene):
         ]
         if self.stragglers is not None and not any(timed):
             raise ValueError("stragglers: time counts with 'horizon_s' or 'federation.network' alone; give one of them")
-        replays = any(
-            how.get("replay") for how in (self.federation.model_dump(), *(arm.federation for arm in self.arms.values()))
-        )
-        if replays and not all(task.pretrains for task in self.tasks.values()):
-            raise ValueError("federation.replay: the cloud trains on samples of stage I, and a plan has none")
+        hows = (self.federation.model_dump(), *(arm.federation for arm in self.arms.values()))
+        for field in ("replay", "cloud_distillation"):
+            trains = any(how.get(field) not in (None, 0) for how in hows)
+            if trains and not all(task.pretrains for task in self.tasks.values()):
+                raise ValueError(f"federation.{field}: the cloud trains on samples of stage I, and a plan has none")
         for check in load_all(RECIPE_CHECKS):
             check(self)
         if MAIN in self.arms:

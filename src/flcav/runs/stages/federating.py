@@ -5,6 +5,7 @@ Stage II, and further edge rounds after it, take place in one region; stage III 
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, ClassVar
 
 from flcav.federation.edge_server import edge_seeds
@@ -21,6 +22,7 @@ from flcav.runs.recipe import CLOUD, EDGE, MORE_EDGE, Federation
 from flcav.runs.registry import CONDUCTS, COUNTS, DEALS, DRIVES, load_all
 from flcav.runs.results.plans import Plan, TaskPlan
 from flcav.runs.results.training import StageResult, StatisticsScore
+from flcav.runs.stages.cloud import CloudServer, EnsembleDistillation
 from flcav.runs.stages.outline import Outline
 from flcav.runs.stages.regions import (
     LabelledSamples,
@@ -32,7 +34,6 @@ from flcav.runs.stages.regions import (
     score_labels,
 )
 from flcav.runs.stages.rounds import (
-    CloudServer,
     Conduct,
     RegionStart,
     StageFederation,
@@ -319,11 +320,13 @@ def _share(
 def _open_cloud(work: Work, settings: CloudSettings, learning: Learning, config: Any) -> CloudServer:
     """Return the cloud's tasks besides averaging: it may train on the samples that it received in stage I."""
     how = settings.federation
-    replay = None
-    if how.replay:
-        samples = load_uploads(work, learning, config, settings.first.pretrain, settings.pools)
-        replay = TaskClient(learning.task, config, samples, batch=learning.batch)
-    return CloudServer(bool(settings.validation), replay, how.replay, how.cloud_topics)
+    cloud = CloudServer(bool(settings.validation), topics=how.cloud_topics)
+    if not how.trains_in_cloud:
+        return cloud
+    samples = load_uploads(work, learning, config, settings.first.pretrain, settings.pools)
+    own = TaskClient(learning.task, config, samples, batch=learning.batch)
+    distil = partial(EnsembleDistillation, own, how.cloud_distillation) if how.cloud_distillation else None
+    return replace(cloud, replay=own if how.replay else None, replay_share=how.replay, distil=distil)
 
 
 def _score_statistics(work: Work, settings: StageSettings, learning: Learning) -> tuple[StatisticsScore, ...] | None:
@@ -386,7 +389,7 @@ def make_cloud_step(outline: Outline, arm: Setting, task: str) -> Step:
     settings = CloudSettings(
         **dict(outline.federation(arm, task, CLOUD)),
         regions={region: outline.inputs(arm, region, task, CLOUD) for region in arm.regions},
-        pools=outline.pools(task) if arm.federation.replay else {},
+        pools=outline.pools(task) if arm.federation.trains_in_cloud else {},
         validation={region: names.recording(region, "validation", task) for region in scored},
     )
     at_once = max(outline.vehicles[region] for region in arm.regions)  # edge servers train one after another

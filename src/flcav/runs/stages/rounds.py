@@ -21,7 +21,7 @@ from flcav.federation.modes.buffered import Buffers, afford_buffers
 from flcav.federation.rules import Rules
 from flcav.federation.state import FederationState, RoundDivergence, measure_divergence
 from flcav.federation.strategies.fedavg import average
-from flcav.federation.trainable import LocalUpdate, Trainable, Update, Weights
+from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report
 from flcav.network.clock.records import RoundTiming
 from flcav.network.ledger import Ledger
@@ -32,6 +32,7 @@ from flcav.runs.driving import DrivenStage
 from flcav.runs.engine import Work
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import CLOUD, EDGE
+from flcav.runs.stages.cloud import CloudServer, Replay
 from flcav.runs.training.checkpoints import FederationCheckpoints, load_round_network
 from flcav.runs.training.learning import (
     Learning,
@@ -63,28 +64,6 @@ class RegionStart:
     weights: Weights  # at the start of its first round: those of pretraining, or after stage II those of stage II
     earlier: int  # earlier rounds with the same vehicles, which count against a privacy budget
     edge_rounds: int = 1  # in a cloud round
-
-
-@dataclass(frozen=True)
-class Replay:
-    """The cloud's training on the samples of stage I, weighted as if it had a given number of samples."""
-
-    client: TaskClient
-    samples: int
-
-    def train(self, weights: Weights, **how: Any) -> Update:
-        """Return the update of `TaskClient.train`, with that number of samples."""
-        return replace(self.client.train(weights, **how), samples=self.samples)
-
-
-@dataclass(frozen=True)
-class CloudServer:
-    """The cloud's tasks in stage III besides averaging."""
-
-    keeps_statistics: bool = False  # whether the regions' statistics of batch normalisation are written, too
-    replay: TaskClient | None = None  # client that trains on the samples of stage I
-    replay_share: float = 0.0  # weight of its update in an average, in [0, 1)
-    topics: str | None = None  # ROS namespace by which edge servers and cloud exchange messages; None: in memory
 
 
 class RoundsOver(Exception):
@@ -318,7 +297,10 @@ def federate_stage(
         keep = partial(_keep_round, own, servers, state, checkpoints)
         if cloud is not None:
             parties = {**servers, **own.open_replay(cloud)}
-            how: dict[str, Any] = {"strategy": own.strategies.cloud, "rules": rules.of_servers()}
+            strategy = own.strategies.cloud
+            if cloud.distil is not None:
+                strategy = cloud.distil(lambda: schedule.work(len(state.records) + 1))  # records are of combined rounds
+            how: dict[str, Any] = {"strategy": strategy, "rules": rules.of_servers()}
             how["runtime"] = own.open_topics(cloud.topics, done)
             wireline = Account(own.book, CLOUD, task.name, "wireline", within=frozenset({REPLAY}))
             federate(parties, start, schedule, wireline, state=state, done=done, on_round=keep, **how)
