@@ -15,7 +15,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from flcav.cli.main import run
-from flcav.cli.planning import place_inputs
+from flcav.planner import inputs as place_inputs
 from flcav.optimization.placement import solve
 from flcav.report.charts import figures
 from flcav.world.geodesy import convert_to_geodetic

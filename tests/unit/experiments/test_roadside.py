@@ -4,7 +4,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.cli.planning.place_inputs import read_given
+from flcav.planner.inputs import read_given
 from flcav.config import parse_config
 from flcav.fusion.average import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of

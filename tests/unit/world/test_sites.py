@@ -10,7 +10,7 @@ import shapely
 import yaml
 from scipy.spatial.distance import pdist
 
-from flcav.cli.planning.place_inputs import find_sites
+from flcav.planner.inputs import find_sites
 from flcav.config import InputError
 from flcav.world.geodesy import convert_to_geodetic, find_on_ground
 from flcav.world.map.roads import read_net
