@@ -78,6 +78,7 @@ class Desk:
             "towns": [] if self.first or self.problem or self.run else [describe_card(name) for name in TOWNS],
             "problem": None if self.problem is None else describe_problem(self.problem, self.problem_name),
             "run": self.run,
+            "spaces": list(self.spaces),
         }
 
 

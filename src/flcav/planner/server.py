@@ -348,5 +348,5 @@ def serve(desk: Desk, port: int | None, report: Callable[[str], None]) -> None:
 
         app = make_app(desk, token)
         app.router.lifespan_context = told
-        config = uvicorn.Config(app, log_level="warning", log_config=None, timeout_graceful_shutdown=1)
+        config = uvicorn.Config(app, log_level="critical", log_config=None, timeout_graceful_shutdown=1)
         uvicorn.Server(config).run(sockets=[door])

@@ -11,12 +11,14 @@ from flcav.cli.terminal import echo
 if TYPE_CHECKING:
     from flcav.planner.desk import Desk
 
+RESULTS = "results.json"  # file of a finished run
+
 
 def planner(
     what: str | None = typer.Argument(
         None,
-        help="A town's name or folder, an OpenDRIVE map (.xodr), or a problem of `flcav allocate` (.yaml); by default "
-        "the towns of flcav to choose from.",
+        help="A town's name or folder, an OpenDRIVE map (.xodr), the folder of a finished run, or a problem of `flcav "
+        "allocate` (.yaml); by default the towns of flcav to choose from.",
     ),
     errors: Path | None = typer.Option(None, help="A town's errors, or points of your own, as of `flcav place`."),
     poles: Path | None = typer.Option(None, help="Candidate poles, as of `flcav place`; by default the town's."),
@@ -82,9 +84,9 @@ def _lay(
     for file in (errors, poles, sensors):
         if file is not None and not file.exists():
             raise InputError(f"{file}: no such file")
-    ending = Path(what or "").suffix.lower()
+    ending, finished = Path(what or "").suffix.lower(), what is not None and (Path(what) / RESULTS).exists()
     placing = {"--errors": errors, "--poles": poles, "--every": every, "--data": data}
-    if ending in (".yaml", ".yml", ".json"):
+    if ending in (".yaml", ".yml", ".json") or finished:
         placing |= {"--sensors": sensors, "--range": range_m}
     elif ending == ".xodr":
         placing = {"--data": data}
@@ -102,6 +104,10 @@ def _lay(
         path = find_recipe(Path(what or ""))
         desk.problem, desk.problem_name = load_problem(path), path.name
         return desk
+    if finished:
+        from flcav.planner.replaying import open_run  # loads torch, as runs do
+
+        return open_run(Path(what or ""))
     if what is None and data is None:
         return desk
     if ending == ".xodr":

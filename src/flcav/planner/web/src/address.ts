@@ -2,7 +2,7 @@
 import type { Kind, Placing, Stand } from "./types";
 
 export type Tab = "place" | "plan" | "replay";
-export type Shared = { town: string; tab: Tab; placing: Partial<Placing>; budgets: number[] };
+export type Shared = { town: string; tab: Tab | null; placing: Partial<Placing>; budgets: number[] };
 
 const enc = encodeURIComponent;
 const short = (value: number) => String(Math.round(value * 100) / 100);
@@ -11,6 +11,7 @@ export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: 
   const parts = [];
   if (town) parts.push(`t=${enc(town)}`);
   if (tab !== "place") parts.push(`tab=${tab}`);
+  else if (!town) return "";
   if (town) {
     parts.push(`k=${placing.kinds.map((each) => [enc(each.name), short(each.range_m), short(each.cost)].join(",")).join(";")}`);
     if (placing.stands.length)
@@ -58,5 +59,5 @@ export function readAddress(hash: string): Shared {
   if (without) placing.without = without.split(";").map(text);
   const tab = fields.get("tab");
   const budgets = (fields.get("b") ?? "").split(",").map(Number).filter((each) => each > 0);
-  return { town: text(fields.get("t") ?? ""), tab: tab === "plan" || tab === "replay" ? tab : "place", placing, budgets };
+  return { town: text(fields.get("t") ?? ""), tab: tab === "place" || tab === "plan" || tab === "replay" ? tab : null, placing, budgets };
 }

@@ -23,7 +23,7 @@ export function Curve({ steps, priced, even, total, yours, onPick }: Props) {
     return n ? `${path}H${px}V${py}` : `M${atX(0)} ${atY(0)}H${px}V${py}`;
   }, "");
   const ticks = (end: number, count: number) => {
-    const rough = end / count;
+    const rough = end / count / 1.6;
     const power = 10 ** Math.floor(Math.log10(rough));
     const step = Math.max([1, 2, 5, 10].find((each) => each * power >= rough)! * power, priced ? 0 : 1);
     return Array.from({ length: Math.floor(end / step) + 1 }, (_, n) => Math.round(n * step * 1e6) / 1e6);

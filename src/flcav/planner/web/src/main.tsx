@@ -4,6 +4,7 @@ import { readAddress, writeAddress, type Tab } from "./address";
 import { makeLive, makeSaved, Unreachable, type Budgets, type Saved } from "./api";
 import { Place } from "./place";
 import { PlanTab } from "./plan";
+import { Replay } from "./replay";
 import type { Card, Kind, Placing, Point, Start, Workspace } from "./types";
 
 const TABS: Record<Tab, string> = { place: "Place", plan: "Plan", replay: "Replay" };
@@ -19,7 +20,7 @@ function App() {
   const [space, setSpace] = useState<Workspace | null>(null);
   const [placing, setNow] = useState<Placing>({ kinds: [], stands: [], sight: true, without: [] });
   const [past, setPast] = useState<Placing[]>([]);
-  const [tab, setTab] = useState<Tab>(shared.tab);
+  const [tab, setTab] = useState<Tab>(shared.tab ?? "place");
   const [budgets, setBudgets] = useState<Budgets | null>(null);
   const [busy, setBusy] = useState("");
   const [problem, setProblem] = useState("");
@@ -43,7 +44,6 @@ function App() {
       without: state.without ?? [],
     });
     setPast([]);
-    setTab("place");
   }, []);
 
   useEffect(() => {
@@ -56,8 +56,9 @@ function App() {
         setBudgets({ wireless_mb: wireless_mb ?? problem.wireless_mb, wireline_mb: wireline_mb ?? problem.wireline_mb, horizon_s: horizon_s ?? problem.horizon_s });
         setTab("plan");
       }
+      if (found.run && !shared.town) setTab("replay");
       const wanted = shared.town || found.first;
-      if (!wanted || (found.problem && !found.first)) return;
+      if (!wanted || ((found.problem || found.run) && !found.first)) return;
       setBusy(`Opening ${wanted} …`);
       try {
         take(await api.workspace(wanted), found.kinds, shared.placing);
@@ -85,7 +86,7 @@ function App() {
 
   const open = (name: string) => {
     setBusy(`Opening ${name} …`);
-    api.open(name).then((found) => take(found, start!.kinds)).catch(fail).finally(() => setBusy(""));
+    api.open(name).then((found) => [take(found, start!.kinds), setTab("place")]).catch(fail).finally(() => setBusy(""));
   };
   const drop = (file: File | undefined) => {
     if (!file || api.saved) return;
@@ -108,12 +109,17 @@ function App() {
     return () => [window.removeEventListener("dragover", over), window.removeEventListener("drop", dropped)] as unknown as void;
   });
 
-  const tabs = (["place", "plan", "replay"] as Tab[]).filter((each) => (each === "place" ? space : each === "plan" ? start?.problem : false));
+  const tabs = (["place", "plan", "replay"] as Tab[]).filter((each) => (each === "place" ? space : each === "plan" ? start?.problem : start?.run));
   return (
     <>
       <header>
         <span class="mark"><b>flcav</b> planner</span>
         {tabs.length > 1 && <nav>{tabs.map((each) => <button type="button" aria-current={tab === each ? "page" : undefined} onClick={() => setTab(each)}>{TABS[each]}</button>)}</nav>}
+        {start && start.spaces.length > 1 && tab === "place" && (
+          <select aria-label="Region" value={space?.key} onChange={(event) => api.workspace(event.currentTarget.value).then((found) => take(found, placing.kinds)).catch(fail)}>
+            {start.spaces.map((key) => <option>{key}</option>)}
+          </select>
+        )}
         {space && tab === "place" && <span class="where"><b>{space.map.name}</b>{space.table && <span> {space.table}</span>}</span>}
         {!api.saved && space && tab === "place" && (
           <label class="file">
@@ -132,7 +138,8 @@ function App() {
       {busy && <div class="busy" role="status"><i aria-hidden="true" />{busy}</div>}
       {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, say, fail }} />}
       {tab === "plan" && start?.problem && budgets && <PlanTab {...{ api, problem: start.problem, budgets, setBudgets, say, fail }} />}
-      {start && !space && !start.problem && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} />}
+      {tab === "replay" && start?.run && <Replay run={start.run} say={say} />}
+      {start && !space && !start.problem && !start.run && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} />}
       <p class="said" role="status" aria-live="polite">{said}</p>
     </>
   );

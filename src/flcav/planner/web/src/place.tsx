@@ -334,7 +334,7 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
         {placing.stands.length > 0 && (
           <section>
             <h2>{plural(placing.stands.length, "sensor")}</h2>
-            <ol class="stands">
+            <ol class="stands" id="stands">
               {placing.stands.map((stand) => {
                 const pole = stand.pole === null ? null : space.poles[stand.pole];
                 const sees = (looks.get(stand.id)?.covered ?? []).filter((row) => shown[row]).length;
@@ -383,14 +383,14 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
               </button>
             )}
             {sought && !news.length && <p>No place beside a street sees any more of them.</p>}
-            <ol class="stands">
+            {news.length > 0 && <ol class="stands">
               {news.map((place) => (
                 <li>
                   <span class="pick"><b>+{number(place.gain)}</b> {place.site.street ?? "beside the road"}<small>x {number(place.site.x)}, y {number(place.site.y)} m</small></span>
                   <button type="button" onClick={() => put({ id: 0, pole: null, x: Math.round(place.site.x * 10) / 10, y: Math.round(place.site.y * 10) / 10, kind }, true)}>Stand one there</button>
                 </li>
               ))}
-            </ol>
+            </ol>}
           </section>
         )}
 

@@ -62,7 +62,7 @@ export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props)
         {feasible && (
           <>
             <p class="big"><strong id="objective">{digits(feasible.objective)}</strong> {problem.measure}</p>
-            <p class="note">{feasible.said} {feasible.gap === null ? "There is no certificate." : `Proven within ${percent(feasible.gap)} for the fitted curves.`}
+            <p class="note">{problem.measure[0].toUpperCase() + problem.measure.slice(1)}: {feasible.said} {feasible.gap === null ? "There is no certificate." : `Proven within ${percent(feasible.gap)} for the fitted curves.`}
               {feasible.equal && ` Equal shares of the stages: ${digits(feasible.equal.objective)}.`}</p>
             <div class="cards">
               {feasible.tasks.map((task, n) => <TaskCard task={task} equal={feasible.equal?.tasks[n] ?? null} warnings={feasible.warnings.filter((each) => each.includes(`'${task.name}'`))} />)}

@@ -81,28 +81,23 @@ export type Plan = {
   equal: { objective: number; note: string | null; tasks: TaskPlan[] } | null;
 };
 export type Saving = { link: string; added: number; added_mb: number; objective: number; gap: number | null; saved: number };
-export type RunRound = {
+export type Moment = {
   stage: string;
-  task: string;
-  server: string;
   round: number;
-  up_mb: number;
-  down_mb: number;
-  loss: number | null;
-  clients: number;
-  failed: number;
+  told: string;
+  servers: { server: string; task: string; clients: number; failed: number; loss: number | null; up_mb: number; down_mb: number }[];
+  sent: Record<"wireless" | "wireline", number>;
+  scores: Record<string, number>;
 };
-export type Watched = { stage: string; task: string; region: string; frames: number; rounds: { round: number; score: number }[] };
 export type RunInfo = {
   name: string;
   arm: string;
-  budgets: { wireless: number; wireline: number };
-  spent: { stage: string; task: string; link: string; mb: number }[];
-  rounds: RunRound[];
-  watched: Watched[];
-  placed: { region: string; chosen: number[]; errors: number; covered: number; range_m: number }[];
-  findings: { sentence: string; verdict: string; question: string; place: string }[];
-  measure: string;
+  moments: Moment[];
+  budgets: Record<"wireless" | "wireline", number>;
+  used: Record<"wireless" | "wireline", number>;
+  frames: number;
+  findings: { verdict: string; sentence: string }[];
+  placed: { region: string; poles: number[]; covered: number; errors: number }[];
 };
 export type Start = {
   first: string | null;
@@ -110,6 +105,7 @@ export type Start = {
   towns: Card[];
   problem: ProblemInfo | null;
   run: RunInfo | null;
+  spaces: string[];
 };
 /** A sensor: on a pole, or at a place of one's own (pole null). */
 export type Stand = { id: number; pole: number | null; x: number; y: number; kind: number };
