@@ -43,7 +43,7 @@ export function Curve({ steps, priced, even, total, yours, onPick }: Props) {
         <g
           class={step.optimal ? "step" : "step open"}
           role="button"
-          tabIndex={0}
+          tabindex={0}
           aria-label={`${priced ? `cost ${x(step)}` : `${x(step)} sensors`}: ${y(step)} of ${total}${step.optimal ? ", proven" : `, at most ${step.bound}`}`}
           onClick={() => onPick(step)}
           onKeyDown={(event) => event.key === "Enter" && onPick(step)}

@@ -225,7 +225,7 @@ export function TownView(props: MapProps) {
               id={`pole-${number}`}
               class="pole"
               role="button"
-              tabIndex={0}
+              tabindex={0}
               aria-label={`Pole ${pole.id}${pole.street ? `, ${pole.street}` : ""}: place ${kinds[props.kind]?.name ?? "a sensor"}`}
               transform={`translate(${pole.at[0]} ${-pole.at[1]})`}
               onPointerDown={(event) => event.stopPropagation()}
@@ -251,7 +251,7 @@ export function TownView(props: MapProps) {
               id={`stand-${stand.id}`}
               class={`stand k${stand.kind % 6}${props.moving ? " moving" : ""}${props.selected === stand.id ? " chosen" : ""}`}
               role="button"
-              tabIndex={0}
+              tabindex={0}
               aria-label={`${kinds[stand.kind]?.name ?? "sensor"} on ${name}, sees ${looks.get(stand.id)?.covered.length ?? 0}; Enter removes it, arrows move it`}
               style={{ transform: `translate(${x}px, ${-y}px)` }}
               onPointerDown={(event) => {

@@ -225,6 +225,8 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
 
   return (
     <div class="place">
+      <main class="stage">
+      <h1 class="said">Sensors in {space.map.name}</h1>
       <TownView
         {...{ space, stands, kinds, looks, covered, shown, kind, sight, news, moving, carried, selected }}
         onlyPoles={api.saved}
@@ -237,6 +239,7 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
         onSelect={setSelected}
       />
       <Legend space={space} covered={placing.stands.length > 0} />
+      </main>
       <aside class="panel" aria-label="Sensors and what they cover">
         {space.errors.length > 0 ? (
           <section class="headline">
@@ -436,7 +439,7 @@ function Command({ api, space, placing, say, fail }: Pick<Props, "api" | "space"
   if (!space.errors.length) return null;
   return text ? (
     <>
-      <pre tabIndex={0} aria-label="The command that finds the optimum">{text}</pre>
+      <pre tabindex={0} aria-label="The command that finds the optimum">{text}</pre>
       <button type="button" class="quiet" onClick={() => navigator.clipboard.writeText(text).then(() => say("The command is copied"), fail)}>Copy it</button>
     </>
   ) : (

@@ -105,7 +105,7 @@ function TaskCard({ task, equal, warnings }: { task: TaskPlan; equal: TaskPlan |
       </div>
       {task.low !== null && <p class="note">band: {task.told.slice(task.told.indexOf("("))}</p>}
       <table>
-        <thead><tr><th /><th>plan</th>{equal && <th>equal shares</th>}</tr></thead>
+        <thead><tr><td /><th>plan</th>{equal && <th>equal shares</th>}</tr></thead>
         <tbody>
           {rows.map(([name, field]) => <tr><th scope="row">{name}</th><td>{String(task[field])}</td>{equal && <td>{String(equal[field])}</td>}</tr>)}
           <tr><th scope="row">accuracy</th><td>{task.told.split(" ")[0]}</td>{equal && <td>{equal.told.split(" ")[0]}</td>}</tr>

@@ -57,7 +57,7 @@ export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void
       <main class="sheet">
         <h1>{run.name}</h1>
         <div class="player">
-          <button type="button" class="primary" onClick={play} aria-label={playing ? "Pause" : "Play"}>{playing ? "❚❚ Pause" : "▶ Play"} <kbd>Space</kbd></button>
+          <button type="button" class="primary" onClick={play}>{playing ? "❚❚ Pause" : "▶ Play"} <kbd>Space</kbd></button>
           <input type="range" min={0} max={moments.length - 1} value={at} aria-label="Moment of the run" aria-valuetext={moment.told} onInput={(event) => go(Number(event.currentTarget.value))} />
           <output id="moment">{moment.told}</output>
         </div>
@@ -83,7 +83,7 @@ export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void
           {!moment.servers.length && <p class="note">The cloud trains on what vehicles uploaded; nothing goes back and forth.</p>}
         </div>
       </main>
-      <aside class="panel" aria-label="Ledger">
+      <aside class="panel" aria-label="Ledger" tabindex={0}>
         <section>
           <h2>Ledger</h2>
           {LINKS.map((link) => {
