@@ -31,7 +31,6 @@ SMOOTH = 1.0  # standard deviation of the smoothing of a viewshed's outline, in 
 WAYS = 12  # most steps of a curve of coverage
 NEW_EVERY_M = 20.0  # distance between the places at which a new pole is tried
 NEW_SHOWN = 3  # of them that are told
-APART_M = 25.0  # least distance between them
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,9 +228,10 @@ class NewPole:
 
 
 def find_new_poles(space: Workspace, question: Question, kind: int, uncovered: Sequence[int]) -> list[NewPole]:
-    """Return the places beside streets where a sensor of a `kind` covers most of the `uncovered` rows of the errors.
+    """Return places beside streets where a sensor of a `kind` covers most of the `uncovered` rows of the errors.
 
-    Places are tried every `NEW_EVERY_M` along all streets; those that are told are `APART_M` apart.
+    Places are tried every `NEW_EVERY_M` along all streets. The second covers most of what is left after the first, and
+    so on.
     """
     if space.given is None or not len(uncovered):
         return []
@@ -241,19 +241,19 @@ def find_new_poles(space: Workspace, question: Question, kind: int, uncovered: S
     sites, range_m = draw_sites(space.town, NEW_EVERY_M), question.kinds.ranges_m[kind]
     if not kept.any() or not len(sites):
         return []
-    errors, weight = space.errors[kept], space.given.weight[kept]
+    errors, left = space.errors[kept], space.given.weight[kept].copy()
     if question.line_of_sight:
         sees = find_seen(errors, sites, range_m, space.town, space.traces)
     else:
         sees = find_covered(errors, sites, [range_m])
-    gain, number = sees @ weight, sees @ np.ones(len(errors))
-    shown: list[int] = []
-    for place in np.argsort(-gain, kind="stable").tolist():
-        far = all(np.hypot(*(sites[place] - sites[other])[:2]) >= APART_M for other in shown)
-        if gain[place] > 0 and far and len(shown) < NEW_SHOWN:
-            shown.append(place)
-    located = locate_sites(space.town, sites[shown])
-    return [NewPole(site, float(gain[n]), int(number[n])) for site, n in zip(located, shown, strict=True)]
+    found: list[tuple[int, float, int]] = []
+    while len(found) < NEW_SHOWN and (gain := sees @ left).max() > 0:
+        place = int(np.argmax(gain))
+        new = (sees[[place]].toarray()[0] > 0) & (left > 0)
+        found.append((place, float(gain[place]), int(new.sum())))
+        left[new] = 0.0
+    located = locate_sites(space.town, sites[[place for place, _, _ in found]])
+    return [NewPole(site, gain, number) for site, (_, gain, number) in zip(located, found, strict=True)]
 
 
 def describe_map(town: Town) -> dict[str, Json]:
