@@ -3,6 +3,7 @@
 import json
 import re
 import subprocess
+from pathlib import Path
 
 import pytest
 from conftest import FLCAV, Served, serve
@@ -128,7 +129,7 @@ def test_everything_goes_by_keyboard_alone(opened, served):
 def test_what_is_covered_is_said_to_readers_of_screens(opened, served, table):
     page = show(opened, served.address)
     page.locator("#pole-1").click()
-    wait_for(page, ".said", f"{seen_from(table, 2)} of 113 errors covered by 1 sensor")
+    wait_for(page, "p.said", f"{seen_from(table, 2)} of 113 errors covered by 1 sensor")
 
 
 def test_the_address_brings_the_state_back_and_holds_no_token(opened, served):
@@ -163,6 +164,23 @@ def test_prices_give_a_curve_of_coverage_against_cost(opened, served):
     page.wait_for_selector("text=Coverage against cost")
     page.get_by_label("of as many sensors").check()
     wait_for(page, "#best", "with 1 sensor")
+
+
+def test_the_best_for_a_number_of_ones_own_is_shown(opened, served, table):
+    page = show(opened, served.address)
+    page.get_by_label("The best with").fill("4")
+    page.get_by_role("button", name="Show", exact=True).click()
+    wait_for(page, COVERED, str(placed(table, 4)["covered"]))
+    assert page.locator(".map .stand").count() == 4
+
+
+def test_a_map_of_ones_own_is_dropped(opened, served):
+    pytest.importorskip("sumolib", reason="no netconvert: pip install flcav[towns]")
+    page = show(opened, served.address)
+    page.set_input_files(".file input", Path(__file__).parents[2] / "recipes" / "maps" / "quarter.xodr")
+    page.wait_for_selector(".map svg[aria-label='Map of quarter']", timeout=120_000)
+    page.locator("#pole-0").click()
+    page.locator(".reach path").first.wait_for(state="attached")
 
 
 def test_a_new_pole_is_found_and_stood(opened, served):

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import check_finite
+from flcav.cli.options import check_finite, refuse_unused
 from flcav.cli.terminal import echo
 
 if TYPE_CHECKING:
@@ -41,6 +41,8 @@ def planner(
     ),
 ) -> None:
     """Plan in the browser, on this machine alone: where sensors see most errors, and what to send."""
+    if html is not None:
+        refuse_unused("--html", "port")
     desk = _lay(what, errors, poles, every, sensors, range_m, data)
     if html is not None:
         from flcav.planner.saving import save_page

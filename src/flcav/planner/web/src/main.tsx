@@ -18,8 +18,10 @@ function App() {
   const shared = useMemo(() => readAddress(location.hash), []);
   const [start, setStart] = useState<Start | null>(null);
   const [space, setSpace] = useState<Workspace | null>(null);
-  const [placing, setNow] = useState<Placing>({ kinds: [], stands: [], sight: true, without: [] });
-  const [past, setPast] = useState<Placing[]>([]);
+  const [{ placing, past }, setHistory] = useState<{ placing: Placing; past: Placing[] }>({
+    placing: { kinds: [], stands: [], sight: true, without: [] },
+    past: [],
+  });
   const [tab, setTab] = useState<Tab>(shared.tab ?? "place");
   const [budgets, setBudgets] = useState<Budgets | null>(null);
   const [busy, setBusy] = useState("");
@@ -37,13 +39,10 @@ function App() {
     poles.current = found.poles.length;
     const own = state.kinds ?? kinds;
     setSpace(found);
-    setNow({
-      kinds: own,
-      stands: (state.stands ?? []).filter((each) => (each.pole === null || (Number.isInteger(each.pole) && each.pole >= 0 && each.pole < found.poles.length)) && own[each.kind]),
-      sight: state.sight ?? true,
-      without: state.without ?? [],
-    });
-    setPast([]);
+    const stands = (state.stands ?? []).filter(
+      (each) => (each.pole === null || (Number.isInteger(each.pole) && each.pole >= 0 && each.pole < found.poles.length)) && own[each.kind],
+    );
+    setHistory({ placing: { kinds: own, stands, sight: state.sight ?? true, without: state.without ?? [] }, past: [] });
   }, []);
 
   useEffect(() => {
@@ -71,11 +70,9 @@ function App() {
     })().catch((error) => [setBusy(""), fail(error)]);
   }, []);
 
-  const setPlacing = useCallback((next: Placing) => {
-    setPast((before) => [...before.slice(-99), placing]);
-    setNow(next);
-  }, [placing]);
-  const undo = past.length ? () => [setNow(past[past.length - 1]), setPast(past.slice(0, -1))] : null;
+  const setPlacing = useCallback((next: Placing) => setHistory((held) => ({ placing: next, past: [...held.past.slice(-99), held.placing] })), []);
+  const goBack = () => setHistory(({ placing, past }) => ({ placing: past[past.length - 1] ?? placing, past: past.slice(0, -1) }));
+  const undo = past.length ? goBack : null;
 
   useEffect(() => {
     if (!start || api.saved) return;

@@ -1,5 +1,5 @@
 /** The tab Place: a map with sensors, and beside it what they cover, what could be covered, and what that costs. */
-import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
 import { siteOf, type Api } from "./api";
 import { Curve } from "./curve";
 import { saveMap, saveText } from "./saving";
@@ -191,7 +191,7 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
     if (target) show(target);
   };
 
-  useEffect(() => {
+  useLayoutEffect(() => {
     const keyed = (event: KeyboardEvent) => {
       if ((event.target as Element).matches("input, select, textarea") || event.ctrlKey || event.metaKey || event.altKey) return;
       if (event.key === "o" || event.key === "O") optimum();
@@ -267,6 +267,23 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
               <button type="button" onClick={() => undo?.()} disabled={!undo}>Undo <kbd>Z</kbd></button>
               <button type="button" onClick={() => setPlacing({ ...placing, stands: [] })} disabled={!placing.stands.length}>Clear</button>
             </div>
+            {!api.saved && (
+              <form
+                class="wish"
+                onSubmit={(event) => {
+                  event.preventDefault();
+                  const value = Number(new FormData(event.currentTarget).get("wish"));
+                  api.best(space.key, placing, same === "cost" ? { budget: value } : { count: Math.round(value) }).then(show).catch(fail);
+                }}
+              >
+                <label>
+                  {same === "cost" ? "The best for a cost of" : "The best with"}{" "}
+                  <input name="wish" type="number" required min={same === "cost" ? 0 : 1} max={same === "cost" ? undefined : space.poles.length + placing.stands.length} step={same === "cost" ? "any" : 1} />
+                  {same === "cost" ? "" : " sensors"}
+                </label>
+                <button type="submit">Show</button>
+              </form>
+            )}
             {priced && !api.saved && (
               <fieldset class="row">
                 <legend>Compare with the best</legend>

@@ -1,5 +1,5 @@
 /** The tab Replay: a finished run, played moment by moment: scores, messages of every server, the ledger that fills. */
-import { useEffect, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useState } from "preact/hooks";
 import type { Moment, RunInfo } from "./types";
 
 const LINKS = ["wireless", "wireline"] as const;
@@ -37,7 +37,7 @@ export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void
     const next = setTimeout(() => (at < moments.length - 1 ? setAt(at + 1) : setPlaying(false)), STEP_MS);
     return () => clearTimeout(next);
   }, [playing, at]);
-  useEffect(() => {
+  useLayoutEffect(() => {
     const keyed = (event: KeyboardEvent) => {
       if ((event.target as Element).matches("input, button")) {
         if (event.key !== " " || (event.target as Element).matches("button")) return;
@@ -114,7 +114,8 @@ function Scores({ run, at, best, onPick }: { run: RunInfo; at: number; best: num
   const { moments } = run;
   const names = Object.keys(moments[moments.length - 1].scores);
   const values = moments.flatMap((each) => Object.values(each.scores));
-  const [width, height, left, right, top, bottom] = [860, 300, 44, 130, 18, 30];
+  const narrow = matchMedia("(max-width: 820px)").matches;
+  const [width, height, left, right, top, bottom] = narrow ? [400, 300, 38, 16, 18, 30] : [860, 300, 44, 130, 18, 30];
   const low = Math.floor(Math.min(...values) * 20) / 20;
   const high = Math.ceil(Math.max(...values) * 20) / 20 || 1;
   const x = (n: number) => left + ((width - left - right) * n) / Math.max(moments.length - 1, 1);
@@ -126,20 +127,24 @@ function Scores({ run, at, best, onPick }: { run: RunInfo; at: number; best: num
       {Array.from({ length: Math.round((high - low) / 0.05) + 1 }, (_, n) => low + n * 0.05).map((score) => (
         <g class="grid"><line x1={left} x2={width - right} y1={y(score)} y2={y(score)} /><text x={left - 8} y={y(score)} dy=".35em" text-anchor="end">{score.toFixed(2)}</text></g>
       ))}
-      <text class="tick" x={width - right + 12} y={12}>validation score</text>
+      <text class="tick" x={narrow ? 0 : width - right + 12} y={12}>validation score</text>
       <rect class="past" x={x(0)} width={Math.max(x(at) - x(0), 0)} y={top} height={height - top - bottom} />
-      {best >= 0 && <text class="tick" x={x(best)} y={12} text-anchor="middle">gained most</text>}
+      {best >= 0 && <text class="tick" x={Math.max(x(best), narrow ? 130 : 0)} y={12} text-anchor="middle">gained most</text>}
       {names.map((name, k) => (
         <g class={`line k${k % 6}`}>
           <path d={moments.flatMap((each, n) => (each.scores[name] === undefined ? [] : [`${x(n)} ${y(each.scores[name])}`])).map((point, n) => (n ? "L" : "M") + point).join("")} />
           {moments.map((each, n) => each.scores[name] !== undefined && <circle cx={x(n)} cy={y(each.scores[name])} r={n === at ? 6 : 3.2} />)}
-          <text x={width - right + 12} y={ends.find((each) => each.name === name)!.y} dy=".35em">{name}</text>
+          {narrow ? (
+            <text x={width - right - 6} y={height - bottom - 12 - 18 * k} text-anchor="end">{name}</text>
+          ) : (
+            <text x={width - right + 12} y={ends.find((each) => each.name === name)!.y} dy=".35em">{name}</text>
+          )}
         </g>
       ))}
       {moments.map((each, n) => (
         <g onClick={() => onPick(n)} class="moment">
-          <rect x={x(n) - 18} width="36" y={top} height={height - top} />
-          <text class={`tick${n === at ? " now" : ""}`} x={x(n)} y={height - 9} text-anchor="middle">{each.stage === "pretrain" ? "I" : `${each.stage === "edge" ? "II" : "III"}·${each.round}`}</text>
+          <rect x={x(n) - 14} width="28" y={top} height={height - top} />
+          {(!narrow || n % 3 === 0 || n === at) && <text class={`tick${n === at ? " now" : ""}`} x={x(n)} y={height - 9} text-anchor="middle">{each.stage === "pretrain" ? "I" : `${each.stage === "edge" ? "II" : "III"}·${each.round}`}</text>}
         </g>
       ))}
     </svg>
