@@ -190,7 +190,7 @@ def test_a_new_pole_is_found_and_stood(opened, served):
     before = int(page.locator(COVERED).inner_text())
     page.get_by_role("button", name="Find the place").click()
     page.locator(".map .new").first.wait_for()
-    gain = int(re.search(r"\+(\d+)", page.locator(".map .new").first.text_content())[1])
+    gain = int(re.findall(r"\+(\d+)", page.locator(".map .new").first.text_content())[0])
     page.get_by_role("button", name="Stand one there").first.click()
     wait_for(page, COVERED, str(before + gain))
 

@@ -81,7 +81,7 @@ def _list_moments(result: ArmResult) -> Iterator[tuple[dict[str, Json], dict[str
             link: sum(row.mb for row in select(result.spent, stage=stage, link=link))
             for link in ("wireless", "wireline")
         }
-        rounds = sorted({record.round for each in of_stage for record in each.records})
+        rounds = sorted({record.round for each in of_stage for record in each.records or ()})
         sent = {number: _up_of_round(of_stage, number) for number in rounds}
         for up in sent.values():
             beside = {link: mb - up[link] for link, mb in beside.items()}
@@ -101,7 +101,7 @@ def _list_moments(result: ArmResult) -> Iterator[tuple[dict[str, Json], dict[str
                     "down_mb": (record.down_bytes or 0) / MB,
                 }
                 for each in of_stage
-                for record in each.records
+                for record in each.records or ()
                 if record.round == number
             ]
             first = {link: mb if number == rounds[0] else 0.0 for link, mb in beside.items()}
@@ -111,9 +111,9 @@ def _list_moments(result: ArmResult) -> Iterator[tuple[dict[str, Json], dict[str
 
 def _up_of_round(stages: list[StageResult], number: int) -> dict[str, float]:
     """Return what the messages of a round sent upwards over each link [MB]."""
-    up = dict.fromkeys(LINKS, 0.0)
+    up: dict[str, float] = dict.fromkeys(LINKS, 0.0)
     for stage in stages:
-        for record in stage.records:
+        for record in stage.records or ():
             if record.round == number:
                 up["wireline" if record.server == CLOUD else "wireless"] += (record.up_bytes or 0) / MB
     return up

@@ -1,6 +1,6 @@
 /** The map: a town in metres, its errors, poles and sensors, with pointer and keyboard. */
 import { memo } from "preact/compat";
-import { useEffect, useMemo, useRef, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Kind, Look, NewPole, Point, Pole, Stand, TownMap, Wrong, Workspace } from "./types";
 
 export const SNAP_M = 8;
@@ -59,9 +59,11 @@ export function TownView(props: MapProps) {
   const drag = useRef<Drag | null>(null);
   const fingers = useRef(new Map<number, Point>());
   useEffect(() => setBox(whole), [whole]);
-  useEffect(() => {
+  useLayoutEffect(() => {
+    const { width, height } = svg.current!.getBoundingClientRect();
+    setSize([width, height]);
     const watch = new ResizeObserver(([entry]) => setSize([entry.contentRect.width, entry.contentRect.height]));
-    if (svg.current) watch.observe(svg.current);
+    watch.observe(svg.current!);
     return () => watch.disconnect();
   }, []);
   const scale = Math.max(box.w / size[0], box.h / size[1]); // metres a pixel
@@ -139,7 +141,7 @@ export function TownView(props: MapProps) {
   };
 
   // A sensor that comes from the panel is carried by the pointer wherever that is over the map.
-  useEffect(() => {
+  useLayoutEffect(() => {
     if (props.carried === null) return;
     const stand: Stand = { id: 0, pole: null, x: 0, y: 0, kind: props.carried };
     const over = (event: PointerEvent) => {
