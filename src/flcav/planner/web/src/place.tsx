@@ -1,10 +1,12 @@
 /** The tab Place: a map with sensors, and beside it what they cover, what could be covered, and what that costs. */
-import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
-import { siteOf, type Api } from "./api";
+import { useEffect, useLayoutEffect, useMemo, useState } from "preact/hooks";
+import type { Api } from "./api";
 import { Curve } from "./curve";
 import { saveMap, saveText } from "./saving";
+import { useLooks } from "./looks";
 import { placeOf, TownView, wordOf } from "./map";
-import type { Best, Look, NewPole, Placing, Stand, Workspace } from "./types";
+import { Bar, Command, Legend } from "./parts";
+import type { Best, NewPole, Placing, Stand, Workspace } from "./types";
 
 type Props = {
   api: Api;
@@ -18,52 +20,6 @@ type Props = {
 
 const plural = (count: number, noun: string) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 const number = (value: number) => String(Math.round(value * 100) / 100);
-export const keyOf = (stand: Stand, range: number, sight: boolean) =>
-  `${stand.pole ?? `${stand.x},${stand.y}`}|${range}|${sight}`;
-
-/** What each sensor sees: answers are kept, and while one is awaited the last one of the sensor is shown. */
-function useLooks(api: Api, space: Workspace, placing: Placing, stands: Stand[], fail: (error: unknown) => void) {
-  const kept = useRef({ space: space.key, looks: new Map<string, Look>() });
-  const last = useRef(new Map<number, Look>());
-  const asking = useRef(new Set<string>());
-  const [, again] = useState(0);
-  if (kept.current.space !== space.key) {
-    kept.current = { space: space.key, looks: new Map() };
-    last.current = new Map();
-  }
-  const wanted = stands.map((stand) => ({ stand, key: keyOf(stand, placing.kinds[stand.kind].range_m, placing.sight) }));
-  useEffect(() => {
-    for (const { stand, key } of wanted) {
-      const { looks, space: of } = kept.current;
-      // One question at a time for each sensor: while it is dragged, places that it has left are not asked for.
-      const mark = `${stand.id}`;
-      if (looks.has(key) || asking.current.has(mark)) continue;
-      asking.current.add(mark);
-      performance.mark("look-asked");
-      api
-        .look(space.key, stand, placing.kinds[stand.kind].range_m, placing.sight)
-        .then((look) => {
-          if (kept.current.space === of) kept.current.looks.set(key, look);
-          requestAnimationFrame(() => performance.measure("look", "look-asked"));
-        })
-        .catch(fail)
-        .finally(() => {
-          asking.current.delete(mark);
-          again((count) => count + 1);
-        });
-    }
-  });
-  const found = new Map<number, Look>();
-  let settled = true;
-  for (const { stand, key } of wanted) {
-    const look = kept.current.looks.get(key);
-    if (look) last.current.set(stand.id, look);
-    else settled = false;
-    const shown = look ?? last.current.get(stand.id);
-    if (shown) found.set(stand.id, shown);
-  }
-  return { looks: found, settled };
-}
 
 export function Place({ api, space, placing, setPlacing, undo, say, fail }: Props) {
   const [drag, setDrag] = useState<Stand | null>(null);
@@ -449,47 +405,3 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
     </div>
   );
 }
-
-function Command({ api, space, placing, say, fail }: Pick<Props, "api" | "space" | "placing" | "say" | "fail">) {
-  const [text, setText] = useState("");
-  useEffect(() => setText(""), [JSON.stringify(placing), space.key]);
-  if (!space.errors.length) return null;
-  return text ? (
-    <>
-      <pre tabindex={0} aria-label="The command that finds the optimum">{text}</pre>
-      <button type="button" class="quiet" onClick={() => navigator.clipboard.writeText(text).then(() => say("The command is copied"), fail)}>Copy it</button>
-    </>
-  ) : (
-    <button type="button" class="quiet" onClick={() => api.files(space.key, placing).then((files) => setText(files.command)).catch(fail)}>
-      The command that does the same
-    </button>
-  );
-}
-
-function Bar({ total, covered, best, beyond }: { total: number; covered: number; best: number | null; beyond: number | null }) {
-  const share = (value: number) => `${(100 * value) / Math.max(total, 1)}%`;
-  return (
-    <div class="bar" aria-hidden="true">
-      <span class="yours" style={{ width: share(covered) }} />
-      <span class="more" style={{ width: share(Math.max((best ?? covered) - covered, 0)) }} />
-      {beyond !== null && <span class="beyond" style={{ width: share(beyond) }} />}
-    </div>
-  );
-}
-
-function Legend({ space, covered }: { space: Workspace; covered: boolean }) {
-  const kinds = [...new Set(space.errors.map((each) => each.kind))];
-  const mark = (kind: string) => (kind === "false_positive" ? "M-4 -4l8 8m0 -8l-8 8" : kind === "final_error" ? "M0 -5l5 8h-10Z" : "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0");
-  return (
-    <ul class="legend" aria-label="Legend">
-      {kinds.map((kind) => (
-        <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><path class={`e ${kind}`} d={mark(kind)} stroke-width={kind === "false_positive" ? 2 : 1} /></svg>{wordOf(kind)}</li>
-      ))}
-      {kinds.length > 0 && covered && <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><path class={`e ${kinds[0]} seen`} d={mark(kinds[0])} stroke-width={kinds[0] === "false_positive" ? 2 : 1} /></svg>covered</li>}
-      <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><g class="pole"><circle r="5" /></g></svg>candidate pole</li>
-      {covered && <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><g class="stand k0"><circle r="5.5" /></g></svg>sensor, and what it sees</li>}
-    </ul>
-  );
-}
-
-export { siteOf };
