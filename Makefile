@@ -7,7 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE # each of many processes would compile all modu
 STAMP := .venv/.installed
 BIN := .venv/bin
 
-.PHONY: help demo test test-runs test-carla test-deployed test-peers test-ray lint docs check bench bench-peers format clean
+.PHONY: help demo test test-runs test-carla test-deployed test-planner test-peers test-ray lint docs check bench bench-peers format clean
 help: # Print the targets with what they do
 	@sed -n 's/^\([a-z-]*\):[^#]*# /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
 
@@ -35,6 +35,10 @@ test-carla: $(STAMP) # Run CARLA's scripts against `flcav carla serve`
 # and are skipped where that is not permitted.
 test-deployed: $(STAMP) # Test a fleet that is up
 	$(BIN)/python -m pytest -n 0 -rs tests/deployed
+
+# The planner in Debian's Chromium; `npm ci` in src/flcav/planner/web gives it axe and esbuild. What is missing is skipped.
+test-planner: $(STAMP) # Test the planner in a browser
+	$(BIN)/python -m pytest -n 0 -rs tests/planner
 
 # What runs on Ray beside what runs without it, in an environment of its own with the extra 'ray', below out/ray.
 test-ray: # Test what runs on Ray

@@ -153,6 +153,9 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         ),
         **dict.fromkeys(("--class-weight", "--driving", "--method", "--town", "--map", "--verify"), ALWAYS),
     },
+    "planner": dict.fromkeys(
+        ("--errors", "--poles", "--every", "--sensors", "--range", "--data", "--port", "--html"), ALWAYS
+    ),
     "fit": {
         **dict.fromkeys(("--model", "--at", "--problem", "--level", "--repeats", "--seed", "--held-out"), ALWAYS),
         **dict.fromkeys(

@@ -15,8 +15,8 @@ import pytest
 from matplotlib.figure import Figure
 
 from flcav.cli.main import run
-from flcav.cli.planning import place_inputs
 from flcav.optimization.placement import solve
+from flcav.planner import inputs as place_inputs
 from flcav.report.charts import figures
 from flcav.world.geodesy import convert_to_geodetic
 from flcav.world.map.town import Town, load_town

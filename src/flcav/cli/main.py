@@ -29,6 +29,7 @@ from flcav.cli.planning.allocate import allocate, replan
 from flcav.cli.planning.fit import fit
 from flcav.cli.planning.history import history
 from flcav.cli.planning.place import place
+from flcav.cli.planning.planner import planner
 from flcav.cli.releases.release import release
 from flcav.cli.reproduce import reproduce
 from flcav.cli.terminal import Interrupted, echo, one_line
@@ -67,7 +68,7 @@ for command in (
     *(run_command.run, run_command.demo, run_command.compare, federate),
     *(record, validate, birdseye, camera, view, export, import_),
     *(train, evaluate, infer, errors),
-    *(allocate, replan, place, fit, history),
+    *(allocate, replan, place, planner, fit, history),
     *(radio, rounds, drive, reproduce),
 ):
     app.command(command.__name__.rstrip("_"))(command)

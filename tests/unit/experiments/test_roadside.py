@@ -4,10 +4,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from flcav.cli.planning.place_inputs import read_given
 from flcav.config import parse_config
 from flcav.fusion.average import Navigation, Sighting
 from flcav.geometry import Boxes, inverse, pose, yaw_of
+from flcav.planner.inputs import read_given
 from flcav.reproductions.fig3b.run import ZONE_M, TownCover, _count_zones, cover_town, list_kinds
 from flcav.reproductions.fig4.run import EDGES_M, find_range
 from flcav.reproductions.road_average.run import Errors, apply_errors, measure_residual

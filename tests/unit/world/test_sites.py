@@ -10,8 +10,8 @@ import shapely
 import yaml
 from scipy.spatial.distance import pdist
 
-from flcav.cli.planning.place_inputs import find_sites
 from flcav.config import InputError
+from flcav.planner.inputs import find_sites
 from flcav.world.geodesy import convert_to_geodetic, find_on_ground
 from flcav.world.map.roads import read_net
 from flcav.world.map.town import Town, load_town

@@ -7,10 +7,10 @@ import typer
 
 from flcav.cli.domains.sampling import ODD
 from flcav.cli.options import Device, check_finite
-from flcav.cli.tables import numbers, read_input_table
 from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 from flcav.machine.threads import use_threads
+from flcav.storage.tables import numbers, read_input_table
 
 if TYPE_CHECKING:
     from flcav.odd.cells import CellErrors

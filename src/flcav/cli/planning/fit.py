@@ -83,13 +83,13 @@ def fit(
     ),
 ) -> Answer:  # fmt: skip
     """Fit how the error falls with samples and rounds, one curve per task, with bootstrap bands."""
-    from flcav.cli.tables import read_input_table
     from flcav.config import InputError
     from flcav.optimization.allocation.problem_file import collect_fitted_fields
     from flcav.optimization.curves import fitting
     from flcav.optimization.curves.bands import bootstrap_bands, fit_lower_curve, fit_upper_curve
     from flcav.optimization.curves.held_out import hold_out_runs
     from flcav.optimization.curves.history import parse_histories
+    from flcav.storage.tables import read_input_table
 
     if model is CurveForm.additive:
         refuse_unused("--model additive", "group_samples", "alpha", "beta", "k")

@@ -15,10 +15,10 @@ from flcav.interface.wording import plural
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
-    from flcav.cli.planning.place_inputs import Given
     from flcav.config import Json
     from flcav.optimization.placement.solve import Candidates, Placement
     from flcav.optimization.verification.record import Verification
+    from flcav.planner.inputs import Given
     from flcav.world.map.town import Town
     from flcav.world.trace import Trace
 
@@ -79,12 +79,12 @@ def place(
     """
     import numpy as np
 
-    from flcav.cli.planning import place_inputs
     from flcav.config import InputError
     from flcav.optimization.placement import solve
     from flcav.optimization.placement.baselines import place_at_random
     from flcav.optimization.placement.cheapest import cover_share
     from flcav.optimization.placement.place import find_seen
+    from flcav.planner import inputs as place_inputs
     from flcav.storage.files import check_writable
     from flcav.world.sites import locate_sites
 

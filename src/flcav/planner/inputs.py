@@ -1,4 +1,4 @@
-"""Inputs of `flcav place`: tables of errors, poles and sensors, and their town with its traffic."""
+"""Inputs of a placement: tables of errors, poles and sensors, and their town with its traffic."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -10,8 +10,6 @@ import pyarrow as pa
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
-from flcav.cli.planning.places import AXES, NAMES, read_places
-from flcav.cli.tables import numbers, read_input_table
 from flcav.config import InputError, shorten
 from flcav.dataset.store import Dataset
 from flcav.interface.wording import plural
@@ -20,7 +18,9 @@ from flcav.optimization.placement.place import check_inside
 from flcav.optimization.placement.solve import Candidates, Placement, find_candidates
 from flcav.optimization.verification.record import exact
 from flcav.perception.errors import CLASS, FALSE_POSITIVE, FINAL_ERROR, MISS
+from flcav.storage.tables import numbers, read_input_table
 from flcav.world.map.town import Town, load_town
+from flcav.world.places import AXES, NAMES, read_places
 from flcav.world.sites import MOUNT_M, draw_sites, measure_streets
 from flcav.world.trace import Trace
 
@@ -50,6 +50,7 @@ class Given:
     sensor_cost: Array  # (S,)
     priced: bool  # whether anything has a cost
     notes: tuple[str, ...] = ()  # sentences on assumptions and unused columns
+    table: pa.Table | None = None  # of the errors, as it was read
 
     def count(self, covered: int | None = None) -> str:
         """Return the number of errors in words: "11 errors", "8 of 11 errors", or "your 300 points" for points."""
@@ -60,6 +61,10 @@ class Given:
     def noun(self) -> str:
         """Return the noun for a row of the table of errors."""
         return "error" if {*self.kind.tolist()} <= REGISTERED else "point"
+
+    def column(self, name: str) -> list[str | float | None]:
+        """Return the values (E,) in a column of the table of errors; empty where it has none of that name."""
+        return [] if self.table is None or name not in self.table.column_names else self.table[name].to_pylist()
 
     def cost_of(self, placed: Placement) -> float | None:
         """Return the cost of a placement; None where nothing has a cost."""
@@ -115,7 +120,7 @@ def read_given(
     """
     placed = read_places(errors, "point", ERRORS, town)
     mistakes = placed.table
-    sites = find_sites(town, every_m) if poles is None else _read_sites(poles, town)
+    sites = read_sites(poles, town, every_m)
     notes = [placed.note, sites.note]
     if town is not None:
         check_inside(town, placed.xyz, sites.xyz, (errors, poles or "poles"), (placed.degrees, sites.degrees))
@@ -124,10 +129,7 @@ def read_given(
         notes.append(f"{errors}: {out.sum()} of {len(placed.xyz)} lie outside {town.name}" if out.any() else "")
     names, ranges, sensor_cost = (None,), np.array([range_m], np.float64), np.zeros(1)
     if sensors is not None:
-        kinds = _read(sensors, SENSORS, SENSORS)
-        names = tuple(map(str, _identify(kinds["name"].to_pylist(), sensors, "sensors", "name")))
-        sensor_cost = _costs(kinds, sensors)
-        ranges = numbers(kinds, ("range_m",), sensors)[:, 0]
+        names, ranges, sensor_cost = read_kinds(sensors)
     kind = mistakes["kind"].to_pylist() if "kind" in mistakes.column_names else ["point"] * mistakes.num_rows
     return Given(
         errors=placed.xyz,
@@ -141,7 +143,20 @@ def read_given(
         sensor_cost=sensor_cost,
         priced=sensors is not None or sites.cost is not None,
         notes=tuple(note for note in notes if note),
+        table=mistakes,
     )
+
+
+def read_kinds(sensors: Path) -> tuple[tuple[str, ...], Array, Array]:
+    """Return the names, ranges (S,) [m] and costs (S,) in a table of sensors; raises `InputError` for other tables."""
+    kinds = _read(sensors, SENSORS, SENSORS)
+    names = tuple(map(str, _identify(kinds["name"].to_pylist(), sensors, "sensors", "name")))
+    return names, numbers(kinds, ("range_m",), sensors)[:, 0], _costs(kinds, sensors)
+
+
+def read_sites(poles: Path | None, town: Town | None, every_m: float | None = None) -> Sites:
+    """Return the candidate sites in a table, or without one those of `find_sites`."""
+    return find_sites(town, every_m) if poles is None else _read_sites(poles, town)
 
 
 def find_sites(town: Town | None, every_m: float | None = None) -> Sites:

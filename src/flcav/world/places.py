@@ -10,9 +10,9 @@ import numpy as np
 import pyarrow as pa
 
 from flcav.arrays import Array
-from flcav.cli.tables import numbers, read_input_table
 from flcav.config import InputError, shorten
 from flcav.interface.wording import plural
+from flcav.storage.tables import numbers, read_input_table
 from flcav.world.geodesy import find_on_ground
 from flcav.world.map.town import Town
 

@@ -1,0 +1,352 @@
+"""The server of the planner: one page on the loopback interface, and the answers that it asks for.
+
+Whoever knows the token of the address is answered: it is sent as a bearer token, which no other site's page can make a
+browser send, so that there is nothing to forge. No request names a path: towns are those of flcav or were opened
+here, files of the page are three by name, and what is uploaded is read from a temporary folder that is removed.
+"""
+
+import contextlib
+import secrets
+import socket
+import tempfile
+import threading
+from collections.abc import AsyncIterator, Callable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import uvicorn
+from fastapi import Depends, FastAPI, Request
+from fastapi.exceptions import RequestValidationError
+from fastapi.responses import JSONResponse, Response
+from pydantic import BaseModel, ConfigDict, Field
+from starlette.middleware import Middleware
+from starlette.middleware.trustedhost import TrustedHostMiddleware
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from flcav.config import InputError, Json
+from flcav.optimization.problem import Problem
+from flcav.planner.desk import Desk
+from flcav.planner.exporting import export_placement
+from flcav.planner.placing import (
+    Kinds,
+    Question,
+    describe_map,
+    describe_workspace,
+    find_best,
+    find_new_poles,
+    look,
+    mount,
+    trace_curve,
+)
+from flcav.planner.planning import plan_budgets, plan_more, with_budgets
+
+ASSETS = Path(__file__).with_name("assets")
+SHOWN = {"": ("index.html", "text/html"), "planner.js": ("planner.js", "text/javascript")}
+SHOWN |= {"planner.css": ("planner.css", "text/css")}
+MOST_BYTES = 16_000_000  # of a request
+POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
+    "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS = {
+    "content-security-policy": POLICY,
+    "x-content-type-options": "nosniff",
+    "referrer-policy": "no-referrer",
+    "cache-control": "no-store",
+}
+
+Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
+Range = Annotated[float, Field(ge=1, le=2000, allow_inf_nan=False)]
+Price = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
+
+
+class Body(BaseModel):
+    """A request's body: no field is passed over."""
+
+    model_config = ConfigDict(extra="forbid")
+
+
+class Kind(Body):
+    """A kind of sensor."""
+
+    name: str = Field(max_length=60)
+    range_m: Range
+    cost: Price = 0.0
+
+
+class Asked(Body):
+    """A question about a workspace."""
+
+    workspace: str = Field(max_length=64)
+    kinds: list[Kind] = Field(min_length=1, max_length=12)
+    own: list[tuple[Metres, Metres]] = Field(default=[], max_length=100)
+    line_of_sight: bool = True
+    without: list[str] = Field(default=[], max_length=100)
+
+    def question(self) -> Question:
+        """Return it as `placing` takes it."""
+        kinds = Kinds(
+            tuple(each.name for each in self.kinds),
+            tuple(each.range_m for each in self.kinds),
+            tuple(each.cost for each in self.kinds),
+        )
+        return Question(kinds, tuple(self.own), self.line_of_sight, frozenset(self.without))
+
+
+class AskedBest(Asked):
+    """The best placement of a number of sensors, or within a budget."""
+
+    count: int | None = Field(default=None, ge=1, le=10_000)
+    budget: Price | None = None
+
+
+class AskedNew(Asked):
+    """Where a new pole pays most."""
+
+    kind: int = Field(ge=0)
+    uncovered: list[Annotated[int, Field(ge=0)]] = Field(max_length=1_000_000)
+
+
+class AskedLook(Body):
+    """What a sensor on a pole, or at a place of one's own, sees."""
+
+    workspace: str = Field(max_length=64)
+    pole: int | None = Field(default=None, ge=0)
+    x: Metres = 0.0
+    y: Metres = 0.0
+    range_m: Range
+    line_of_sight: bool = True
+
+
+class AskedExport(Asked):
+    """The files of a placement: pairs of a site, with own ones after the poles, and a kind."""
+
+    pairs: list[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]] = Field(max_length=1000)
+
+
+class AskedTown(Body):
+    """A town of flcav to open."""
+
+    town: str = Field(max_length=64)
+
+
+class AskedPlan(Body):
+    """A plan for budgets of one's own [MB, s]."""
+
+    wireless_mb: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+    wireline_mb: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
+    horizon_s: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = None
+
+
+class LimitBody:
+    """ASGI middleware that refuses bodies of more than `MOST_BYTES`, before they are read as far as they are told."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self.app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass a request on, cut off where it is too long."""
+        if scope["type"] != "http":
+            return await self.app(scope, receive, send)
+        length = dict(scope["headers"]).get(b"content-length", b"0")
+        if not length.isdigit() or int(length) > MOST_BYTES:
+            return await _refuse(413, f"more than {MOST_BYTES // 1_000_000} MB")(scope, receive, send)
+        taken = 0
+
+        async def counted() -> Message:
+            nonlocal taken
+            message = await receive()
+            taken += len(message.get("body", b""))
+            if taken > MOST_BYTES:
+                raise TooLong
+            return message
+
+        with contextlib.suppress(TooLong):
+            return await self.app(scope, counted, send)
+        return await _refuse(413, f"more than {MOST_BYTES // 1_000_000} MB")(scope, receive, send)
+
+
+class TooLong(Exception):
+    """Raised where a body goes on beyond its limit."""
+
+
+def _refuse(status: int, sentence: str) -> JSONResponse:
+    return JSONResponse({"error": sentence}, status, headers=HEADERS)
+
+
+def make_app(desk: Desk, token: str) -> FastAPI:
+    """Return the app of the planner over what is on the `desk`, for holders of the `token`."""
+    busy = threading.Lock()  # Embree's scenes and the solver are used by one request at a time
+
+    def admit(request: Request) -> None:
+        given = request.headers.get("authorization", "")
+        if not secrets.compare_digest(given.encode(), f"Bearer {token}".encode()):
+            raise Refused(401, "the address lacks the planner's token: open the one that the command printed")
+        origin = request.headers.get("origin")
+        if origin is not None and origin != f"{request.url.scheme}://{request.headers.get('host')}":
+            raise Refused(403, "a page of another site asked")
+
+    app = FastAPI(
+        title="flcav planner", docs_url=None, redoc_url=None, openapi_url=None,
+        middleware=[Middleware(TrustedHostMiddleware, allowed_hosts=["127.0.0.1", "localhost"]), Middleware(LimitBody)],
+    )  # fmt: skip
+    guarded: dict[str, Any] = {"dependencies": [Depends(admit)]}
+
+    @app.exception_handler(Refused)
+    async def refused(_: Request, error: Refused) -> JSONResponse:
+        return _refuse(error.status, error.sentence)
+
+    @app.exception_handler(InputError)
+    async def bad(_: Request, error: InputError) -> JSONResponse:
+        return _refuse(422, " ".join(str(error).split()))
+
+    @app.exception_handler(RequestValidationError)
+    async def malformed(_: Request, error: RequestValidationError) -> JSONResponse:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"] if part != "body")
+        return _refuse(422, f"{where}: {first['msg']}" if where else str(first["msg"]))
+
+    @app.post("/api/start", **guarded)
+    def start() -> dict[str, Json]:
+        return desk.describe()
+
+    @app.post("/api/open", **guarded)
+    def open_town(asked: AskedTown) -> dict[str, Json]:
+        with busy:
+            return _describe(desk, desk.open_town(asked.town))
+
+    @app.post("/api/workspace", **guarded)
+    def workspace(asked: AskedTown) -> dict[str, Json]:
+        with busy:
+            return _describe(desk, asked.town)
+
+    @app.post("/api/drop", **guarded)
+    async def drop(request: Request, name: str, workspace: str = "") -> dict[str, Json]:
+        content = await request.body()
+        return await _in_thread(lambda: _describe(desk, _take(desk, workspace, name, content)), busy)
+
+    @app.post("/api/look", **guarded)
+    def look_from(asked: AskedLook) -> dict[str, Json]:
+        space = desk.find(asked.workspace)
+        with busy:
+            at = mount(space, [(asked.x, asked.y)])[0]
+            if asked.pole is not None:
+                if asked.pole >= len(space.sites.ids):
+                    raise InputError(f"there is no pole {asked.pole + 1} of {len(space.sites.ids)}")
+                at = space.sites.xyz[asked.pole]
+            area, covered = look(space, tuple(at.tolist()), asked.range_m, asked.line_of_sight)
+        return {"area": area, "covered": covered, "z": float(at[2])}
+
+    @app.post("/api/best", **guarded)
+    def best(asked: AskedBest) -> dict[str, Json]:
+        if (asked.count is None) == (asked.budget is None):
+            raise InputError("count, budget: one of the two is wanted")
+        with busy:
+            found = find_best(desk.find(asked.workspace), asked.question(), count=asked.count, budget=asked.budget)
+        return found.as_json()
+
+    @app.post("/api/curve", **guarded)
+    def curve(asked: Asked) -> dict[str, Json]:
+        with busy:
+            return {"steps": [step.as_json() for step in trace_curve(desk.find(asked.workspace), asked.question())]}
+
+    @app.post("/api/new-poles", **guarded)
+    def new_poles(asked: AskedNew) -> dict[str, Json]:
+        space = desk.find(asked.workspace)
+        if asked.kind >= len(asked.kinds) or any(row >= len(space.errors) for row in asked.uncovered):
+            raise InputError("kind, uncovered: there are not as many")
+        with busy:
+            found = find_new_poles(space, asked.question(), asked.kind, asked.uncovered)
+        return {"places": [asdict(place) for place in found]}
+
+    @app.post("/api/export", **guarded)
+    def export(asked: AskedExport) -> dict[str, Json]:
+        with busy:
+            return export_placement(desk.find(asked.workspace), asked.question(), asked.pairs)
+
+    @app.post("/api/plan", **guarded)
+    def plan(asked: AskedPlan) -> dict[str, Json]:
+        return plan_budgets(_budgeted(desk, asked))
+
+    @app.post("/api/plan-more", **guarded)
+    def more(asked: AskedPlan) -> dict[str, Json]:
+        return plan_more(_budgeted(desk, asked))
+
+    @app.get("/")
+    @app.get("/{name}")
+    def file(name: str = "") -> Response:
+        if name not in SHOWN:
+            return _refuse(404, "there is no such page")
+        path, kind = SHOWN[name]
+        return Response((ASSETS / path).read_bytes(), media_type=kind, headers=HEADERS)
+
+    return app
+
+
+class Refused(Exception):
+    """A request that is refused, with its status."""
+
+    def __init__(self, status: int, sentence: str) -> None:
+        super().__init__(sentence)
+        self.status, self.sentence = status, sentence
+
+
+async def _in_thread(work: Callable[[], dict[str, Json]], busy: threading.Lock) -> dict[str, Json]:
+    import asyncio
+
+    def locked() -> dict[str, Json]:
+        with busy:
+            return work()
+
+    return await asyncio.to_thread(locked)
+
+
+def _budgeted(desk: Desk, asked: AskedPlan) -> Problem:
+    if desk.problem is None:
+        raise InputError("there is no problem to plan: flcav planner PROBLEM.yaml")
+    return with_budgets(desk.problem, asked.wireless_mb, asked.wireline_mb, asked.horizon_s)
+
+
+def _describe(desk: Desk, key: str) -> dict[str, Json]:
+    space = desk.find(key)
+    return {"key": key, "map": describe_map(space.town), **describe_workspace(space)}
+
+
+def _take(desk: Desk, workspace: str, name: str, content: bytes) -> str:
+    """Put an uploaded file on the desk by the ending of its `name`; return the key of its workspace."""
+    ending = Path(name).suffix.lower()
+    if ending not in (".xodr", ".csv", ".parquet"):
+        raise InputError("a map (.xodr) or a table of errors (.csv, .parquet) is wanted")
+    stem = "".join(sign if sign.isalnum() or sign in "-_" else "_" for sign in Path(name).stem)[:60] or "file"
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{stem}{ending}"
+        path.write_bytes(content)
+        try:
+            return desk.open_map(path) if ending == ".xodr" else desk.add_errors(workspace, path)
+        except InputError as error:
+            raise InputError(str(error).replace(f"{folder}/", "")) from None
+
+
+def serve(desk: Desk, port: int | None, report: Callable[[str], None]) -> None:
+    """Serve the planner on the loopback until interrupted; `report` is given its address.
+
+    Raises `InputError` where the port is taken.
+    """
+    token = secrets.token_urlsafe(24)
+    with socket.socket() as door:
+        door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            door.bind(("127.0.0.1", port or 0))
+        except OSError as error:
+            raise InputError(f"port {port}: {error.strerror or error}") from None
+
+        @contextlib.asynccontextmanager
+        async def told(_: FastAPI) -> AsyncIterator[None]:
+            report(f"http://127.0.0.1:{door.getsockname()[1]}/#token={token}")
+            yield
+
+        app = make_app(desk, token)
+        app.router.lifespan_context = told
+        config = uvicorn.Config(app, log_level="critical", log_config=None, timeout_graceful_shutdown=1)
+        uvicorn.Server(config).run(sockets=[door])

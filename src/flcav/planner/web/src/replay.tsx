@@ -1,0 +1,152 @@
+/** The tab Replay: a finished run, played moment by moment: scores, messages of every server, the ledger that fills. */
+import { useEffect, useLayoutEffect, useState } from "preact/hooks";
+import type { Moment, RunInfo } from "./types";
+
+const LINKS = ["wireless", "wireline"] as const;
+const STEP_MS = 700;
+const mean = (moment: Moment) => {
+  const scores = Object.values(moment.scores);
+  return scores.reduce((sum, each) => sum + each, 0) / Math.max(scores.length, 1);
+};
+const signed = (value: number) => (value < 0 ? "−" : "+") + Math.abs(value).toFixed(3);
+
+/** The round whose mean score over regions rose most. */
+export function findBestRound(moments: Moment[]): { at: number; gain: number } | null {
+  let best: { at: number; gain: number } | null = null;
+  moments.forEach((moment, n) => {
+    if (!n || !Object.keys(moments[n - 1].scores).length) return;
+    const gain = mean(moment) - mean(moments[n - 1]);
+    if (!best || gain > best.gain) best = { at: n, gain };
+  });
+  return best;
+}
+
+export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void }) {
+  const { moments } = run;
+  const [at, setAt] = useState(0);
+  const [playing, setPlaying] = useState(false);
+  const moment = moments[at];
+  const best = findBestRound(moments);
+  const go = (to: number) => setAt(Math.min(Math.max(to, 0), moments.length - 1));
+  const play = () => {
+    if (!playing && at === moments.length - 1) setAt(0);
+    setPlaying(!playing);
+  };
+  useEffect(() => {
+    if (!playing) return;
+    const next = setTimeout(() => (at < moments.length - 1 ? setAt(at + 1) : setPlaying(false)), STEP_MS);
+    return () => clearTimeout(next);
+  }, [playing, at]);
+  useLayoutEffect(() => {
+    const keyed = (event: KeyboardEvent) => {
+      if ((event.target as Element).matches("input, button")) {
+        if (event.key !== " " || (event.target as Element).matches("button")) return;
+      }
+      if (event.key === " ") play();
+      else if (event.key === "ArrowRight") go(at + 1);
+      else if (event.key === "ArrowLeft") go(at - 1);
+      else return;
+      event.preventDefault();
+    };
+    window.addEventListener("keydown", keyed);
+    return () => window.removeEventListener("keydown", keyed);
+  });
+  useEffect(() => say(`${moment.told}: ${Object.entries(moment.scores).map(([name, score]) => `${name} ${score.toFixed(3)}`).join(", ")}`), [at]);
+  return (
+    <div class="replay">
+      <main class="sheet">
+        <h1>{run.name}</h1>
+        <div class="player">
+          <button type="button" class="primary" onClick={play}>{playing ? "❚❚ Pause" : "▶ Play"} <kbd>Space</kbd></button>
+          <input type="range" min={0} max={moments.length - 1} value={at} aria-label="Moment of the run" aria-valuetext={moment.told} onInput={(event) => go(Number(event.currentTarget.value))} />
+          <output id="moment">{moment.told}</output>
+        </div>
+        <Scores run={run} at={at} best={best?.at ?? -1} onPick={go} />
+        {best && (
+          <p id="gained">
+            <b>{moments[best.at].told}</b> gained most: <b>{signed(best.gain)}</b> in the mean of {Object.keys(moments[best.at].scores).length} regions, on {run.frames} validation frames each.{" "}
+            <button type="button" class="quiet" onClick={() => go(best.at)}>Go there</button>
+          </p>
+        )}
+        <div class="servers">
+          {moment.servers.map((each) => (
+            <article class="task" key={`${each.server} ${each.task}`}>
+              <h2>{each.server} <small>{each.task}</small></h2>
+              <div class="pulses" aria-hidden="true" key={at}>
+                {Array.from({ length: Math.min(each.clients, 24) }, (_, n) => <i style={{ animationDelay: `${n * 40}ms` }} />)}
+              </div>
+              <p class="note">
+                {each.clients} {each.server === "cloud" ? "servers" : "vehicles"}{each.failed ? `, ${each.failed} failed` : ""} · {each.up_mb.toFixed(2)} MB up{each.loss === null ? "" : ` · loss ${each.loss.toFixed(3)}`}
+              </p>
+            </article>
+          ))}
+          {!moment.servers.length && <p class="note">The cloud trains on what vehicles uploaded; nothing goes back and forth.</p>}
+        </div>
+      </main>
+      <aside class="panel" aria-label="Ledger" tabindex={0}>
+        <section>
+          <h2>Ledger</h2>
+          {LINKS.map((link) => {
+            const part = run.budgets[link] ? moment.sent[link] / run.budgets[link] : 0;
+            return (
+              <div class="slider" key={link}>
+                <p><b>{link}</b> {moment.sent[link].toFixed(1)} of {run.budgets[link]} MB</p>
+                <div class="bar"><span class="yours" style={{ width: `${Math.min(100 * part, 100)}%` }} /></div>
+              </div>
+            );
+          })}
+          <p class="note">What a stage sent beside its rounds, its samples and labels, counts before the first of them.</p>
+        </section>
+        <section>
+          <h2>Road sensors</h2>
+          <ul class="facts">{run.placed.map((each) => <li>{each.region}: pole {each.poles.join(", ")} covers {each.covered} of {each.errors} errors</li>)}</ul>
+        </section>
+        <section>
+          <h2>Findings</h2>
+          {run.findings.slice(0, 4).map((each) => <p class="note"><b>{each.verdict}</b> {each.sentence}</p>)}
+        </section>
+      </aside>
+    </div>
+  );
+}
+
+function Scores({ run, at, best, onPick }: { run: RunInfo; at: number; best: number; onPick: (at: number) => void }) {
+  const { moments } = run;
+  const names = Object.keys(moments[moments.length - 1].scores);
+  const values = moments.flatMap((each) => Object.values(each.scores));
+  const narrow = matchMedia("(max-width: 820px)").matches;
+  const [width, height, left, right, top, bottom] = narrow ? [400, 300, 38, 16, 18, 30] : [860, 300, 44, 130, 18, 30];
+  const low = Math.floor(Math.min(...values) * 20) / 20;
+  const high = Math.ceil(Math.max(...values) * 20) / 20 || 1;
+  const x = (n: number) => left + ((width - left - right) * n) / Math.max(moments.length - 1, 1);
+  const y = (score: number) => height - bottom - ((height - top - bottom) * (score - low)) / Math.max(high - low, 1e-9);
+  const ends = names.map((name) => ({ name, y: y(moments[moments.length - 1].scores[name]) })).sort((a, b) => a.y - b.y);
+  ends.forEach((end, n) => n && (end.y = Math.max(end.y, ends[n - 1].y + 16)));
+  return (
+    <svg class="curve scores" viewBox={`0 0 ${width} ${height}`} role="img" aria-label={`Validation scores by round: ${names.map((name) => `${name} from ${moments[0].scores[name]?.toFixed(3) ?? "?"} to ${moments[moments.length - 1].scores[name].toFixed(3)}`).join("; ")}`}>
+      {Array.from({ length: Math.round((high - low) / 0.05) + 1 }, (_, n) => low + n * 0.05).map((score) => (
+        <g class="grid"><line x1={left} x2={width - right} y1={y(score)} y2={y(score)} /><text x={left - 8} y={y(score)} dy=".35em" text-anchor="end">{score.toFixed(2)}</text></g>
+      ))}
+      <text class="tick" x={narrow ? 0 : width - right + 12} y={12}>validation score</text>
+      <rect class="past" x={x(0)} width={Math.max(x(at) - x(0), 0)} y={top} height={height - top - bottom} />
+      {best >= 0 && <text class="tick" x={Math.max(x(best), narrow ? 130 : 0)} y={12} text-anchor="middle">gained most</text>}
+      {names.map((name, k) => (
+        <g class={`line k${k % 6}`}>
+          <path d={moments.flatMap((each, n) => (each.scores[name] === undefined ? [] : [`${x(n)} ${y(each.scores[name])}`])).map((point, n) => (n ? "L" : "M") + point).join("")} />
+          {moments.map((each, n) => each.scores[name] !== undefined && <circle cx={x(n)} cy={y(each.scores[name])} r={n === at ? 6 : 3.2} />)}
+          {narrow ? (
+            <text x={width - right - 6} y={height - bottom - 12 - 18 * k} text-anchor="end">{name}</text>
+          ) : (
+            <text x={width - right + 12} y={ends.find((each) => each.name === name)!.y} dy=".35em">{name}</text>
+          )}
+        </g>
+      ))}
+      {moments.map((each, n) => (
+        <g onClick={() => onPick(n)} class="moment">
+          <rect x={x(n) - 14} width="28" y={top} height={height - top} />
+          {(!narrow || n % 3 === 0 || n === at) && <text class={`tick${n === at ? " now" : ""}`} x={x(n)} y={height - 9} text-anchor="middle">{each.stage === "pretrain" ? "I" : `${each.stage === "edge" ? "II" : "III"}·${each.round}`}</text>}
+        </g>
+      ))}
+    </svg>
+  );
+}

@@ -1,0 +1,112 @@
+export type Point = [number, number];
+export type Kind = { name: string; range_m: number; cost: number };
+export type Pole = { id: string; at: [number, number, number]; cost: number; street: string | null };
+export type Wrong = {
+  at: [number, number, number];
+  weight: number;
+  kind: string;
+  class?: string;
+  returns?: number;
+  occlusion?: number;
+  scene?: string;
+  track?: string;
+};
+export type TownMap = {
+  name: string;
+  said: string;
+  bounds: [number, number, number, number];
+  roads: Point[][];
+  sidewalks: Point[][];
+  houses: Point[][];
+  trees: [number, number, number][];
+  streets: { name: string; line: Point[] }[];
+};
+export type Workspace = {
+  key: string;
+  map: TownMap;
+  poles: Pole[];
+  errors: Wrong[];
+  noun: string;
+  table: string;
+  notes: string[];
+  traffic: number;
+};
+export type Look = { area: string; covered: number[]; z: number };
+export type Best = {
+  pairs: [number, number][];
+  covered: number;
+  weight: number;
+  bound: number;
+  optimal: boolean;
+  cost: number;
+  beyond: number;
+  errors: number;
+};
+export type NewPole = {
+  site: { x: number; y: number; street: string | null };
+  gain: number;
+  errors: number;
+};
+export type Card = { name: string; said: string; told: string; bounds: [number, number, number, number]; roads: Point[][] };
+export type ProblemInfo = {
+  name: string;
+  wireless_mb: number;
+  wireline_mb: number;
+  horizon_s: number | null;
+  measure: string;
+  more_is_better: boolean;
+  tasks: string[];
+};
+export type TaskPlan = {
+  name: string;
+  samples: number;
+  edge_rounds: number;
+  cloud_rounds: number;
+  accuracy: number;
+  low: number | null;
+  high: number | null;
+  told: string;
+  mb: [number, number];
+};
+export type Plan = {
+  infeasible?: string;
+  objective: number;
+  said: string;
+  gap: number | null;
+  status: string;
+  used_mb: [number, number];
+  busy_s: number | null;
+  warnings: string[];
+  tasks: TaskPlan[];
+  equal: { objective: number; note: string | null; tasks: TaskPlan[] } | null;
+};
+export type Saving = { link: string; added: number; added_mb: number; objective: number; gap: number | null; saved: number };
+export type Moment = {
+  stage: string;
+  round: number;
+  told: string;
+  servers: { server: string; task: string; clients: number; failed: number; loss: number | null; up_mb: number; down_mb: number }[];
+  sent: Record<"wireless" | "wireline", number>;
+  scores: Record<string, number>;
+};
+export type RunInfo = {
+  name: string;
+  arm: string;
+  moments: Moment[];
+  budgets: Record<"wireless" | "wireline", number>;
+  used: Record<"wireless" | "wireline", number>;
+  frames: number;
+  findings: { verdict: string; sentence: string }[];
+  placed: { region: string; poles: number[]; covered: number; errors: number }[];
+};
+export type Start = {
+  first: string | null;
+  kinds: Kind[];
+  towns: Card[];
+  problem: ProblemInfo | null;
+  run: RunInfo | null;
+  spaces: string[];
+};
+/** A sensor: on a pole, or at a place of one's own (pole null). */
+export type Stand = { id: number; pole: number | null; x: number; y: number; kind: number };
+export type Placing = { kinds: Kind[]; stands: Stand[]; sight: boolean; without: string[] };
