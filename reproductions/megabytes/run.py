@@ -36,6 +36,7 @@ from flcav.runs.recipe import EDGE, MAIN, RunRecipe
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER, WEIGHTS
 from flcav.runs.training.messages import choose_uploads
+from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
@@ -98,8 +99,8 @@ class MegabytesResult(Record):
             for point in curve
         ]
         matches = [
-            f"{name}, {match.mb:.2f} MB, is matched by sweeps of {_span(match.sweeps_mb, '.2f')} MB with "
-            f"{_span(match.sweeps_boxes, '.0f')} annotated boxes"
+            f"{name}, {match.mb:.2f} MB; megabytes of sweeps that reach it: {_span(match.sweeps_mb, '.2f')}; "
+            f"their annotated boxes: {_span(match.sweeps_boxes, '.0f')}"
             for name, match in self.matches.items()
         ]
         return [*points, *matches, *describe_means(self.differences)]
@@ -212,18 +213,21 @@ def megabytes_tables(results: MegabytesResult) -> dict[str, str]:
 
 
 def draw_megabytes(results: MegabytesResult) -> bytes:
-    """Return AP50 against uplink megabytes and against annotated boxes, a line per curve, as a PNG.
+    """Return AP50 against uplink megabytes and against annotated boxes, with the range over seeds, as a PNG.
 
     A federation on ground truth has the boxes of all sweeps of its vehicles.
     """
-    sent = {name: [(point.mb, point.ap50) for point in points[1:]] for name, points in results.curves.items()}
     held = sum(seed.boxes for seed in results.seeds.values()) / len(results.seeds)
-    boxes = {
-        name: [(point.boxes or held, point.ap50) for point in points[1 if name.startswith(SWEEPS) else -1 :]]
-        for name, points in results.curves.items()
-    }
-    start = results.curves[FLOAT32][0].ap50.mean
-    return style.png(figures.by_costs({"wireless uplink [MB]": sent, "annotated boxes": boxes}, start))
+    sent, boxes = {}, {}
+    for name, points in results.curves.items():
+        reached = [[point.ap50 for point in seed.curves[name]] for seed in results.seeds.values()]
+        ranges = [Estimate(sum(own) / len(own), min(own), max(own)) for own in zip(*reached, strict=True)]
+        sent[name] = [(point.mb, ap50) for point, ap50 in zip(points[1:], ranges[1:], strict=True)]
+        last = 1 if name.startswith(SWEEPS) else -1
+        boxes[name] = [(point.boxes or held, own) for point, own in zip(points[last:], ranges[last:], strict=True)]
+    costs = {"wireless uplink [MB]": sent, "annotated boxes": boxes}
+    label = "AP50 (mean and range over seeds)"
+    return style.png(figures.by_costs(costs, results.curves[FLOAT32][0].ap50.mean, label))
 
 
 def _run(out: Path, options: Options) -> Outcome[MegabytesResult]:

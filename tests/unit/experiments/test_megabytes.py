@@ -76,7 +76,9 @@ def test_sweeps_that_match_a_federation_in_megabytes_and_boxes() -> None:
     assert "| 7.00 | 0.50 (0.50 to 0.50) | 40 (40 to 40) |" in shown["matches"]
     assert f"| {SWEEPS} | 10 sweeps | 1.00 | 80 | 0.720" in shown["curves"]
     assert "| seed 31 | 2.30 | 900 |" in shown["sizes"]
-    assert any(line.startswith(f"{INT8}, 7.00 MB, is matched by sweeps of 0.50") for line in found.sentences())
+    assert any(
+        line.startswith(f"{INT8}, 7.00 MB; megabytes of sweeps that reach it: 0.50") for line in found.sentences()
+    )
     assert draw_megabytes(found).startswith(b"\x89PNG")
 
 

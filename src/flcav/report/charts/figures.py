@@ -104,8 +104,8 @@ def by_megabytes(lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Figur
 
 
 @style.styled
-def by_costs(costs: Mapping[str, Mapping[str, Sequence[tuple[float, Estimate]]]], start: float) -> Figure:
-    """Return AP50 with intervals against several costs, a panel each and a line per name; `start`: AP50 at no cost."""
+def by_costs(costs: Mapping[str, Mapping[str, Sequence[tuple[float, Estimate]]]], start: float, label: str) -> Figure:
+    """Return AP50, of `label`, against several costs, a panel each and a line per name; `start`: AP50 at no cost."""
     figure = style.canvas(2.2 * WIDTH, 1.1 * WIDTH)
     panels = figure.subplots(1, len(costs), sharey=True, squeeze=False)[0]
     for axes, (cost, lines) in zip(panels, costs.items(), strict=True):
@@ -119,7 +119,7 @@ def by_costs(costs: Mapping[str, Mapping[str, Sequence[tuple[float, Estimate]]]]
             textcoords="offset points",
             ha="right",
         )
-    panels[0].set_ylabel("AP50 (95 % interval)")
+    panels[0].set_ylabel(label)
     style.key(figure, panels[0].get_legend_handles_labels()[0], ncols=3)
     return figure
 

@@ -190,7 +190,7 @@ def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Esti
 
 
 def draw_by_cost(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Estimate]]], cost: str) -> None:
-    """Draw AP50 with intervals against a `cost` above 0 on a logarithmic axis, a line per name.
+    """Draw AP50 with its spread against a `cost` above 0 on a logarithmic axis, a line per name.
 
     Lines whose names are the same up to a comma have the same colour; those with one are solid and filled.
     """
