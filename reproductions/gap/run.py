@@ -17,20 +17,25 @@ import numpy as np
 from flcav.config import Json
 from flcav.experiments.comparison import average_arms, compare_arms, mean_difference, tabulate_seeds
 from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
+from flcav.experiments.megabytes import (
+    AtBytes,
+    Curves,
+    MeanAtBytes,
+    average_curves,
+    list_uploads,
+    trace_federation,
+    trace_pretrained,
+    trace_uploads,
+)
 from flcav.interface.wording import plural
-from flcav.network.ledger import BYTES_PER_MB, Ledger
-from flcav.perception.objects.task import OBJECTS
-from flcav.perception.outcomes import score_network
-from flcav.perception.weights import load_network
+from flcav.network.ledger import Ledger
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.runs.analysis.histories import gap_closed
-from flcav.runs.frames import Frames
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.runs.results.run import Run
-from flcav.runs.results.saved import LEDGER, WEIGHTS
-from flcav.runs.training.checkpoints import load_round_network
+from flcav.runs.results.saved import LEDGER
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
@@ -40,28 +45,6 @@ FEDERATED: Mapping[str, str] = {"edge FL on tracks": MAIN, "edge FL on ground tr
 IN_BYTES = "edge FL on ground truth, int8"
 LONGER_ARMS = (("longer", EDGE), ("longer", MORE_EDGE), ("longest", MORE_EDGE))  # arms and stages of that curve
 UPLOADED = "centralised on uploaded sweeps"
-ROUNDS = (1, 2, 3, 5, 10)  # after which a federation is tested, as far as it has them
-
-
-@dataclass(frozen=True)
-class AtBytes:
-    """AP50 on test frames, and the megabytes sent until then on the wireless uplink in a region's stage II."""
-
-    label: str  # rounds or sweeps, as "3 rounds"
-    mb: float
-    ap50: float
-
-
-@dataclass(frozen=True)
-class MeanAtBytes:
-    """AP50 and megabytes at a point of a curve, as means over seeds."""
-
-    label: str
-    mb: float
-    ap50: MeanOverSeeds
-
-
-Curves = Mapping[str, tuple[AtBytes, ...]]  # by name
 
 
 def trace_bytes(run: Run, work: Path, region: str) -> Curves:
@@ -70,22 +53,6 @@ def trace_bytes(run: Run, work: Path, region: str) -> Curves:
     All curves begin with the pretrained network.
     """
     (task,) = run.recipe.tasks
-    test = Frames.open(work / run.steps.recording(region, "test", task))
-    start = load_network(OBJECTS, work / run.steps.pretrain(MAIN, task) / WEIGHTS)
-    pretrained = AtBytes("pretraining", 0.0, score_network(OBJECTS, start, test.data, test.vehicles))
-
-    def federated(arm: str) -> Iterator[AtBytes]:
-        settings, folder = run.recipe.training_of(task), work / run.steps.edge(arm, region, task)
-        sent = Ledger.load(folder / LEDGER).entries
-        for number in (each for each in ROUNDS if each <= max(entry.round for entry in sent)):
-            ended = load_round_network(OBJECTS, start, folder, number, settings.average_rounds, settings.start_share)
-            up = (
-                entry.bytes
-                for entry in sent
-                if (entry.link, entry.direction) == ("wireless", "up") and entry.round <= number
-            )
-            ap50 = score_network(OBJECTS, ended, test.data, test.vehicles)
-            yield AtBytes(plural(number, "round"), sum(up) / BYTES_PER_MB, ap50)
 
     def in_bytes() -> Iterator[AtBytes]:
         for arm, stage in LONGER_ARMS:
@@ -94,36 +61,10 @@ def trace_bytes(run: Run, work: Path, region: str) -> Curves:
             ap50 = run.test(arm=arm, stage=stage, region=region, task=task).estimate.mean
             yield AtBytes(plural(number, "round"), Ledger.load(folder / LEDGER).used_mb("wireless"), ap50)
 
-    def uploaded() -> Iterator[AtBytes]:
-        for arm, sweeps in list_uploads(run.recipe):
-            book = Ledger.load(work / run.steps.central(arm, region, task) / LEDGER)
-            ap50 = run.test(arm=arm, stage=CENTRAL, region=region, task=task).estimate.mean
-            yield AtBytes(plural(sweeps, "sweep"), book.used_mb("wireless"), ap50)
-
-    curves = {name: (pretrained, *federated(arm)) for name, arm in FEDERATED.items()}
-    return {**curves, IN_BYTES: (pretrained, *in_bytes()), UPLOADED: (pretrained, *uploaded())}
-
-
-def list_uploads(recipe: RunRecipe) -> list[tuple[str, int]]:
-    """Return the arms that train centrally on uploaded sweeps, and how many these are, fewest first."""
-    found = [(name, arm.uploads) for name, arm in recipe.arms.items() if arm.uploads is not None]
-    return sorted(found, key=lambda each: each[1])
-
-
-def average_curves(curves: Sequence[Curves]) -> dict[str, tuple[MeanAtBytes, ...]]:
-    """Return the mean over seeds of the points of each curve."""
-    means = {}
-    for name in curves[0]:
-        rows = zip(*(curve[name] for curve in curves), strict=True)
-        means[name] = tuple(
-            MeanAtBytes(
-                points[0].label,
-                sum(point.mb for point in points) / len(points),
-                mean_over_seeds([point.ap50 for point in points], share=True),
-            )
-            for points in rows
-        )
-    return means
+    pretrained = trace_pretrained(run, region)
+    curves = {name: (pretrained, *trace_federation(run, work, region, arm)) for name, arm in FEDERATED.items()}
+    uploaded = (pretrained, *trace_uploads(run, work, region, list_uploads(run.recipe)))
+    return {**curves, IN_BYTES: (pretrained, *in_bytes()), UPLOADED: uploaded}
 
 
 TASK, TOWN, HOME = "objects", "grid", "suburb"

@@ -130,6 +130,11 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
         np.array_equal(one.points, other.points)
         for one, other in zip(received, OBJECTS.samples(data, config, [0, 3]), strict=True)
     )
+    whole = [entry.bytes for entry in book.entries]
+    compressed = upload_samples(book, OBJECTS, config, "suburb", split, [0, 3], compressed=True)
+    assert all(np.allclose(a.points, b.points, atol=0.006) for a, b in zip(compressed, received, strict=True))
+    assert all(np.array_equal(a.boxes.array(), b.boxes.array()) for a, b in zip(compressed, received, strict=True))
+    assert sum(entry.bytes for entry in book.entries) - sum(whole) < sum(whole) / 3  # sweeps of few returns
     network = build_network(OBJECTS, config, 1)
     before = {name: array.copy() for name, array in to_arrays(network).items()}
     after = to_arrays(release_network(book, OBJECTS, network, "grid", split))

@@ -15,10 +15,13 @@ from flcav.config import InputError
 from flcav.federation.privacy import Privacy
 from flcav.network.ledger import LINKS, Ledger
 from flcav.perception.objects import distillation
+from flcav.perception.objects.task import OBJECTS
 from flcav.perception.trajectory.config import CONFIGURATIONS
 from flcav.perception.trajectory.task import TRAJECTORY
+from flcav.perception.weights import load_network
 from flcav.report.pages.run_page import page, write_report
 from flcav.reproductions.gap.run import IN_BYTES, UPLOADED, trace_bytes
+from flcav.reproductions.megabytes.run import FEDERATED, MORE, SWEEPS, compare_megabytes, trace_seed
 from flcav.runs.analysis.histories import ORIGIN, HistoryOrigin
 from flcav.runs.engine import Step, ignore_steps, run_side_by_side
 from flcav.runs.forecast import forecast_run
@@ -29,6 +32,7 @@ from flcav.runs.recipe import (
     MAIN,
     PRETRAIN,
     SPLITS_OF,
+    Arm,
     Budgets,
     Federation,
     Role,
@@ -103,6 +107,30 @@ def test_a_forecast_is_what_the_run_then_plans(
         assert found.uplink_mb[link] == pytest.approx(use.used_mb, rel=0.05)
     assert 0 < told.minutes < 20
     assert any("MB wireless" in line for line in told.lines())
+
+
+def test_compressed_sweeps_are_in_the_ledger_as_they_are_sent(tmp_path: Path) -> None:
+    recipe = shrunk("megabytes")
+    found = run(recipe, tmp_path)
+    work = tmp_path / "work"
+    split = Frames.open(work / "grid-edge-objects")
+    network = load_network(OBJECTS, work / "pretrain-objects" / WEIGHTS)
+    whole = [*OBJECTS.pack_samples(split.data, network.config, split.vehicles)]
+    sent = Ledger.load(work / "grid-central-objects-sweeps3" / LEDGER).entries
+    up = [entry.bytes for entry in sent if entry.link == "wireless"]
+    assert up == [len(message) for message in OBJECTS.compress_samples(whole)]
+    assert sum(up) < sum(map(len, whole)) / 4
+    few = {name: Arm(central="federate", uploads=3, compressed=name == "coded") for name in ("floats", "coded")}
+    told = forecast_run(recipe.model_copy(update={"arms": few})).arms
+    saved_mb = (told["floats"].uplink_mb["wireless"] - told["coded"].uplink_mb["wireless"]) / 3
+    assert saved_mb == pytest.approx(
+        sum(map(len, whole)) / len(whole) / 1e6 * (1 - sum(up) / sum(map(len, whole))), rel=0.3
+    )
+    seed = trace_seed(found, work)
+    assert {*seed.curves} == {*FEDERATED, SWEEPS, f"{SWEEPS}{MORE}"}
+    assert 1 < seed.bytes_per_return < 3
+    assert seed.curves[SWEEPS][1].boxes == seed.boxes  # the one frame that there is
+    assert compare_megabytes(recipe, {"31": seed}).curves[SWEEPS][1].mb == pytest.approx(sum(up) / 1e6)
 
 
 def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:

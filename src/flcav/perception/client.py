@@ -5,7 +5,7 @@ mean, by the cross entropy with a soft target (Hinton et al., "Distilling the Kn
 temperature 1).
 """
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, Generic, Protocol, cast, runtime_checkable
@@ -54,6 +54,15 @@ class Shared(Protocol):
 
     def unpack_samples(self, messages: Sequence[bytes], config: Any) -> Sequence[Any] | None:
         """Return the training samples in messages of `pack_samples`; None where they are read from the recording."""
+        ...
+
+
+@runtime_checkable
+class Compresses(Protocol):
+    """A task whose samples can be uploaded in fewer bytes."""
+
+    def compress_samples(self, messages: Iterable[bytes]) -> Iterator[bytes]:
+        """Yield messages of `Shared.pack_samples`, compressed; `unpack_samples` takes either."""
         ...
 
 

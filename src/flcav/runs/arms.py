@@ -15,7 +15,7 @@ from flcav.federation.strategies.strategy import Corrects, needs_known_number
 from flcav.federation.trainable import statistics_names
 from flcav.fusion.distillation import Distillation
 from flcav.network.awareness import MessageSettings
-from flcav.perception.client import Imitates
+from flcav.perception.client import Compresses, Imitates
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -90,6 +90,7 @@ class Setting:
     training: Mapping[str, Training]  # by task
     central: Literal["pretrain", "federate", "all"] | None
     uploads: int | None  # frames per region that centralised training has; None: all
+    compressed: bool  # whether these are uploaded in fewer bytes
     regions: tuple[str, ...]  # that federate
     stages: tuple[str, ...]  # after pretraining
     replanned: bool  # whether the rest is planned again after stages I and II, from the scores of the run itself
@@ -159,6 +160,7 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         },
         arm.central,
         arm.uploads,
+        arm.compressed,
         arm.regions or recipe.with_role("federate"),
         (CENTRAL,) if arm.central else arm.stages,
         learned and recipe.replan != "none" and calls == find_calls(recipe, recipe.federation),
@@ -246,6 +248,8 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
     _check_distillation(setting, edge, cloud)
     _check_imitation(setting)
+    if setting.compressed and (bare := [task for task in recipe.tasks if not isinstance(task_named(task), Compresses)]):
+        raise InputError(f"compressed: it is a form of sweeps, and '{bare[0]}' uploads none; leave it out")
     _check_numbers(recipe, setting, edge)
     if isinstance(edge, FedMD) and setting.central is None:
         _check_outputs(recipe, setting)

@@ -21,7 +21,7 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.network.ledger import Link
 from flcav.network.plan import MessageSizes, StagePlan, price
-from flcav.perception.client import as_shared
+from flcav.perception.client import Compresses, as_shared
 from flcav.perception.outcomes import score_network
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
@@ -112,6 +112,7 @@ class _Measured:
     """Measured message sizes and computing times of a task."""
 
     sample_mb: float  # size of an uploaded sample [MB]
+    compressed_mb: float  # likewise, compressed where the task can [MB]
     exchange_mb: float | None  # what a vehicle sends to be combined in a round [MB]; None: a model update
     pool: int  # candidates for upload
     frame_s: float  # time to record a frame [s]
@@ -141,8 +142,11 @@ def _measure(graph: Graph, task: str) -> _Measured:
     learning = graph.learning(graph.settings[MAIN], task).resolve()
     with tempfile.TemporaryDirectory() as folder:
         split, pool, frame_s = _record_scene(graph, task, Path(folder))
-        packed = as_shared(learning.task).pack_samples(split.data, learning.config, split.vehicles)
-        sample_mb = float(np.mean([len(message) for message in packed])) / 1e6
+        packed = [*as_shared(learning.task).pack_samples(split.data, learning.config, split.vehicles)]
+        compressed = learning.task.compress_samples(packed) if isinstance(learning.task, Compresses) else packed
+        sample_mb, compressed_mb = (
+            float(np.mean([len(message) for message in form])) / 1e6 for form in (packed, compressed)
+        )
         about = (learning.task, learning.config, [split], settings.updates, len(split.vehicles), settings.seed)
         exchange_mb = measure_exchange(*about)
         network = learning.build_network()
@@ -157,7 +161,7 @@ def _measure(graph: Graph, task: str) -> _Measured:
         frames = split.vehicles
         score_network(learning.task, network, split.data, frames)
         test_s = (time.process_time() - trained) / len(frames)
-    return _Measured(sample_mb, exchange_mb, pool, frame_s, (trained - began) / STEPS, test_s)
+    return _Measured(sample_mb, compressed_mb, exchange_mb, pool, frame_s, (trained - began) / STEPS, test_s)
 
 
 def _record_scene(graph: Graph, task: str, folder: Path) -> tuple[Frames, int, float]:
@@ -246,9 +250,10 @@ def _forecast_arm(
     for task, planned in plans[arm.name].items():
         cloud = planned.cloud_rounds if CLOUD in arm.stages else 0
         edge = 0 if arm.central else planned.edge_rounds + (planned.cloud_rounds * k if MORE_EDGE in arm.stages else 0)
-        samples = planned.samples + (arm.uploads or 0) * len(groups)
-        sent = price(StagePlan(samples, edge, cloud, groups, k), _size_messages(settings, task, measured[task]))
+        sizes = measured[task]
+        sent = price(StagePlan(planned.samples, edge, cloud, groups, k), _size_messages(settings, task, sizes))
         uplink_mb += (sent.wireless_mb, sent.wireline_mb)
+        uplink_mb += (arm.uploads or 0) * len(groups) * (sizes.compressed_mb if arm.compressed else sizes.sample_mb)
     trainings = [
         PrivateTraining(region, graph.vehicles[region], planned.edge_rounds + planned.cloud_rounds * k, planned.noise)
         for repeat in range(1 + graph.recipe.retrainings)

@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import pytest
 
+from flcav.experiments.megabytes import ROUNDS, AtBytes, list_uploads
 from flcav.reproductions.gap.run import (
     ARMS,
     AT_HOME,
@@ -18,16 +19,13 @@ from flcav.reproductions.gap.run import (
     PRETRAINED,
     REPLAY,
     ROAD,
-    ROUNDS,
     TRACKS,
     TRUTH,
-    AtBytes,
     GapResult,
     compare_gap,
     draw_gap,
     draw_megabytes,
     gap_tables,
-    list_uploads,
 )
 from flcav.runs.recipe import MAIN, load_run_recipe
 from flcav.runs.results.training import LabelQuality

@@ -56,6 +56,16 @@ def test_an_impossible_federation_is_one_sentence_before_the_run(federation: Any
             check_federations(recipe, arms)
 
 
+def test_sweeps_are_not_compressed_where_a_task_has_none() -> None:
+    recipe, _ = settings({})
+    few = recipe.tasks["objects"].model_copy(update={"labels": None})
+    arms = {"few": Arm(central="federate", uploads=3, compressed=True)}
+    for tasks in ({"objects": few}, {"objects": few, "signs": few.model_copy(update={"network": None})}):
+        own = recipe.model_copy(update={"tasks": tasks, "arms": arms})
+        with pytest.raises(InputError, match="'signs' uploads none") if "signs" in tasks else nullcontext():
+            check_federations(own, resolve_settings(own).values())
+
+
 def test_what_needs_a_known_number_is_refused_where_the_plan_says_who_joins() -> None:
     def check(secure: dict[str, Any], *changes: dict[str, Any], **federation: Any) -> None:
         recipe, _ = settings({"masked": secure}, **federation)

@@ -67,6 +67,7 @@ ARM = {"placement": {"rule": "densest"}}
         ),
         ({"tasks": STARTED, "arms": {"more": {"central": "pretrain"}}}, "more pretraining goes with samples"),
         ({"tasks": STARTED, "arms": {"joint": {"central": "all"}}}, "training on all regions goes with samples"),
+        ({"arms": {"few": {"central": "federate", "compressed": True}}}, "a form of uploads; give their number"),
         ({"tasks": STARTED, "federation": {"replay": 0.3}}, "the cloud trains on samples of stage I"),
         ({"regions": {"grid": {"role": "federate"}}}, "one with the role pretrain is wanted"),
         ({"regions": {"suburb": {"role": "pretrain"}}}, "one with the role federate is wanted"),

@@ -1,6 +1,6 @@
 """Training samples of the detector: LiDAR sweeps with labels, from recorded frames or from messages.
 
-In a message the sweep is whole and uncompressed, 16 bytes per point, with the boxes to learn from.
+In a message the sweep is whole, 16 bytes per point, or compressed, with the boxes to learn from.
 """
 
 import math
@@ -35,6 +35,7 @@ from flcav.perception.objects.truth import (
 from flcav.perception.task import KnownLidar
 from flcav.perception.weights import find_recorded_lidar
 from flcav.sensors.frame import Frame
+from flcav.sensors.lidar.compression import decode_sweep, encode_sweep
 
 RANGE_SLACK = 0.2  # relative difference of a LiDAR's range from that of the training that is not mentioned
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
@@ -256,10 +257,17 @@ def pack_sample(frame: Frame, config: SecondConfig) -> bytes:
     )
 
 
-def unpack_sample(message: bytes, config: SecondConfig) -> Sample:
-    """Return the training sample in a message: that of `sample_from_frame`."""
+def compress_sample(message: bytes) -> bytes:
+    """Return a message of `pack_sample` with its sweep compressed, see `flcav.sensors.lidar.compression`."""
     arrays = unpack_arrays(message)
-    points = crop_to_range(arrays["points"], config)
+    return pack_arrays({**arrays, "points": encode_sweep(arrays["points"])})
+
+
+def unpack_sample(message: bytes, config: SecondConfig) -> Sample:
+    """Return the training sample in a message: that of `sample_from_frame`, to a centimetre if it is compressed."""
+    arrays = unpack_arrays(message)
+    sent = arrays["points"]
+    points = crop_to_range(decode_sweep(sent) if sent.dtype == np.uint8 else sent, config)
     return Sample(points, unpack_boxes(arrays, "boxes"), unpack_boxes(arrays, "ignore"))
 
 

@@ -42,6 +42,7 @@ from flcav.perception.objects.samples import (
     RecordedSweeps,
     Sample,
     compare_rig,
+    compress_sample,
     pack_sample,
     select_fitting_frames,
     unpack_sample,
@@ -260,8 +261,12 @@ class ObjectsTask(ObjectsOutcomes):
         read = frame_reader(data, config.foreground)
         return (pack_sample(read(i), config) for i in frames)
 
+    def compress_samples(self, messages: Iterable[bytes]) -> Iterator[bytes]:
+        """Yield messages of `pack_samples` with compressed sweeps."""
+        return map(compress_sample, messages)
+
     def unpack_samples(self, messages: Sequence[bytes], config: SecondConfig) -> list[Sample]:
-        """Return the samples in messages of `pack_samples`."""
+        """Return the samples in messages of `pack_samples` or `compress_samples`."""
         return [unpack_sample(message, config) for message in messages]
 
     def infer(

@@ -104,6 +104,27 @@ def by_megabytes(lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Figur
 
 
 @style.styled
+def by_costs(costs: Mapping[str, Mapping[str, Sequence[tuple[float, Estimate]]]], start: float, label: str) -> Figure:
+    """Return AP50, of `label`, against several costs, a panel each and a line per name; `start`: AP50 at no cost."""
+    figure = style.canvas(2.2 * WIDTH, 1.1 * WIDTH)
+    panels = figure.subplots(1, len(costs), sharey=True, squeeze=False)[0]
+    for axes, (cost, lines) in zip(panels, costs.items(), strict=True):
+        runs.draw_by_cost(axes, lines, cost)
+        axes.axhline(start, color=style.MUTED, linewidth=0.8)
+        axes.annotate(
+            "pretrained",
+            (1, start),
+            (0, 3),
+            xycoords=axes.get_yaxis_transform(),
+            textcoords="offset points",
+            ha="right",
+        )
+    panels[0].set_ylabel(label)
+    style.key(figure, panels[0].get_legend_handles_labels()[0], ncols=3)
+    return figure
+
+
+@style.styled
 def overview(
     scene: maps.ErrorMap, sweep: clouds.ComparedSweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
 ) -> Figure:

@@ -5,6 +5,7 @@ from itertools import cycle
 
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
+from matplotlib.ticker import LogLocator, NullLocator
 
 from flcav.report import style
 from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN
@@ -185,6 +186,27 @@ def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Esti
             style.interval(axes, x, ap, color=colour, linewidth=0.8)
     axes.set(xlabel="wireless uplink [MB]", ylabel="AP50 (95 % interval)", xlim=(0, None))
     axes.legend(loc="lower right", frameon=False)
+    axes.grid(axis="y")
+
+
+def draw_by_cost(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Estimate]]], cost: str) -> None:
+    """Draw AP50 with its spread against a `cost` above 0 on a logarithmic axis, a line per name.
+
+    Lines whose names are the same up to a comma have the same colour; those with one are solid and filled.
+    """
+    bases = list(dict.fromkeys(name.split(", ")[0] for name in lines))
+    for number, (name, points) in enumerate(lines.items()):
+        base, aside = name.split(", ")[0], 1.015 ** (number - len(lines) / 2)  # keeps intervals apart
+        colour = (style.BLUE, style.VERMILLION, *style.OTHER_COLOURS)[bases.index(base) % 6]
+        look = {"mfc": colour, "linestyle": "-"} if name != base else {"mfc": "white", "linestyle": (0, (2, 2))}
+        xs = [x * aside for x, _ in points]
+        axes.plot(xs, [ap.mean for _, ap in points], marker="o", color=colour, label=name, markersize=4.5, **look)
+        for x, (_, ap) in zip(xs, points, strict=True):
+            style.interval(axes, x, ap, color=colour, linewidth=0.8, alpha=0.6)
+    axes.set(xscale="log", xlabel=cost)
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0)))
+    axes.xaxis.set_major_formatter(lambda x, _: f"{x:g}")
+    axes.xaxis.set_minor_locator(NullLocator())
     axes.grid(axis="y")
 
 

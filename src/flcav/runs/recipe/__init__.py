@@ -201,6 +201,7 @@ class Arm(ArmFields, _PlannedArm):
     uploads: int | None = Field(
         default=None, ge=1
     )  # with `central: federate`: train on so many frames that vehicles upload with their annotations; None: on all
+    compressed: bool = False  # with `uploads`: sweeps are sent in levels of a centimetre, delta-coded, not as floats
     stages: tuple[Literal["edge", "cloud", "more_edge"], ...] = (
         "edge",
         "cloud",
@@ -211,6 +212,8 @@ class Arm(ArmFields, _PlannedArm):
     def _uploads_are_learned_from(self) -> "Arm":
         if self.uploads is not None and self.central != "federate":
             raise ValueError("uploads: of centralised training alone; it goes with 'central: federate'")
+        if self.compressed and self.uploads is None:
+            raise ValueError("compressed: it is a form of uploads; give their number in 'uploads'")
         return self
 
     @field_validator("stages")

@@ -229,6 +229,7 @@ class OracleSettings(StepSettings):
     inputs: RegionInputs
     vehicles: int  # number of those whose local steps it takes: the region's
     uploads: int | None = None  # frames that the vehicles upload; None: all are available at no cost
+    compressed: bool = False  # whether these are
     budgets_mb: Budgets  # of the run
 
     @property
@@ -272,7 +273,9 @@ def oracle_step(work: Work, settings: OracleSettings) -> None:
         book = Ledger(share, read_entries(work, inputs.pretrain))
         before = len(book.entries)
         chosen = choose_uploads({inputs.region: frames}, settings.uploads, settings.learning.seed)[inputs.region]
-        held = upload_samples(book, learning.task, trained.config, inputs.region, split, chosen, EDGE)
+        held = upload_samples(
+            book, learning.task, trained.config, inputs.region, split, chosen, EDGE, settings.compressed
+        )
         Ledger(share, book.entries[before:]).save(work.folder / LEDGER)
     samples = [held[number] for number in range(len(held))]  # in memory: samples are drawn many times
     _train_on(work, learning, trained, samples, inputs.plan, settings.vehicles, inputs.region)
@@ -318,6 +321,7 @@ def list_central_steps(outline: Outline, arm: Setting, task: str) -> Iterator[St
             inputs=inputs,
             vehicles=outline.vehicles[region],
             uploads=arm.uploads,
+            compressed=arm.compressed,
             budgets_mb=outline.recipe.budgets_mb,
         )
         yield make_step(names.central(arm.name, region, task), oracle_step, settings)

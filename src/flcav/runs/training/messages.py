@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.federation.strategies.fedmd import FedMD
 from flcav.federation.trainable import Weights
 from flcav.network.ledger import Ledger, pack_arrays, send_message, unpack_arrays
-from flcav.perception.client import SharedSamples, as_shared
+from flcav.perception.client import Compresses, SharedSamples, as_shared
 from flcav.perception.errors import Registry, pack_errors, unpack_errors
 from flcav.perception.task import Task
 from flcav.perception.weights import from_arrays, to_arrays
@@ -135,17 +135,27 @@ def choose_planned_uploads(
 
 
 def upload_samples(
-    book: Ledger, task: Task, config: Any, region: str, pool: Frames, chosen: Sequence[int], stage: str = PRETRAIN
+    book: Ledger,
+    task: Task,
+    config: Any,
+    region: str,
+    pool: Frames,
+    chosen: Sequence[int],
+    stage: str = PRETRAIN,
+    compressed: bool = False,
 ) -> Sequence[Any]:
     """Upload the `chosen` frames from vehicles to the cloud (wireless, then wireline); return the received samples.
 
-    Messages enter `book` under `stage`. The samples of a task that does not define messages are read from the recording
-    on access.
+    Messages enter `book` under `stage`, compressed if so asked. The samples of a task that does not define messages are
+    read from the recording on access.
     """
     shared = as_shared(task)
     received = []
     about: Any = {"stage": stage, "task": task.name, "direction": "up"}
-    for frame, message in zip(chosen, shared.pack_samples(pool.data, config, chosen), strict=True):
+    messages = shared.pack_samples(pool.data, config, chosen)
+    if compressed and isinstance(task, Compresses):
+        messages = task.compress_samples(messages)
+    for frame, message in zip(chosen, messages, strict=True):
         key = pool.data.keys[frame]
         at_edge = send_message(book, message, **about, link="wireless", client=f"{key.scene}/{key.agent}")
         received.append(send_message(book, at_edge, **about, link="wireline", client=region))
