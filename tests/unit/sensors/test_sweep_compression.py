@@ -1,5 +1,6 @@
 """Compressed sweeps: what comes back, and how few bytes a return takes."""
 
+import lzma
 import os
 from pathlib import Path
 
@@ -9,7 +10,8 @@ import pytest
 from flcav.geometry import Boxes
 from flcav.network.ledger import pack_arrays, unpack_arrays
 from flcav.perception.objects.samples import compress_sample, pack_boxes, unpack_boxes
-from flcav.sensors.lidar.compression import decode_sweep, encode_sweep
+from flcav.sensors.lidar import compression
+from flcav.sensors.lidar.compression import CODED, RETURN_BYTES, decode_sweep, encode_sweep
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[4] / "shared" / "data"))
 KITTI = REAL / "kitti_frame" / "training" / "velodyne" / "000008.bin"
@@ -70,3 +72,16 @@ def test_a_compressed_sample_keeps_its_boxes() -> None:
     assert len(compress_sample(whole)) < len(whole) / 5
     np.testing.assert_array_equal(unpack_boxes(sent, "boxes").array(), car.array())
     np.testing.assert_array_equal(decode_sweep(sent["points"]), decode_sweep(encode_sweep(make_sweep())))
+
+
+@pytest.mark.parametrize("plain", [b"\0" * 17, b"\0" * (RETURN_BYTES * 1001)])
+def test_bytes_of_no_sweep_or_of_too_large_a_one_are_refused(plain: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(compression, "MOST", 1000)
+    with pytest.raises(ValueError, match="not a compressed sweep of at most 1000 returns"):
+        decode_sweep(np.frombuffer(lzma.compress(plain, **CODED), np.uint8))
+    assert len(decode_sweep(np.frombuffer(lzma.compress(b"\0" * RETURN_BYTES * 1000, **CODED), np.uint8))) == 1000
+
+
+def test_other_bytes_are_refused() -> None:
+    with pytest.raises(ValueError, match="not a compressed sweep"):
+        decode_sweep(np.full(100, 255, np.uint8))

@@ -11,6 +11,8 @@ import numpy as np
 from flcav.arrays import Array32, Bytes
 
 PER_UNIT = np.array((100.0, 100.0, 100.0, 255.0))  # levels of a metre along x, y and z, and of the full intensity
+RETURN_BYTES = 16  # four steps of 4 bytes
+MOST = 1 << 22  # returns of a sweep
 CODED = {"format": lzma.FORMAT_RAW, "filters": [{"id": lzma.FILTER_LZMA2, "lc": 0, "pb": 0, "preset": 6}]}
 
 
@@ -27,8 +29,17 @@ def encode_sweep(points: Array32) -> Bytes:
 
 
 def decode_sweep(coded: Bytes) -> Array32:
-    """Return the points (N, 4) that `encode_sweep` coded, at the centres of their levels."""
-    planes = np.frombuffer(lzma.decompress(coded.tobytes(), **CODED), np.uint8).reshape(4, 4, -1)
+    """Return the points (N, 4) that `encode_sweep` coded, at the centres of their levels.
+
+    Raises ValueError for bytes that are not a sweep's, or more than `MOST` returns.
+    """
+    try:
+        plain = lzma.LZMADecompressor(**CODED).decompress(coded.tobytes(), RETURN_BYTES * MOST + 1)
+    except lzma.LZMAError as error:
+        raise ValueError(f"not a compressed sweep ({error})") from None
+    if len(plain) > RETURN_BYTES * MOST or len(plain) % RETURN_BYTES:
+        raise ValueError(f"not a compressed sweep of at most {MOST} returns")
+    planes = np.frombuffer(plain, np.uint8).reshape(4, 4, -1)
     unsigned = np.ascontiguousarray(planes.transpose(0, 2, 1)).view("<u4")[..., 0].astype(np.int64).T
     steps = (unsigned >> 1) ^ -(unsigned & 1)
     return (np.cumsum(steps, axis=0) / PER_UNIT).astype(np.float32)
