@@ -198,9 +198,12 @@ def draw_by_cost(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Estimate]
     for number, (name, points) in enumerate(lines.items()):
         base, aside = name.split(", ")[0], 1.015 ** (number - len(lines) / 2)  # keeps intervals apart
         colour = (style.BLUE, style.VERMILLION, *style.OTHER_COLOURS)[bases.index(base) % 6]
-        look = {"mfc": colour, "linestyle": "-"} if name != base else {"mfc": "white", "linestyle": (0, (2, 2))}
+        fill, dashes = (colour, "-") if name != base else ("white", (0, (2, 2)))
         xs = [x * aside for x, _ in points]
-        axes.plot(xs, [ap.mean for _, ap in points], marker="o", color=colour, label=name, markersize=4.5, **look)
+        axes.plot(
+            xs, [ap.mean for _, ap in points],
+            marker="o", color=colour, label=name, markersize=4.5, mfc=fill, linestyle=dashes,
+        )  # fmt: skip
         for x, (_, ap) in zip(xs, points, strict=True):
             style.interval(axes, x, ap, color=colour, linewidth=0.8, alpha=0.6)
     axes.set(xscale="log", xlabel=cost)
