@@ -118,12 +118,12 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, option
 
 
 def _list_lines(results: "list[Run]", summary: "Summary | None") -> Iterator[str]:
-    from flcav.runs.analysis.answer import answer_question
+    from flcav.runs.analysis.answer import tell_answer
     from flcav.runs.analysis.caveats import DIVERGING, PLACED_BARE
     from flcav.runs.results.training import TOGETHER
 
     if summary is None:
-        if answer := answer_question(results[0]):
+        if answer := tell_answer(results[0]):
             yield " ".join((f"{answer.word}.", *answer.sentences))
         for finding in results[0].findings:
             yield f"{finding.question}: {finding.decision}. {finding.sentence}"

@@ -22,7 +22,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
 from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
 from flcav.dataset.formats.kitti.write import FRAMES
-from flcav.dataset.formats.rig import LOOKED, RANGE_M, Rig
+from flcav.dataset.formats.rig import LOOKED, RANGE_M, LidarRig
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.scene_checks import EmptyBoxes
 from flcav.geometry import Boxes, transform_points
@@ -271,7 +271,7 @@ def is_kitti(path: Path) -> bool:
     return (path / "training" / "velodyne").is_dir() or (is_drive(path) and not (path / MANIFEST).exists())
 
 
-def compare_kitti_rig(path: Path, rig: Rig, config: SecondConfig, trained: KnownLidar) -> str:
+def compare_kitti_rig(path: Path, rig: LidarRig, config: SecondConfig, trained: KnownLidar) -> str:
     """Return how the LiDAR of the KITTI folder `path` differs from KITTI's and from that of the network's training.
 
     The words are those of `find_rig` and `describe_rig`. Neither beams nor range are known of an export of flcav.
@@ -291,7 +291,9 @@ def open_evaluated(path: Path) -> tuple[KittiFolder, str | None]:
     return KittiFolder.open(path, split, pictures=False), split
 
 
-def evaluate_kitti(network: Second, path: Path, rig: Rig, progress: Report = ignore_progress) -> BenchmarkEvaluation:
+def evaluate_kitti(
+    network: Second, path: Path, rig: LidarRig, progress: Report = ignore_progress
+) -> BenchmarkEvaluation:
     """Return the AP|R40 of each class on the frames of `open_evaluated`, whose LiDAR is that of `rig`.
 
     Raises `InputError` where a file is missing, truncated or malformed.
@@ -328,7 +330,7 @@ def _check_labels(folder: KittiFolder) -> None:
     boxes.refuse(folder.folder)
 
 
-def _detect(network: Second, folder: KittiFolder, rig: Rig, progress: Report) -> Iterator[_Found]:
+def _detect(network: Second, folder: KittiFolder, rig: LidarRig, progress: Report) -> Iterator[_Found]:
     move = level_mount(rig.agent_from_lidar, network.config)
     for number in range(len(folder)):
         frame = folder.frame(number)

@@ -61,7 +61,7 @@ class Desk:
 
     def open_map(self, xodr: Path) -> str:
         """Import an OpenDRIVE map, and return the key of its town; raises `InputError` as `import_town` does."""
-        return self.add(import_map(xodr))
+        return self.add(lay_out_map(xodr))
 
     def add_errors(self, key: str, table: Path) -> str:
         """Put the errors in a table into a copy of a workspace, and return its key; raises `InputError`."""
@@ -105,7 +105,7 @@ def with_errors(space: Workspace, table: Path) -> Workspace:
     return replace(space, given=given, name=table.name, typed=f"--town {space.town.name} --errors {table.name}")
 
 
-def import_map(xodr: Path) -> Workspace:
+def lay_out_map(xodr: Path) -> Workspace:
     """Return the town of an OpenDRIVE map, imported into a temporary folder that stays as long as the process.
 
     Raises `InputError` where the map is none, or netconvert is not installed.

@@ -106,7 +106,7 @@ def select_errors(given: Given, without: frozenset[str]) -> NDArray[np.bool_]:
     return ~(out | np.isin(np.array(labels, dtype=np.str_), [*without])) if labels else ~out
 
 
-def list_candidates(space: Workspace, question: Question) -> tuple[Candidates, Given]:
+def collect_candidates(space: Workspace, question: Question) -> tuple[Candidates, Given]:
     """Return the candidates of a question, and the errors, poles and kinds that it is about.
 
     Raises `InputError` where there are no errors, or none that counts.
@@ -185,7 +185,7 @@ def find_best(space: Workspace, question: Question, *, count: int | None = None,
 
     Raises `InputError` as `flcav place` does.
     """
-    candidates, given = list_candidates(space, question)
+    candidates, given = collect_candidates(space, question)
     priced = candidates if given.priced and count is None else candidates.at_unit_cost()
     placed = place_count(priced, count) if count is not None else place_budget(priced, budget or 0.0)
     reached = int((np.bincount(candidates.covers.indices, minlength=len(given.errors)) > 0).sum())
@@ -200,7 +200,7 @@ def trace_curve(space: Workspace, question: Question) -> list[Best]:
 
     All errors are meant that any site reaches. There are `WAYS` steps at most.
     """
-    candidates, given = list_candidates(space, question)
+    candidates, given = collect_candidates(space, question)
     if not candidates.covers.nnz:
         return []
     if not given.priced:
@@ -256,7 +256,7 @@ def find_new_poles(space: Workspace, question: Question, kind: int, uncovered: S
     return [NewPole(site, gain, number) for site, (_, gain, number) in zip(located, found, strict=True)]
 
 
-def describe_map(town: Town) -> dict[str, Json]:
+def describe_town(town: Town) -> dict[str, Json]:
     """Return the map of a town for the page: outlines [m, world], heights of buildings, names of streets."""
     x, y, yaw, length, width, height = town.buildings.T
     houses = Boxes.from_array(np.c_[x, y, height / 2, length, width, height, yaw], "building").corners()[:, :4, :2]

@@ -5,7 +5,7 @@ import json
 from flcav.config import InputError, Json
 from flcav.planner.desk import Desk
 from flcav.planner.exporting import write_command
-from flcav.planner.placing import Question, describe_map, describe_workspace, look, trace_curve
+from flcav.planner.placing import Question, describe_town, describe_workspace, look, trace_curve
 from flcav.planner.server import ASSETS
 
 MOST_MB = 5.0  # of a page, to be sent by mail
@@ -28,7 +28,7 @@ def save_page(desk: Desk) -> bytes:
             looks[f"{pole} {kind}"] = {"area": area, "covered": covered, "z": site[2]}
     saved = {
         "start": desk.describe(),
-        "workspace": {"key": desk.first, "map": describe_map(space.town), **describe_workspace(space)},
+        "workspace": {"key": desk.first, "map": describe_town(space.town), **describe_workspace(space)},
         "looks": looks,
         "curve": [] if space.given is None else [step.as_json() for step in trace_curve(space, question)],
         "command": "" if space.given is None else write_command(space, question, 1),

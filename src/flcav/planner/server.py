@@ -31,7 +31,7 @@ from flcav.planner.exporting import export_placement
 from flcav.planner.placing import (
     Kinds,
     Question,
-    describe_map,
+    describe_town,
     describe_workspace,
     find_best,
     find_new_poles,
@@ -67,7 +67,7 @@ class Body(BaseModel):
     model_config = ConfigDict(extra="forbid")
 
 
-class Kind(Body):
+class SensorOffer(Body):
     """A kind of sensor."""
 
     name: str = Field(max_length=60)
@@ -75,11 +75,11 @@ class Kind(Body):
     cost: Price = 0.0
 
 
-class Asked(Body):
+class AskedPlacement(Body):
     """A question about a workspace."""
 
     workspace: str = Field(max_length=64)
-    kinds: list[Kind] = Field(min_length=1, max_length=12)
+    kinds: list[SensorOffer] = Field(min_length=1, max_length=12)
     own: list[tuple[Metres, Metres]] = Field(default=[], max_length=100)
     line_of_sight: bool = True
     without: list[str] = Field(default=[], max_length=100)
@@ -94,14 +94,14 @@ class Asked(Body):
         return Question(kinds, tuple(self.own), self.line_of_sight, frozenset(self.without))
 
 
-class AskedBest(Asked):
+class AskedBest(AskedPlacement):
     """The best placement of a number of sensors, or within a budget."""
 
     count: int | None = Field(default=None, ge=1, le=10_000)
     budget: Price | None = None
 
 
-class AskedNew(Asked):
+class AskedNew(AskedPlacement):
     """Where a new pole pays most."""
 
     kind: int = Field(ge=0)
@@ -119,7 +119,7 @@ class AskedLook(Body):
     line_of_sight: bool = True
 
 
-class AskedExport(Asked):
+class AskedExport(AskedPlacement):
     """The files of a placement: pairs of a site, with own ones after the poles, and a kind."""
 
     pairs: list[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]] = Field(max_length=1000)
@@ -247,7 +247,7 @@ def make_app(desk: Desk, token: str) -> FastAPI:
         return found.as_json()
 
     @app.post("/api/curve", **guarded)
-    def curve(asked: Asked) -> dict[str, Json]:
+    def curve(asked: AskedPlacement) -> dict[str, Json]:
         with busy:
             return {"steps": [step.as_json() for step in trace_curve(desk.find(asked.workspace), asked.question())]}
 
@@ -310,7 +310,7 @@ def _budgeted(desk: Desk, asked: AskedPlan) -> Problem:
 
 def _describe(desk: Desk, key: str) -> dict[str, Json]:
     space = desk.find(key)
-    return {"key": key, "map": describe_map(space.town), **describe_workspace(space)}
+    return {"key": key, "map": describe_town(space.town), **describe_workspace(space)}
 
 
 def _take(desk: Desk, workspace: str, name: str, content: bytes) -> str:
@@ -328,7 +328,7 @@ def _take(desk: Desk, workspace: str, name: str, content: bytes) -> str:
             raise InputError(str(error).replace(f"{folder}/", "")) from None
 
 
-def serve(desk: Desk, port: int | None, report: Callable[[str], None]) -> None:
+def serve_planner(desk: Desk, port: int | None, report: Callable[[str], None]) -> None:
     """Serve the planner on the loopback until interrupted; `report` is given its address.
 
     Raises `InputError` where the port is taken.

@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.conversion import import_dataset
 from flcav.dataset.formats.kitti.files import read_points
 from flcav.dataset.formats.mounting import estimate_mounting
-from flcav.dataset.formats.rig import HEIGHT_M, UNSTATED, Rig, StatedLidar, find_rig
+from flcav.dataset.formats.rig import HEIGHT_M, UNSTATED, LidarRig, StatedLidar, find_rig
 from flcav.dataset.store import Dataset
 from flcav.geometry.poses import pose
 
@@ -28,7 +28,7 @@ def test_a_sweep_without_ground_shows_none() -> None:
     assert estimate_mounting([cast(64, 1.7, 0, 0, seed, ground=False) for seed in range(2)]) is None
 
 
-def rig(tmp_path: Path, clouds: list[np.ndarray], stated: StatedLidar = UNSTATED) -> Rig:
+def rig(tmp_path: Path, clouds: list[np.ndarray], stated: StatedLidar = UNSTATED) -> LidarRig:
     paths = [tmp_path / f"{number:06d}.bin" for number in range(len(clouds))]
     for path, cloud in zip(paths, clouds, strict=True):
         cloud.tofile(path)

@@ -8,7 +8,7 @@ import pytest
 
 from flcav.report.pages.html import render
 from flcav.report.pages.run_page import page
-from flcav.runs.analysis.answer import answer_question, list_stage_means
+from flcav.runs.analysis.answer import list_stage_means, tell_answer
 from flcav.runs.results.run import Run
 from flcav.runs.running import RESULTS
 from flcav.statistics.estimates import Estimate
@@ -40,7 +40,7 @@ def judged(run: Run, *verdicts: str) -> Run:
 )
 def test_the_word_is_that_of_the_verdict_on_the_mean_over_regions(verdicts: tuple[str, ...], word: str) -> None:
     run = judged(Run.load(RUNS / "demo", RESULTS), *verdicts)
-    answer = answer_question(run)
+    answer = tell_answer(run)
     assert answer is not None
     assert answer.word == word
     assert f"({verdicts[0]}: " in answer.sentences[0]
@@ -58,7 +58,7 @@ def test_the_word_is_that_of_the_verdict_on_the_mean_over_regions(verdicts: tupl
     ],
 )
 def test_without_one_all_regions_count(verdicts: tuple[str, ...], word: str) -> None:
-    answer = answer_question(judged(Run.load(RUNS / "retraining", RESULTS), *verdicts))
+    answer = tell_answer(judged(Run.load(RUNS / "retraining", RESULTS), *verdicts))
     assert answer is not None
     assert answer.word == word
     for region, verdict, sentence in zip(("grid", "ring"), verdicts, answer.sentences, strict=False):
@@ -70,14 +70,14 @@ def test_there_is_no_price_where_no_measure_fell_at_home_by_more_than_its_interv
     run = judged(Run.load(RUNS / "demo", RESULTS), HELD)
     assert run.home is not None
     kept = replace(run, home=(replace(run.home[0], difference=Estimate(-0.27, -0.6, 0.06)),))
-    answer = answer_question(kept)
+    answer = tell_answer(kept)
     assert answer is not None
     assert answer.word == "Yes"
 
 
 def test_numbers_are_means_over_regions_and_trainings_and_megabytes_those_of_the_stage() -> None:
     run = Run.load(RUNS / "demo", RESULTS)
-    answer = answer_question(run)
+    answer = tell_answer(run)
     assert answer is not None
     means = {
         stage: np.mean(
@@ -109,4 +109,4 @@ def test_a_run_without_the_claim_has_no_answer() -> None:
         if each.before_stage != "pretrain"
     ]
     differences, findings = zip(*others, strict=True)
-    assert answer_question(replace(run, differences=differences, findings=findings)) is None
+    assert tell_answer(replace(run, differences=differences, findings=findings)) is None

@@ -51,9 +51,9 @@ def planner(
         write_bytes(html, save_page(desk))
         echo(f"{html}: {html.stat().st_size / 1e6:.1f} MB, a page that needs no server")
         return
-    from flcav.planner.server import serve
+    from flcav.planner.server import serve_planner
 
-    serve(
+    serve_planner(
         desk,
         port,
         lambda address: echo(f"{address}\n    open it in a browser on this machine; Ctrl-C ends the planner"),
@@ -74,7 +74,7 @@ def _lay(
 
     from flcav.config import InputError
     from flcav.optimization.graph import load_problem
-    from flcav.planner.desk import ONE_KIND, RANGE_M, Desk, import_map, lay_out
+    from flcav.planner.desk import ONE_KIND, RANGE_M, Desk, lay_out_map, lay_out
     from flcav.planner.inputs import read_given, read_kinds, read_sites, read_world
     from flcav.planner.placing import Kinds
     from flcav.sources.recipe import find_recipe
@@ -113,7 +113,7 @@ def _lay(
     if what is None and data is None:
         return desk
     if ending == ".xodr":
-        space = import_map(Path(what or ""))
+        space = lay_out_map(Path(what or ""))
     else:
         town, traces = read_world(data, what)
         if town is None:

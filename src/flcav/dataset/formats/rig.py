@@ -54,7 +54,7 @@ KITTI = UsualLidar("KITTI's", HEIGHT_M, BEAMS)
 
 
 @dataclass(frozen=True)
-class Rig:
+class LidarRig:
     """The mount and the beams of a LiDAR, and sentences on how they differ from the usual ones."""
 
     agent_from_lidar: Array  # (4, 4) [m]; the vehicle's origin is on the ground below the LiDAR
@@ -67,7 +67,7 @@ def find_rig(
     read: Callable[[Path], Array32],
     stated: StatedLidar = UNSTATED,
     usual: UsualLidar = KITTI,
-) -> Rig:
+) -> LidarRig:
     """Return the LiDAR of sweeps by those of them that are evenly spread.
 
     Raises `InputError` where a file is damaged, and where the points are in another frame than x ahead, y left, z up,
@@ -97,7 +97,7 @@ def find_rig(
     else:
         mount, note = _place(found, stated, usual)
         notes += [note] if note else []
-    return Rig(mount, beams, tuple(notes))
+    return LidarRig(mount, beams, tuple(notes))
 
 
 def _place(found: Mounting, stated: StatedLidar, usual: UsualLidar) -> tuple[Array, str]:

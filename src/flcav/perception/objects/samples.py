@@ -14,7 +14,7 @@ import numpy as np
 
 from flcav.arrays import Array, Array32, Mask
 from flcav.config import InputError
-from flcav.dataset.formats.rig import Rig, StatedLidar, UsualLidar, find_rig
+from flcav.dataset.formats.rig import LidarRig, StatedLidar, UsualLidar, find_rig
 from flcav.dataset.formats.sweeps import list_cloud_files, read_cloud_file
 from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
@@ -185,7 +185,7 @@ def describe_rig(mounts: Sequence[Array], here: KnownLidar, config: SecondConfig
     return f"unlike in the network's training the LiDAR {' and '.join(differences)}" if differences else ""
 
 
-def find_rigs(paths: Sequence[Path], config: SecondConfig, lidar: StatedLidar) -> dict[Path, Rig]:
+def find_rigs(paths: Sequence[Path], config: SecondConfig, lidar: StatedLidar) -> dict[Path, LidarRig]:
     """Return the LiDAR of point cloud files by their folder, given files and folders of them.
 
     It is the one that a network of `config` expects, unless the sweeps or `lidar` say otherwise. Raises `InputError` as
@@ -198,7 +198,7 @@ def find_rigs(paths: Sequence[Path], config: SecondConfig, lidar: StatedLidar) -
     return {folder: find_rig(sweeps, read_cloud_file, lidar, usual) for folder, sweeps in files.items()}
 
 
-def compare_files_rig(rig: Rig, lidar: StatedLidar, config: SecondConfig, trained: KnownLidar) -> str:
+def compare_files_rig(rig: LidarRig, lidar: StatedLidar, config: SecondConfig, trained: KnownLidar) -> str:
     """Return how the LiDAR of files by `find_rigs` differs from that of a network's training, in words; "" if not."""
     here = KnownLidar() if rig.beams is None else KnownLidar((rig.beams, rig.beams))
     stated = [] if lidar.height_m is None else [rig.agent_from_lidar]  # the notes tell a height that is found

@@ -21,7 +21,7 @@ from flcav.report.charts import figures
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps
-from flcav.runs.analysis.answer import answer_question, list_stage_means
+from flcav.runs.analysis.answer import list_stage_means, tell_answer
 from flcav.runs.analysis.caveats import PLACED_BARE
 from flcav.runs.analysis.costs import list_arm_costs, list_home_costs
 from flcav.runs.arms import Names
@@ -75,7 +75,7 @@ def page(run: Run) -> dict[str, Any]:
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "stages": list_stage_means(run),
-        "answer": answer_question(run),
+        "answer": tell_answer(run),
         "plans": main.plans,
         "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},

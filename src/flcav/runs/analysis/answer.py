@@ -29,7 +29,7 @@ class Answer:
     sentences: tuple[str, ...]
 
 
-def answer_question(run: Run) -> Answer | None:
+def tell_answer(run: Run) -> Answer | None:
     """Return the answer by the verdicts on edge FL against pretraining; None where a run has no such claim.
 
     A claim on the mean over regions counts in place of those of the regions. The price is a measure that fell in a town

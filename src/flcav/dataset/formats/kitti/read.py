@@ -43,7 +43,7 @@ from flcav.dataset.formats.reading import (
     name_some,
     unseen_views,
 )
-from flcav.dataset.formats.rig import RANGE_M, UNSTATED, Rig, StatedLidar, find_rig
+from flcav.dataset.formats.rig import RANGE_M, UNSTATED, LidarRig, StatedLidar, find_rig
 from flcav.geometry import Boxes, inverse
 from flcav.interface.wording import plural
 from flcav.sensors.frame import Calibration, LinkedFrame
@@ -129,7 +129,7 @@ class KittiSource(LogSource):
 IMPORT = ImportFormat(KittiSource, ("training/velodyne", "testing/velodyne", "velodyne/*.bin"), takes_lidar=True)
 
 
-def mount_sensors(calibrated: KittiCalibration, rig: Rig) -> Calibration:
+def mount_sensors(calibrated: KittiCalibration, rig: LidarRig) -> Calibration:
     """Return the mounts of LiDAR and camera on a vehicle with the LiDAR of `rig`."""
     agent_from_lidar = rig.agent_from_lidar
     projection = calibrated.image_from_camera
@@ -142,7 +142,7 @@ def mount_sensors(calibrated: KittiCalibration, rig: Rig) -> Calibration:
     )
 
 
-def _read_frame(shot: KittiShot, agent: str, calibration: Calibration, rig: Rig) -> LinkedFrame:
+def _read_frame(shot: KittiShot, agent: str, calibration: Calibration, rig: LidarRig) -> LinkedFrame:
     pictures = {CAMERA: path} if (path := _path(shot, CAMERA)).is_file() else {}
     files = {LIDAR: _path(shot, "velodyne"), **pictures}
     points, calibrated = read_points(files[LIDAR]), read_calibration(_path(shot, "calib"))

@@ -47,7 +47,7 @@ from flcav.dataset.formats.reading import (
     name_some,
     unseen_views,
 )
-from flcav.dataset.formats.rig import RANGE_M, UNSTATED, Rig, StatedLidar, find_rig
+from flcav.dataset.formats.rig import RANGE_M, UNSTATED, LidarRig, StatedLidar, find_rig
 from flcav.geometry import inverse
 from flcav.geometry.poses import rotations
 from flcav.interface.wording import plural
@@ -122,7 +122,7 @@ class _Labels:
 class _Sequence:
     """A sequence of the benchmark: its files, by the folder of its sweeps."""
 
-    rig: Rig
+    rig: LidarRig
 
     def __init__(self, velodyne: Path) -> None:
         self._part, self.name = velodyne.parents[1], velodyne.name
