@@ -74,7 +74,7 @@ def _lay(
 
     from flcav.config import InputError
     from flcav.optimization.graph import load_problem
-    from flcav.planner.desk import ONE_KIND, RANGE_M, Desk, lay_out_map, lay_out
+    from flcav.planner.desk import ONE_KIND, RANGE_M, Desk, lay_out, lay_out_map
     from flcav.planner.inputs import read_given, read_kinds, read_sites, read_world
     from flcav.planner.placing import Kinds
     from flcav.sources.recipe import find_recipe
