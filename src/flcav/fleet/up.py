@@ -210,9 +210,9 @@ class _Enrolment:
         self._next = time.monotonic() + (CHECK_S if self._seen >= 0 else 0.1)
         try:
             with contextlib.closing(open_registry(self._folder)) as registry:
-                if registry.count_changes() != self._seen:
+                if (changes := registry.count_changes()) != self._seen:
                     link.enrol(registry)
-                    self._seen = registry.count_changes()
+                    self._seen = changes  # not those since: a vehicle may register while others are enrolled
         except (
             *SuperLinkLost,
             InputError,

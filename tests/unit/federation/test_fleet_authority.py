@@ -10,6 +10,7 @@ import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
 
 from flcav.config import InputError
+from flcav.fleet import up
 from flcav.fleet.authority import REGISTRY, found_authority, open_authority, open_registry
 from flcav.fleet.keys import (
     AUTHORITY,
@@ -198,3 +199,20 @@ def test_ten_thousand_vehicles(authority):
     begun = time.process_time()
     assert len(registry.list_vehicles()) == 10_050
     assert time.process_time() - begun < 1.0
+
+
+def test_a_vehicle_that_registers_while_others_are_enrolled_is_enrolled_next(authority, vehicle, tmp_path, monkeypatch):
+    monkeypatch.setattr(up, "CHECK_S", 0.0)
+    enrolled = []
+
+    class Link:
+        def enrol(self, registry):
+            enrolled.append([each.name for each in registry.list_vehicles()])
+            if len(enrolled) == 1:
+                authority.register(request_certificate(tmp_path / "late", "cav-2"))
+
+    state = up._Enrolment(authority.folder)
+    for _ in range(4):
+        time.sleep(0.11)  # the pause after a first look
+        assert state.update(Link())
+    assert enrolled == [["cav-1"], ["cav-1", "cav-2"]]  # once for each change
