@@ -58,6 +58,7 @@ def port(tmp_path_factory):
     assert "Traceback" not in log.read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("session", SESSIONS)
 def test_the_genuine_client(session, port):
     pytest.importorskip("carla", reason="needs the extra 'carla'")

@@ -240,6 +240,7 @@ def test_spawn_points_are_as_many_as_carla_has_and_follow_the_road(maps, monkeyp
         assert len(np.unique(places.round(2), axis=0)) == wanted
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("town", ["suburb", "ring", "grid"])
 def test_the_longest_and_the_widest_vehicle_fit_at_all_spawn_points_at_once(town, maps):
     """Beside posts, buildings and the parked cars of a seed, which leave no room at some places."""

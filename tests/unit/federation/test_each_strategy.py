@@ -300,6 +300,7 @@ class Byzantine(Descent):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("lie", ["sign", "scaled", "labels"])
 def test_byzantine_clients_mislead_the_mean_and_not_the_robust_strategies(lie: str):
     rng, clients = np.random.default_rng(1), {}

@@ -114,6 +114,7 @@ def test_placements_within_limits_are_the_best_of_every_choice_exactly(seed: int
     assert len(drawn.check(placed, best, count=count)) == count
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("size")
 @pytest.mark.parametrize("seed", range(12))
 def test_shares_are_covered_at_the_least_cost_of_every_choice_exactly(seed: int) -> None:

@@ -54,6 +54,7 @@ def test_plans_of_vehicles_without_names_are_the_best_of_all(
     assert busy_s <= horizon_s * (1 + 1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("model", "objective"), [*itertools.product(("additive", "effective"), ("weighted", "max-min"))]
 )
@@ -77,6 +78,7 @@ def test_a_horizon_makes_caps_by_hand_needless() -> None:
     assert plan.busy_s == 42.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BASELINES)
 def test_baselines_keep_the_time_too(name: str) -> None:
     limits = {"samples": [20, 900], "edge_rounds": [0, 12], "cloud_rounds": [0, 8]}
@@ -134,6 +136,7 @@ def test_named_vehicles_come_near_the_best_of_all_plans(seed: int, linked: bool)
     assert max(busy_s.values()) <= (asked.horizon_s or 0) * (1 + 1e-6)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(6))
 def test_bounds_hold_for_fleets_that_train_one_task_fast_and_another_slowly(seed: int) -> None:
     rng = np.random.default_rng(seed)

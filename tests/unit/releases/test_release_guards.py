@@ -141,6 +141,7 @@ def renamed(boxes: Boxes) -> Boxes:
     return replace(boxes, label=np.where(boxes.label == "Cyclist", "Pedestrian", boxes.label))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "lost"),
     [

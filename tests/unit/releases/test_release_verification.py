@@ -161,6 +161,7 @@ def test_the_driving_network_itself_is_accepted():
     }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "lost"),
     [

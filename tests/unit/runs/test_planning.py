@@ -279,6 +279,7 @@ def plan_recipe(name: str, wireless: float = 1, wireline: float = 1, rule: PlanR
     return make_plan((request,), settings, rule)[0].tasks["objects"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["demo_road", "arms"])
 def test_doubling_up_to_a_recipe_s_budget_is_worth_more_than_trainings_differ_and_beyond_it_less(name: str) -> None:
     spreads = read_spreads("demo", Path())

@@ -100,6 +100,7 @@ class Killed(BaseException):
     pass
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("strategy", [FEDAVG, FedAdam(), Scaffold()], ids=["fedavg", "fedadam", "scaffold"])
 @pytest.mark.parametrize("stage", [edge, cloud])
 def test_a_federation_killed_at_any_write_ends_the_same(

@@ -41,6 +41,7 @@ def write(root: ElementTree.Element, path: Path) -> Path:
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["one,two", "one;two", "${HOME}", "\N{GREEK SMALL LETTER LAMDA} .x", "-x"])
 def test_names_of_folders_do_not_matter_to_netconvert(name: str, tmp_path: Path) -> None:
     plain, odd = tmp_path / "plain", tmp_path / name / "odd"
