@@ -150,7 +150,8 @@ class EmptyBoxes:
             if not len(cloud) or not np.isfinite(cloud).all() or not np.isfinite(world_from_lidar).all():
                 continue
             local = raised.transform(inverse(world_from_lidar))
-            away = np.minimum(away, np.linalg.norm(local.center, axis=1))
+            x, y, z = local.center.T
+            away = np.minimum(away, np.hypot(np.hypot(x, y), z))  # of implausible numbers, too
             level = _have_beams(local, cloud)
             beamed |= level
             near |= level & _are_in_view(local, cloud)

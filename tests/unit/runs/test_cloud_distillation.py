@@ -79,9 +79,9 @@ def test_the_networks_of_all_updates_teach_their_mean_on_the_cloud_s_samples() -
             np.testing.assert_array_equal(found[weight][name], array)
     own, *teachers = (each.eval() for each in (build_network(OBJECTS, CONFIG, 3), *networks))
     scores = [predict(each, [client.samples[0].points]).score for each in (own, *teachers)]
-    both, first = (float(ensemble_loss(scores[0], seen)) for seen in (scores[1:], scores[1:2]))
+    both, first = (ensemble_loss(scores[0], seen).item() for seen in (scores[1:], scores[1:2]))
     assert both != pytest.approx(first, rel=0.01)
-    taught, plain = (float(task.loss(own, client.samples)) for task in (TaughtObjects(teachers, 1e6), OBJECTS))
+    taught, plain = (task.loss(own, client.samples).item() for task in (TaughtObjects(teachers, 1e6), OBJECTS))
     assert (taught - plain) / 1e6 == pytest.approx(both, rel=1e-3)
     labels_alone = client.train(mean, **cast(Any, rates)).weights
     assert all(np.array_equal(found[0.0][name], array) for name, array in labels_alone.items())
