@@ -214,5 +214,5 @@ def test_a_vehicle_that_registers_while_others_are_enrolled_is_enrolled_next(aut
     state = up._Enrolment(authority.folder)
     for _ in range(4):
         time.sleep(0.11)  # the pause after a first look
-        assert state.update(Link())
+        assert state.update(cast(Any, Link()))
     assert enrolled == [["cav-1"], ["cav-1", "cav-2"]]  # once for each change
