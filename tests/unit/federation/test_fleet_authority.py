@@ -5,6 +5,7 @@ import sqlite3
 import stat
 import subprocess
 import time
+from typing import Any, cast
 
 import pytest
 from cryptography.hazmat.primitives.asymmetric import ec
