@@ -57,7 +57,11 @@ def test_the_wheel_holds_what_the_checkout_holds(installed: Path, tmp_path: Path
     where = "import flcav, flcav.reproductions.demo_arms.run; print(flcav.__file__)"
     assert Path(ran(installed, [sys.executable, "-c", where], tmp_path).strip()).parent == installed / "flcav"
     for folder, into in ((ROOT / "src" / "flcav", "."), (ROOT / "recipes", "recipes")):
-        files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+        files = (
+            path
+            for path in folder.rglob("*")
+            if path.is_file() and "__pycache__" not in path.parts and BUNDLED not in path.parents
+        )
         missing = [str(path) for path in files if not (installed / "flcav" / into / path.relative_to(folder)).exists()]
         assert not missing
 
