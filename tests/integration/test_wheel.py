@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
+BUNDLED = ROOT / "src" / "flcav" / "planner" / "web"  # sources of planner/assets, which the wheel has
 SMALL = """
 size: toy
 tasks: {objects: {network: tiny, history: objects}}
