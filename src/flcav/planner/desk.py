@@ -1,4 +1,4 @@
-"""What a planner works on: towns with their errors, an allocation problem, a finished run."""
+"""The desk of a planner: towns with their errors, an allocation problem, a finished run."""
 
 import tempfile
 import threading

@@ -61,7 +61,7 @@ class Kinds:
 
 @dataclass(frozen=True)
 class Question:
-    """What a placement is sought for: kinds of sensors, own sites beside the poles, and the errors that count."""
+    """The question that a placement answers: kinds of sensors, own sites beside the poles, the errors that count."""
 
     kinds: Kinds
     own: tuple[tuple[float, float], ...] = ()  # x, y [m] of sites of one's own, after the poles

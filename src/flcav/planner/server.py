@@ -102,7 +102,7 @@ class AskedBest(AskedPlacement):
 
 
 class AskedNew(AskedPlacement):
-    """Where a new pole pays most."""
+    """A request for the places where a new pole sees most."""
 
     kind: int = Field(ge=0)
     uncovered: list[Annotated[int, Field(ge=0)]] = Field(max_length=1_000_000)
