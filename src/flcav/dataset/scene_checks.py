@@ -30,11 +30,8 @@ NEAR_SIZES = 10.0  # the same for smaller boxes, in lengths of their longest sid
 LIFT_M = 0.2  # height of a box's lower part, whose points may be the ground's [m]
 HIDDEN = 0.5  # occlusion above which a box may be empty
 LOW_M, CLEAR_M = 0.5, 3.0  # height above the ground, and distance from the vehicle, of points that are compared
-SHARED_M, CELL_M, SHIFT_M = (
-    30.0,
-    0.5,
-    8.0,
-)  # half of the square that two vehicles share, its cells, largest shift looked for
+SHARED_M, CELL_M = 30.0, 0.5  # half of the square that two vehicles share, and its cells
+SHIFT_M = 8.0  # largest shift that is looked for
 FEWEST_POINTS, FEWEST_CELLS = 200, 30  # of a vehicle in the square, and that coincide
 APART_M, CONTRADICT, MOST_PAIRS = 2.0, 0.2, 50  # shift that is a contradiction, share of such; pairs compared
 SECTOR_DEG = 2.0  # width of the azimuth sectors for which a LiDAR's range is determined
