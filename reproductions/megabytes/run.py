@@ -49,6 +49,7 @@ FLOAT32, INT8, INT4, TOP_K = (f"edge FL in {form}" for form in ("float32", "int8
 REMEDIES: Mapping[str, str] = {  # against the drift of more local steps, by name: arm
     f"{INT8}{MORE}, server momentum": "momentum",
     f"{INT8}{MORE}, decaying rate": "decaying",
+    f"{INT8}{MORE}, proximal term": "proximal",
 }
 FEDERATED: Mapping[str, str] = {  # name: arm
     FLOAT32: MAIN,
