@@ -106,6 +106,9 @@ def test_a_forecast_is_what_the_run_then_plans(
         assert found.uplink_mb[link] == pytest.approx(use.planned_mb, rel=0.05)
         assert found.uplink_mb[link] == pytest.approx(use.used_mb, rel=0.05)
     assert 0 < told.minutes < 20
+    work = three_tasks[0] / "work"
+    recorded = [path for data in work.glob("*/data") for path in data.rglob("*") if path.is_file()]
+    assert 0.3 < told.disk_mb / (sum(path.stat().st_size for path in recorded) / 1e6) < 3
     assert any("MB wireless" in line for line in told.lines())
 
 

@@ -5,6 +5,7 @@ times. Plans are made as the run makes its first ones; what only a run can measu
 average's labels, new plans after a stage) is left out.
 """
 
+import resource
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
@@ -33,6 +34,7 @@ from flcav.runs.registry import FORECASTS, load_all
 from flcav.runs.results.training import PrivacySpent
 from flcav.runs.stages.graph import Graph
 from flcav.runs.stages.planning import FirstPlanSettings, frame_plan
+from flcav.runs.stages.recording import record_step
 from flcav.runs.tables import parse_history
 from flcav.runs.training.learning import make_clients
 from flcav.runs.training.private_rounds import (
@@ -76,14 +78,18 @@ class Forecast(Record):
     """Forecast of a run."""
 
     minutes: float  # computing time of one core [min]
+    memory_mb: float  # most memory of a process, with one sample of each task in a step [MB]
+    disk_mb: float  # recordings of vehicles at most [MB]
     arms: Mapping[str, ArmForecast]
     scenes: int  # test scenes of a region
     effect: float  # smallest difference of AP50 or accuracy, in [0, 1], that these tests detect in one training
 
     def lines(self) -> list[str]:
         """Return the forecast as lines of text."""
+        took = f"{self.minutes:.1f} minutes" if self.minutes < 100 else f"{self.minutes / 60:.1f} hours"
         lines = [
-            f"about {self.minutes:.1f} minutes of one core, by one scene and {STEPS} steps of each task just timed"
+            f"about {took} of one core, by one scene and {STEPS} steps of each task just timed",
+            f"at most {self.disk_mb / 1e3:.1f} GB of recordings, and {self.memory_mb / 1e3:.1f} GB of memory a process",
         ]
         for name, arm in self.arms.items():
             for task, planned in arm.tasks.items():
@@ -116,6 +122,7 @@ class _Measured:
     exchange_mb: float | None  # what a vehicle sends to be combined in a round [MB]; None: a model update
     pool: int  # candidates for upload
     frame_s: float  # time to record a frame [s]
+    frame_mb: float  # a recorded frame on disk [MB]
     step_s: float  # time of a training step [s]
     test_s: float  # time to test a frame [s]
 
@@ -134,7 +141,9 @@ def forecast_run(
     arms = {name: _forecast_arm(graph, arm, plans, measured) for name, arm in graph.settings.items() if not arm.repeat}
     scenes = recipe.sized_splits.test.scenes
     minutes = sum(_list_seconds(graph, plans, measured)) / 60
-    return Forecast(minutes, arms, scenes, DETECTABLE * SCENE_SD / float(np.sqrt(scenes)))
+    disk_mb = sum(frames * measured[task].frame_mb for (_, task), frames in _count_frames(graph).items())
+    memory_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1000
+    return Forecast(minutes, memory_mb, disk_mb, arms, scenes, DETECTABLE * SCENE_SD / float(np.sqrt(scenes)))
 
 
 def _measure(graph: Graph, task: str) -> _Measured:
@@ -142,6 +151,9 @@ def _measure(graph: Graph, task: str) -> _Measured:
     learning = graph.learning(graph.settings[MAIN], task).resolve()
     with tempfile.TemporaryDirectory() as folder:
         split, pool, frame_s = _record_scene(graph, task, Path(folder))
+        frame_mb = (
+            sum(path.stat().st_size for path in Path(folder).rglob("*") if path.is_file()) / 1e6 / len(split.data)
+        )
         packed = [*as_shared(learning.task).pack_samples(split.data, learning.config, split.vehicles)]
         compressed = learning.task.compress_samples(packed) if isinstance(learning.task, Compresses) else packed
         sample_mb, compressed_mb = (
@@ -161,7 +173,7 @@ def _measure(graph: Graph, task: str) -> _Measured:
         frames = split.vehicles
         score_network(learning.task, network, split.data, frames)
         test_s = (time.process_time() - trained) / len(frames)
-    return _Measured(sample_mb, compressed_mb, exchange_mb, pool, frame_s, (trained - began) / STEPS, test_s)
+    return _Measured(sample_mb, compressed_mb, exchange_mb, pool, frame_s, frame_mb, (trained - began) / STEPS, test_s)
 
 
 def _record_scene(graph: Graph, task: str, folder: Path) -> tuple[Frames, int, float]:
@@ -264,6 +276,19 @@ def _forecast_arm(
     return ArmForecast(plans[arm.name], dict(zip(("wireless", "wireline"), uplink_mb.tolist())), spent)
 
 
+def _count_frames(graph: Graph) -> dict[tuple[str, str], int]:
+    """Return the most frames that vehicles record, by step and task, windows for labels included."""
+    recorded = {step.name: step.arguments["settings"].recipe for step in graph.steps if step.run is record_step}
+    named = {
+        (graph.names.recording(region, split, task), task)
+        for region, place in graph.recipe.regions.items()
+        for split in SPLITS_OF[place.role]
+        for task in graph.recipe.tasks
+    }
+    count = {name: recipe.scenes * recipe.spins * recipe.cavs for name, recipe in recorded.items()}
+    return {(name, task): count[name] for name, task in sorted(named) if name in recorded}
+
+
 def _list_seconds(
     graph: Graph, plans: Mapping[str, Mapping[str, PlannedRounds]], measured: Mapping[str, _Measured]
 ) -> Iterator[float]:
@@ -277,12 +302,9 @@ def _list_seconds(
         counted.add(step)
         return seconds if new else 0.0
 
+    for (recording, task), frames in _count_frames(graph).items():
+        yield once(recording, frames * measured[task].frame_s)
     for task, times in measured.items():
-        for region, place in recipe.regions.items():
-            for split in SPLITS_OF[place.role]:
-                sizes = getattr(size, split)
-                frames = sizes.scenes * sizes.spins * (graph.vehicles[region] if split == EDGE else sizes.cavs)
-                yield once(names.recording(region, split, task), 0.0 if place.data else frames * times.frame_s)
         for arm in graph.settings.values():
             plan, training = plans[arm.name][task], arm.training[task]
             yield once(names.pretrain(arm.name, task), training.steps * times.step_s)
