@@ -33,6 +33,16 @@ def test_defaults_are_those_of_the_article() -> None:
     )
 
 
+def test_the_recipe_of_the_article_has_its_sizes() -> None:
+    recipe = load_run_recipe(RUNS / "article.yaml")
+    sizes = recipe.sized_splits
+    assert sizes.pool.scenes * sizes.pool.spins * sizes.pool.cavs == 5000
+    assert sizes.edge.scenes * sizes.edge.spins == 500  # of each vehicle
+    assert [recipe.vehicles(region) for region in ("Town05", "Town03")] == [4, 3]
+    assert sizes.test.scenes * sizes.test.spins * sizes.test.cavs == 2432
+    assert (recipe.budgets_mb.wireless, recipe.budgets_mb.wireline) == (4000, 4000)
+
+
 @pytest.mark.parametrize("path", sorted(RUNS.glob("*.yaml")), ids=lambda path: path.stem)
 def test_committed_recipes_are_read(path: Path) -> None:
     recipe = load_run_recipe(path)
