@@ -69,11 +69,20 @@ def match_at_each(
     ]
     wanted = np.array([len(boxes) for boxes in targets], dtype=np.int64)
     for kind, least in overlaps:
-        parts = [_match_frame(one, on, ious[kind], least, aside) for one, on, ious, aside in pairs]
-        frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _ in parts])
-        score, turned = (np.concatenate(column) for column in zip(*parts)) if parts else (np.zeros(0), np.zeros(0))
-        order = np.argsort(-score, kind="stable")
-        yield Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], wanted)
+        yield join_frames([_match_frame(one, on, ious[kind], least, aside) for one, on, ious, aside in pairs], wanted)
+
+
+def join_frames(frames: Sequence[tuple[Array, Array]], targets: Ints) -> Matches:
+    """Return the matches of F frames by falling score.
+
+    Args:
+        frames: scores (D,) and heading errors (D,) [rad] of each frame's detections; NaN for a false positive.
+        targets: (F,) number of targets in each frame.
+    """
+    frame = np.repeat(np.arange(len(frames)), [len(scores) for scores, _ in frames])
+    score, turned = (np.concatenate(column) for column in zip(*frames)) if frames else (np.zeros(0), np.zeros(0))
+    order = np.argsort(-score, kind="stable")
+    return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], targets)
 
 
 def assign_targets(detections: Boxes, targets: Boxes, overlap: float, kind: Kind = "3d") -> Ints:

@@ -21,7 +21,7 @@ from scipy.special import stdtrit
 from flcav.geometry import Boxes, wrap_angle
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import Matches, weighted_precision
-from flcav.perception.metrics.detection import lies_on, match_greedily, on_neutral
+from flcav.perception.metrics.detection import join_frames, lies_on, match_greedily, on_neutral
 from flcav.perception.metrics.operating_point import DISTANCES_M
 from flcav.perception.objects.evaluate import BORDER_M, OCCLUSIONS
 from flcav.perception.objects.truth import FrameTruth, select_class
@@ -77,12 +77,8 @@ def match_overlaps(
         _match_frame(each, least, None if wanted is None else wanted[number], None if kept is None else kept[number])
         for number, each in enumerate(overlaps)
     ]
-    frame = np.repeat(np.arange(len(parts)), [len(scores) for scores, _, _ in parts])
-    score = np.concatenate([scores for scores, _, _ in parts]) if parts else np.zeros(0)
-    turned = np.concatenate([turned for _, turned, _ in parts]) if parts else np.zeros(0)
-    order = np.argsort(-score, kind="stable")
     targets = np.array([count for _, _, count in parts], dtype=np.int64)
-    return Matches(score[order], ~np.isnan(turned[order]), turned[order], frame[order], targets)
+    return join_frames([(score, turned) for score, turned, _ in parts], targets)
 
 
 def match_detections(each: Overlaps, least: float, inside: Mask, rows: NDArray[np.intp]) -> NDArray[np.int64]:
