@@ -6,7 +6,8 @@ from matplotlib.figure import Figure
 
 from flcav.report import style
 from flcav.report.charts import runs
-from flcav.report.pictures import clouds, maps
+from flcav.report.pictures import clouds, maps, perspective
+from flcav.report.pictures.changes import ErrorChanges, draw_changed, list_key
 from flcav.runs.results.run import ArmCost
 from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
@@ -15,7 +16,6 @@ from flcav.storage.records import select
 WIDTH = 3.8  # of a figure on a phone [inch]
 TALLEST = 2.0  # greatest height of a map, in widths; a higher map is drawn narrower
 ACROSS = 2  # entries of a map's legend per line
-EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
 @style.styled
@@ -35,18 +35,6 @@ def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
     maps.draw_coordinates(axes, scene.town)
     axes.set_title(scene.title, fontweight="bold")
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=ACROSS)
-    return figure
-
-
-@style.styled
-def before_after(sweep: clouds.ComparedSweep, extent: clouds.Extent = EXTENT) -> Figure:
-    """Return a sweep with the detections of a network before training, and below it with those after training."""
-    figure = style.canvas(WIDTH, 2 * WIDTH)
-    for axes, detections in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
-        clouds.draw_detections(axes, sweep, detections, extent)
-        axes.set_title(detections.title, fontweight="bold", pad=20)
-        style.key(axes, clouds.key(detections), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
-        axes.set(xlabel="metres to the right", ylabel="metres ahead")
     return figure
 
 
@@ -125,25 +113,18 @@ def by_costs(costs: Mapping[str, Mapping[str, Sequence[tuple[float, Estimate]]]]
 
 
 @style.styled
-def overview(
-    scene: maps.ErrorMap, sweep: clouds.ComparedSweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
-) -> Figure:
-    """Return the overview of a run: map of errors, a sweep before and after, a measure by round and by stage."""
-    figure = style.canvas(9.6, 4.4)
-    grid = figure.add_gridspec(1, 3, width_ratios=(4.1, 2.1, 3.4))
+def overview(changes: ErrorChanges, sweep: clouds.ComparedSweep, tested: Sequence[Row], measure: str) -> Figure:
+    """Return the overview of a run: what became of the errors in a town, a sweep before and after, and the measure."""
+    figure = style.canvas(12.8, 5.2)
+    grid = figure.add_gridspec(1, 3, width_ratios=(4.4, 5.0, 3.0))
     left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))
     axes = left.add_subplot()
-    maps.draw_errors(axes, scene)
-    axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
-    style.key(left, axes.get_legend_handles_labels()[0], ncols=ACROSS)
+    draw_changed(axes, changes)
+    axes.set_title(f"{changes.town.name}: errors before and after edge FL", fontweight="bold")
+    style.key(left, list_key(changes), ncols=3)
     for axes, detections in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
-        clouds.draw_detections(axes, sweep, detections, EXTENT)
-        axes.set_title(detections.title, fontweight="bold")
-        axes.set(xticks=[], yticks=[0, 20, 40])
-    middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
-    style.key(middle, clouds.key(), columnspacing=0.8)
-    above, below = right.subplots(2, height_ratios=(3, 2))
-    runs.draw_by_round(above, rounds, measure)
-    above.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
-    runs.draw_tested(below, tested, measure)
+        perspective.draw_sweep(axes, sweep, detections)
+    axes = right.add_subplot()
+    runs.draw_tested(axes, tested, measure)
+    axes.set_title(f"{measure} with 95 % intervals", fontweight="bold")
     return figure
