@@ -168,8 +168,12 @@ def test_findings_say_what_their_intervals_say(result: Run) -> None:
 
 def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:
     text = (finished / "report.html").read_text()
-    assert all(link.startswith("data:") for link in re.findall(r"""(?:src|href)\s*=\s*["']?([^"'\s>]+)""", text))
-    assert not re.search(r"url\(|@import|<script|<link|<iframe", text)
+    assert all(
+        link.startswith(("data:", "#")) for link in re.findall(r"""(?:src|xlink:href)\s*=\s*["']?([^"'\s>]+)""", text)
+    )
+    files = re.findall(r' href="([^"#]+)"', text)
+    assert all((finished / file).exists() for file in files)  # of the run's folder: results, pictures
+    assert not re.search(r"url\((?!#)|@import|<script|<link|<iframe", text)
     read = html.unescape(re.sub(r"\s+", " ", text))
     assert all(finding.sentence in read for finding in result.findings)
     names = {path.stem for path in (finished / "pictures").iterdir()}

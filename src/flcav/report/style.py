@@ -124,7 +124,7 @@ VARIABLES = {  # colours of figures by the page's variable that takes their plac
 def svg(figure: Figure) -> str:
     """Return the figure as an SVG element in the colours and fonts of its page; equal figures give equal text."""
     buffer = io.StringIO()
-    with matplotlib.rc_context({"svg.fonttype": "none"}):
+    with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "flcav"}):
         figure.savefig(buffer, format="svg", dpi=150, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
     text = buffer.getvalue()
     text = text[text.index("<svg") :]

@@ -12,6 +12,8 @@ from matplotlib.text import Text
 
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.report.pictures import perspective
+from flcav.report.pictures.changes import GONE, NEW, REMAINING, draw_changes
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.world.geodesy import find_on_ground
@@ -28,11 +30,12 @@ ARMS = {
 
 DRAWN: dict[str, Callable[[], Figure]] = {
     "town_map": lambda: figures.town_map(made_up_run.error_map()),
-    "before_after": lambda: figures.before_after(made_up_run.sweep()),
+    "changes": lambda: draw_changes(made_up_run.changes()),
+    "before_after": lambda: perspective.before_after(made_up_run.sweep()),
     "by_round": lambda: figures.by_round(ROUNDS, TESTED, "AP50"),
     "megabytes": lambda: figures.megabytes(SENT, BUDGETS),
     "arms": lambda: figures.arms(ARMS),
-    "overview": lambda: figures.overview(made_up_run.error_map(), made_up_run.sweep(), ROUNDS, TESTED, "AP50"),
+    "overview": lambda: figures.overview(made_up_run.changes(), made_up_run.sweep(), TESTED, "AP50"),
 }
 
 
@@ -161,22 +164,45 @@ def test_zones_stand_on_the_map_with_their_density() -> None:
 
 
 def test_sweeps_count_what_was_found_missed_and_false() -> None:
-    before, after = figures.before_after(made_up_run.sweep()).axes
-    counts = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in (before, after)]  # type: ignore
-    assert counts == [["2 found", "3 missed", "1 false"], ["4 found", "1 missed", "0 false"]]
+    before, after = perspective.before_after(made_up_run.sweep()).axes
+    told = [axes.texts[0].get_text() for axes in (before, after)]
+    assert told == ["Pretrained: 2 of 5 found, 1 false", "Edge + cloud FL: 4 of 5 found, 0 false"]
 
 
-def test_ahead_is_up_and_left_is_left() -> None:
-    sweep = made_up_run.sweep()
-    axes = figures.before_after(sweep).axes[0]
-    centres = [
-        np.asarray(path.vertices)[:4].mean(axis=0)
-        for boxes in axes.collections
-        for path in boxes.get_paths()
-        if len(np.asarray(path.vertices)) == 5
-    ]
-    for x, y, _ in sweep.targets.center:
-        assert np.isclose(centres, (-y, x)).all(axis=1).any()
+def test_a_sweep_is_seen_from_behind_and_above() -> None:
+    ground_m = -1.7
+    eye = np.array([[perspective.EYE[0], 0.0, ground_m + perspective.EYE[1]]])
+    along = np.array([[np.cos(perspective.DOWN), 0.0, -np.sin(perspective.DOWN)]])  # the axis of view
+    at, depth = perspective.project(eye + 20 * along + [[0, 0, 0], [0, 2, 0]], ground_m)
+    np.testing.assert_allclose(depth, 20)
+    np.testing.assert_allclose(at, [[0, 0], [-0.1, 0]], atol=1e-12)  # 2 m to the left at 20 m
+    near, far = perspective.project(np.array([[10.0, 0, ground_m], [40.0, 0, ground_m]]), ground_m)[0]
+    assert near[1] < far[1]
+
+
+def test_the_map_of_changes_counts_what_is_gone_left_and_new_and_draws_no_disc() -> None:
+    changes = made_up_run.changes()
+    figure = draw_changes(changes)
+    axes = figure.axes[0]
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words[:3] == [f"{changes.gone} gone", f"{len(changes.errors) - changes.gone} left", "2 new"]
+    assert not [patch for patch in axes.patches if isinstance(patch, Circle)]
+    by_colour: dict[str, int] = {}
+    for line in axes.get_lines():
+        by_colour[line.get_color()] = by_colour.get(line.get_color(), 0) + len(np.asarray(line.get_xdata()))
+    assert by_colour[GONE] == changes.gone
+    assert by_colour[REMAINING] == len(changes.errors) - changes.gone
+    assert by_colour[NEW] == 2
+
+
+def test_a_drawing_of_a_page_takes_its_colours_and_fonts() -> None:
+    drawn = style.svg(draw_changes(made_up_run.changes()))
+    assert drawn.startswith("<svg")
+    assert f"{made_up_run.changes().gone} gone</text>" in drawn
+    assert "var(--house)" in drawn
+    assert not any(colour in drawn for colour in style.VARIABLES)
+    assert "font-family" not in drawn
+    assert drawn == style.svg(draw_changes(made_up_run.changes()))
 
 
 def test_validation_and_test_frames_stand_on_axes_of_their_own() -> None:

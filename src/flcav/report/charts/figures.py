@@ -125,6 +125,6 @@ def overview(changes: ErrorChanges, sweep: clouds.ComparedSweep, tested: Sequenc
     for axes, detections in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
         perspective.draw_sweep(axes, sweep, detections)
     axes = right.add_subplot()
-    runs.draw_tested(axes, tested, measure)
+    runs.draw_tested(axes, tested, measure, runs.LINE)
     axes.set_title(f"{measure} with 95 % intervals", fontweight="bold")
     return figure

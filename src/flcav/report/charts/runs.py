@@ -39,10 +39,10 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
     axes.grid(axis="y")
 
 
-def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
+def draw_tested(axes: Axes, tested: Sequence[Row], measure: str, name_height: float = TALL) -> None:
     """Draw the measure on test frames with its interval after every stage, a colour per town.
 
-    `tested` are rows of `tabulate`, one per stage and region.
+    `tested` are rows of `tabulate`, one per stage and region; `name_height`: of a name, in axes.
     """
     stages = [stage for stage in STAGES if select(tested, stage=stage)]
     towns = list(dict.fromkeys(row.region for row in tested))
@@ -58,7 +58,7 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
         ends[town] = points[-1]
     axes.set(xlim=(0, max(len(stages), 1) + 0.12), xlabel="test frames", ylabel=measure)
     axes.set_ylim(0, None)
-    _name_ends(axes, ends, colours, TALL)
+    _name_ends(axes, ends, colours, name_height)
     axes.set_xticks([place + 0.5 for place in range(len(stages))], [STAGES[stage] for stage in stages])
     axes.grid(axis="y")
 

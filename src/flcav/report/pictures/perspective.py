@@ -23,7 +23,7 @@ FOUND, MISSED, FALSE = "#4cc3ff", "#ffb020", "#ff5a3c"
 EYE = (-9.0, 8.5)  # position of the camera: behind the sensor and above the ground [m]
 DOWN = np.radians(17.0)  # its angle below the horizon
 REACH_M, ASIDE_M, NEAR_M = 62.0, 30.0, 1.0
-WINDOW = (-0.62, 0.62, -0.40, 0.13)  # shown: tangents of the angles to the right and up from the axis of view
+WINDOW = (-0.9, 0.9, -0.28, 0.30)  # shown: tangents of the angles to the right and up from the axis of view
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
@@ -45,9 +45,9 @@ def before_after(sweep: ComparedSweep, width_in: float = 4.4) -> Figure:
     panels = figure.subplots(2, gridspec_kw={"left": 0, "right": 1, "bottom": 0, "top": 1, "hspace": 0.02})
     for axes, detections in zip(panels, (sweep.before, sweep.after), strict=True):
         draw_sweep(axes, sweep, detections)
-    panels[0].legend(
+    panels[1].legend(
         handles=[Line2D([], [], color=colour, linewidth=2, linestyle=dash, label=label) for label, colour, dash in KEY],
-        loc="upper right", frameon=False, labelcolor=TEXT, ncols=3, handlelength=1.3, columnspacing=1.2,
+        loc="lower center", frameon=False, labelcolor=TEXT, ncols=3, handlelength=1.3, columnspacing=1.2,
     )  # fmt: skip
     return figure
 
