@@ -189,7 +189,8 @@ def test_the_map_of_changes_counts_what_is_gone_left_and_new_and_draws_no_disc()
     assert not [patch for patch in axes.patches if isinstance(patch, Circle)]
     by_colour: dict[str, int] = {}
     for line in axes.get_lines():
-        by_colour[line.get_color()] = by_colour.get(line.get_color(), 0) + len(np.asarray(line.get_xdata()))
+        colour = str(line.get_color())
+        by_colour[colour] = by_colour.get(colour, 0) + len(np.asarray(line.get_xdata()))
     assert by_colour[GONE] == changes.gone
     assert by_colour[REMAINING] == len(changes.errors) - changes.gone
     assert by_colour[NEW] == 2

@@ -19,7 +19,7 @@ from flcav.statistics.estimates import Estimate
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
 PIXEL = b"\x89PNG made up"
 PICTURES: dict[str, bytes] = {"before_after": PIXEL}
-DRAWINGS = dict.fromkeys(("rounds_objects", "megabytes"), "<svg><g></g></svg>")
+DRAWINGS: dict[str, str] = dict.fromkeys(("rounds_objects", "megabytes"), "<svg><g></g></svg>")
 
 
 def results() -> dict[str, Any]:

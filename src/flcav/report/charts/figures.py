@@ -60,12 +60,13 @@ def megabytes(rows: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
 
 
 @style.styled
-def gains(costs: Sequence[ArmCost]) -> Figure:
-    """Return the measures of arms against their uplink [MB], a panel per task."""
+def gains(costs: Sequence[ArmCost], between: Mapping[tuple[str, str], tuple[float, Estimate]] | None = None) -> Figure:
+    """Return the measures of arms against their uplink [MB], a panel per task; `between`: by arm and task."""
     tasks = dict.fromkeys(cost.task for cost in costs)
     figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(tasks))
     for axes, task in zip(figure.subplots(len(tasks), squeeze=False)[:, 0], tasks, strict=True):
-        runs.draw_gains(axes, select(costs, task=task))
+        of_task = {arm: point for (arm, at), point in (between or {}).items() if at == task}
+        runs.draw_gains(axes, select(costs, task=task), of_task)
         axes.set_title(task, fontweight="bold")
     figure.axes[-1].set_xlabel("uplink of stages II and III [MB]")
     return figure
@@ -124,6 +125,7 @@ def overview(changes: ErrorChanges, sweep: clouds.ComparedSweep, tested: Sequenc
     style.key(left, list_key(changes), ncols=3)
     for axes, detections in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
         perspective.draw_sweep(axes, sweep, detections)
+    style.key(middle.axes[1], perspective.list_key(), loc="lower center", labelcolor=perspective.TEXT)
     axes = right.add_subplot()
     runs.draw_tested(axes, tested, measure, runs.LINE)
     axes.set_title(f"{measure} with 95 % intervals", fontweight="bold")

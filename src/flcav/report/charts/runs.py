@@ -156,8 +156,11 @@ def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]
     axes.set(xlabel="uplink megabytes (1 MB = 10⁶ bytes)", ylim=(len(budgets) - 0.6, -0.65))
 
 
-def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
-    """Draw the measure of each arm of a task against its uplink [MB], with a line from pretraining."""
+def draw_gains(axes: Axes, costs: Sequence[ArmCost], between: Mapping[str, tuple[float, Estimate]]) -> None:
+    """Draw the measure of each arm of a task against its uplink [MB], with a line from pretraining.
+
+    `between`: uplink and measure of arms after edge FL, where cloud FL follows.
+    """
     palette = cycle((style.BLUE, *style.OTHER_COLOURS, style.VERMILLION))
     colours = dict(zip((cost.arm for cost in costs), palette, strict=False))
     most = max(cost.uplink_mb for cost in costs)
@@ -166,7 +169,12 @@ def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
         colour = colours[cost.arm]
         near = [x for x in at.values() if abs(x - cost.uplink_mb) < most / 50]
         at[cost.arm] = x = cost.uplink_mb + len(near) * most / 60
-        axes.plot([0, x], [cost.before, cost.after.mean], color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
+        path = [(0.0, cost.before), (x, cost.after.mean)]
+        if cost.arm in between:
+            middle, reached = between[cost.arm]
+            path.insert(1, (middle, reached.mean))
+            _draw_interval(axes, middle, reached, colour)
+        axes.plot(*zip(*path, strict=True), color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
         axes.plot(0, cost.before, "o", color=colour, markerfacecolor="white", markersize=6, clip_on=False)
         _draw_interval(axes, x, cost.after, colour)
     low, top = axes.get_ylim()

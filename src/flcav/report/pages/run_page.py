@@ -25,7 +25,7 @@ from flcav.report.pictures.changes import ErrorChanges, draw_changes, look_from_
 from flcav.runs.analysis.answer import list_stage_means, tell_answer
 from flcav.runs.analysis.caveats import PLACED_BARE
 from flcav.runs.analysis.claims import ClaimRow, list_claims
-from flcav.runs.analysis.costs import list_arm_costs, list_home_costs
+from flcav.runs.analysis.costs import list_arm_costs, list_edge_points, list_home_costs
 from flcav.runs.analysis.tiles import list_tiles
 from flcav.runs.driving import CLOCK
 from flcav.runs.frames import Frames
@@ -158,7 +158,7 @@ def draw(run: Run, work: Path, seen: Seen) -> dict[str, Figure]:
     drawn["megabytes"] = figures.megabytes(select(rows, arm=MAIN), budgets)
     costs = _list_costs(run)
     if any(cost.uplink_mb for cost in costs):
-        drawn["gain"] = figures.gains(costs)
+        drawn["gain"] = figures.gains(costs, list_edge_points(run))
     if seen.sweep is not None:
         sweep = _read_sweep(work, run, seen.sweep)
         drawn[SWEEP] = perspective.before_after(sweep)

@@ -1,6 +1,7 @@
 """Map of what became of a network's errors in a town: gone, remaining and new, with what its roadside sensors see."""
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -92,7 +93,8 @@ def _plot(axes: Axes, at: Array, kind: NDArray[np.str_], colour: str, size: floa
     known = {"miss": "o", FALSE: "x"}
     for name in dict.fromkeys(kind.tolist()):
         marker = known.get(name, "^")
-        edge = {"markeredgewidth": 1.6} if marker == "x" else {"markeredgecolor": "white", "markeredgewidth": 0.5}
+        edge: dict[str, Any] = {"markeredgewidth": 1.6}
+        edge = edge if marker == "x" else {"markeredgecolor": "white", "markeredgewidth": 0.5}
         here = at[kind == name, :2]
         axes.plot(*here.T, marker, linestyle="none", markersize=size, color=colour, zorder=6, **edge)
 

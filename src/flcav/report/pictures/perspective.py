@@ -3,6 +3,8 @@
 The picture is a pinhole projection. A point is seen at (f x / z, f y / z), with z the distance along the axis of view.
 """
 
+from typing import Any
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -24,6 +26,7 @@ EYE = (-9.0, 8.5)  # position of the camera: behind the sensor and above the gro
 DOWN = np.radians(17.0)  # its angle below the horizon
 REACH_M, ASIDE_M, NEAR_M = 62.0, 30.0, 1.0
 WINDOW = (-0.9, 0.9, -0.28, 0.30)  # shown: tangents of the angles to the right and up from the axis of view
+DASHES = (0, (2.5, 1.5))  # of false boxes
 EDGES = ((0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4), (0, 4), (1, 5), (2, 6), (3, 7))
 
 
@@ -45,14 +48,17 @@ def before_after(sweep: ComparedSweep, width_in: float = 4.4) -> Figure:
     panels = figure.subplots(2, gridspec_kw={"left": 0, "right": 1, "bottom": 0, "top": 1, "hspace": 0.02})
     for axes, detections in zip(panels, (sweep.before, sweep.after), strict=True):
         draw_sweep(axes, sweep, detections)
-    panels[1].legend(
-        handles=[Line2D([], [], color=colour, linewidth=2, linestyle=dash, label=label) for label, colour, dash in KEY],
-        loc="lower center", frameon=False, labelcolor=TEXT, ncols=3, handlelength=1.3, columnspacing=1.2,
-    )  # fmt: skip
+    style.key(panels[1], list_key(), loc="lower center", labelcolor=TEXT)
     return figure
 
 
-KEY = (("found", FOUND, "-"), ("missed", MISSED, "-"), ("false", FALSE, (0, (2.5, 1.5))))
+def list_key() -> list[Line2D]:
+    """Return the legend of the boxes."""
+    return [
+        Line2D([], [], color=FOUND, linewidth=2, label="found"),
+        Line2D([], [], color=MISSED, linewidth=2, label="missed"),
+        Line2D([], [], color=FALSE, linewidth=2, linestyle=DASHES, label="false"),
+    ]
 
 
 def draw_sweep(axes: Axes, sweep: ComparedSweep, found: MatchedDetections) -> None:
@@ -63,7 +69,7 @@ def draw_sweep(axes: Axes, sweep: ComparedSweep, found: MatchedDetections) -> No
     _draw_returns(axes, sweep.points, sweep.ground_m)
     _draw_boxes(axes, sweep.targets[~found.found], sweep.ground_m, MISSED, 1.8)
     _draw_boxes(axes, found.boxes[found.hit], sweep.ground_m, FOUND, 1.5)
-    _draw_boxes(axes, found.boxes[~found.hit], sweep.ground_m, FALSE, 1.5, KEY[2][2])
+    _draw_boxes(axes, found.boxes[~found.hit], sweep.ground_m, FALSE, 1.5, DASHES)
     text = f"{found.title}: {found.found.sum()} of {len(found.found)} found, {count_false(found.hit)} false"
     axes.text(0.015, 0.955, text, transform=axes.transAxes, color=TEXT, va="top", fontweight="bold")
 
@@ -83,7 +89,7 @@ def _draw_returns(axes: Axes, points: NDArray[np.float32], ground_m: float) -> N
     axes.scatter(*at[order].T, s=size, c=colours, linewidths=0, rasterized=True)
 
 
-def _draw_boxes(axes: Axes, boxes: Boxes, ground_m: float, colour: str, width: float, dash: object = "-") -> None:
+def _draw_boxes(axes: Axes, boxes: Boxes, ground_m: float, colour: str, width: float, dash: Any = "-") -> None:
     """Draw the edges of boxes, and their footprints filled."""
     if not len(boxes):
         return

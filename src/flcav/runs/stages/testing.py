@@ -155,7 +155,7 @@ def detect_before_after(before: Path, after: Path, split: Frames) -> SweepCompar
         frame = split.data.frame(i)
         truth = asked_of(frame, networks[0].config)
         seen = [_matched(detect_in(network, [frame], score_threshold=THRESHOLD)[0], truth) for network in networks]
-        looks.append(SweepComparison(i, _rows(truth.targets), *seen))
+        looks.append(SweepComparison(i, _rows(truth.targets), seen[0], seen[1]))
     counts = np.array([_count(look) for look in looks])
     targets, *numbers = counts.sum(axis=0).tolist()
     total = SweepTotal(len(looks), targets, (numbers[0], numbers[1]), (numbers[2], numbers[3]))
