@@ -65,7 +65,7 @@ def test_the_page_needs_nothing_but_itself() -> None:
     links = {str(attributes["href"]) for _, attributes in read.tags if "href" in attributes}
     places = {f"#{attributes['id']}" for _, attributes in read.tags if "id" in attributes}
     assert {link for link in links if link.startswith("#")} <= places
-    files = {"results.csv", "results.json", "history.csv", "pictures/", "ledgers/", "work/"}
+    files = {"results.csv", "results.json", "pictures/", "ledgers/", "work/"}
     assert {link for link in links if not link.startswith("#")} == files  # beside the page
     assert "url(" not in text
     assert "viewport" in {attributes.get("name") for tag, attributes in read.tags if tag == "meta"}

@@ -85,6 +85,30 @@ def arms(towns: Mapping[str, Mapping[str, Estimate]], label: str = "AP50 (95 % i
 
 
 @style.styled
+def arms_by_question(
+    panels: Mapping[str, Mapping[str, Estimate]], marks: Mapping[str, float], label: str = "AP50 (95 % interval)"
+) -> Figure:
+    """Return forest plots of a measure, named by `label`, by arm: a panel per title, two abreast.
+
+    `marks`: values by name that all panels have as vertical lines.
+    """
+    rows = [list(panels)[i : i + 2] for i in range(0, len(panels), 2)]
+    heights = [max(len(panels[title]) for title in row) for row in rows]
+    figure = style.canvas(13.2, sum(0.32 * height + 0.6 for height in heights) + 0.4)
+    drawn = figure.subplots(len(rows), 2, sharex=True, squeeze=False, height_ratios=heights)
+    for axes, (title, arms_) in zip(drawn.ravel(), panels.items(), strict=False):
+        runs.draw_arms(axes, title, arms_)
+        axes.set_title(title, fontweight="bold")
+        axes.set_ylim(max(heights[list(panels).index(title) // 2], len(arms_)) - 0.5, -0.5)
+        for (name, value), dash in zip(marks.items(), ((0, (1, 1.5)), (0, (4, 2))), strict=False):
+            axes.axvline(value, color=style.MUTED, linewidth=1, linestyle=dash, label=name, zorder=0)
+    for axes in drawn[-1]:
+        axes.set_xlabel(label)
+    style.key(figure, [line for line in drawn[0, 0].get_lines() if line.get_label() in marks])
+    return figure
+
+
+@style.styled
 def by_megabytes(lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Figure:
     """Return AP50 against uplink megabytes, with intervals: a line per name."""
     figure = style.canvas(1.6 * WIDTH, 0.9 * WIDTH)

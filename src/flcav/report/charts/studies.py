@@ -80,6 +80,40 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
     return figure
 
 
+@style.styled
+def precision_table(panels: Mapping[str, Sequence[Bar]], label: str) -> Figure:
+    """Return a table of means, darker where higher: a row per figure, a column per title, empty where a test lacks it.
+
+    A cell has the mean, half the range over seeds where there are several, and below it the number of targets.
+    """
+    names = list(dict.fromkeys(bar.name for bars in panels.values() for bar in bars))
+    figure = style.canvas(2.6 + 1.25 * len(panels), 0.8 + 0.42 * len(names))
+    axes = figure.add_subplot()
+    means = np.full((len(names), len(panels)), np.nan)
+    for column, bars in enumerate(panels.values()):
+        for bar in bars:
+            row = names.index(bar.name)
+            means[row, column] = bar.mean
+            half = (max(bar.seeds) - min(bar.seeds)) / 2 if len(bar.seeds) > 1 else None
+            look = {"ha": "center", "color": "white" if bar.mean > 0.6 else style.INK}
+            text = f"{bar.mean:.2f}" + ("" if half is None else f" ±{half:.2f}")
+            axes.text(column, row - (0 if bar.targets is None else 0.17), text, va="center", **look)
+            if bar.targets is not None:
+                axes.text(column, row + 0.24, f"{bar.targets}", va="center", fontsize=style.SMALL, **look)
+    axes.imshow(means, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
+    axes.set_xticks(range(len(panels)), list(panels))
+    axes.xaxis.tick_top()
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xticks(np.arange(-0.5, len(panels)), minor=True)
+    axes.set_yticks(np.arange(-0.5, len(names)), minor=True)
+    axes.grid(which="minor", color="white", linewidth=2)
+    axes.tick_params(which="minor", length=0)
+    axes.set_xlabel(label, loc="left")
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return figure
+
+
 Panels = Mapping[str, Mapping[str, Sequence[Bar]]]  # bars by test and slice, named with its number of samples
 
 
