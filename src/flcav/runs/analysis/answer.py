@@ -1,6 +1,6 @@
 """The answer of a run to its question, whether vehicles can teach a network towns that it has never seen."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +10,7 @@ from flcav.runs.analysis.costs import list_home_costs
 from flcav.runs.analysis.findings import OVER_EDGE, OVER_PRETRAINING
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.runs.results.run import Run
-from flcav.runs.results.tests import Difference, FoundCount, HomeCost, RunFinding, Test
+from flcav.runs.results.tests import Difference, FoundCount, HomeCost, RunFinding
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.statistics.verdicts import HELD, NOT_HELD
 from flcav.storage.records import select
@@ -46,11 +46,8 @@ def tell_answer(run: Run) -> Answer | None:
         word += PRICE if any(map(fell, home)) else ""
     else:
         word = "No" if verdicts == {NOT_HELD} else "This run cannot tell"
-    sentences = [
-        sentence
-        for task, found in claims.items()
-        for sentence in _tell(run, task, tuple(region for each, _ in found for region in each.places))
-    ]
+    regions = {task: tuple(region for each, _ in found for region in each.places) for task, found in claims.items()}
+    sentences = [*_tell_edge(run, regions), *_tell_cloud(run, regions)]
     sentences += _tell_home(home)
     return Answer(word, tuple(sentences))
 
@@ -96,31 +93,38 @@ def select_claims(run: Run, task: str, stage: str) -> list[Claimed]:
     return [claimed for claimed in found if claimed[0].regions is not None] or found
 
 
-def _tell(run: Run, task: str, regions: tuple[str, ...]) -> Iterator[str]:
-    """Yield sentences on edge FL and cloud FL of a task in the regions of its claims."""
-    towns = f"{NUMBERS[len(regions)] if len(regions) < len(NUMBERS) else len(regions)} unseen town"
-    towns += "" if len(regions) == 1 else "s"
-    pretrained, edge, cloud = (
-        select(run.tested, arm=MAIN, stage=stage, task=task, region=regions) for stage in (PRETRAIN, EDGE, CLOUD)
-    )
-    cost = f"for {_sent(run, task, EDGE, ('wireless',)):.0f} MB of radio"
-    counts = [_sum_counts(run, task, stage, regions) for stage in (PRETRAIN, EDGE, CLOUD)]
-    before, after, last = counts
-    if before is not None and after is not None:
-        right = f"{before.found:.0f} → {after.found:.0f} of {after.targets} {after.noun} found"
-        if before.false is not None and after.false is not None:
-            right += f" and {before.false:.0f} → {after.false:.0f} false"
-        yield f"In {towns}, {right}, {cost}."
-    else:
-        change = f"{_average(pretrained):.3f} → {_average(edge):.3f}"
-        yield f"In {towns}, {edge[0].measure} of {task} went {change}, {cost}."
-    if not cloud:
-        return
-    one = f"One network for all towns, averaged by the cloud for {_sent(run, task, CLOUD, LINKS):.0f} MB more, "
-    if last is not None:
-        yield f"{one}finds {last.found:.0f}{'' if last.false is None else f', {last.false:.0f} false'}."
-    else:
-        yield f"{one}has {cloud[0].measure} {_average(cloud):.3f}."
+def _tell_edge(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """Yield a sentence on edge FL of all tasks in the regions of their claims: counts, or else the measure."""
+    told = []
+    for task, places in regions.items():
+        before, after = (_sum_counts(run, task, stage, places) for stage in (PRETRAIN, EDGE))
+        if before is not None and after is not None:
+            right = f"{before.found:.0f} → {after.found:.0f} of {after.targets} {after.noun} found"
+            if before.false is not None and after.false is not None:
+                right += f" and {before.false:.0f} → {after.false:.0f} false"
+        else:
+            means = [_average(run, task, stage, places) for stage in (PRETRAIN, EDGE)]
+            right = f"{_measure(run, task)} of {task} {means[0]:.3f} → {means[1]:.3f}"
+        told.append(f"{right}, for {_sent(run, task, EDGE, ('wireless',)):.0f} MB of radio")
+    most = max(len(places) for places in regions.values())
+    towns = f"{NUMBERS[most] if most < len(NUMBERS) else most} unseen town{'' if most == 1 else 's'}"
+    yield f"In {towns}: {'; '.join(told)}."
+
+
+def _tell_cloud(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """Yield a sentence on the network for all towns of each task, where there is one."""
+    told, sent = [], 0.0
+    for task, places in regions.items():
+        if not select(run.tested, arm=MAIN, stage=CLOUD, task=task, region=places):
+            continue
+        sent += _sent(run, task, CLOUD, LINKS)
+        last = _sum_counts(run, task, CLOUD, places)
+        if last is not None:
+            told.append(f"finds {last.found:.0f}{'' if last.false is None else f', {last.false:.0f} false'}")
+        else:
+            told.append(f"has {_measure(run, task)} {_average(run, task, CLOUD, places):.3f}")
+    if told:
+        yield f"One network for all towns, averaged by the cloud for {sent:.0f} MB more, {', '.join(told)}."
 
 
 def _tell_home(home: Sequence[HomeCost]) -> Iterator[str]:
@@ -151,8 +155,13 @@ def _sum_counts(run: Run, task: str, stage: str, regions: tuple[str, ...]) -> Fo
     )
 
 
-def _average(tests: Sequence[Test]) -> float:
+def _average(run: Run, task: str, stage: str, regions: tuple[str, ...]) -> float:
+    tests = select(run.tested, arm=MAIN, stage=stage, task=task, region=regions)
     return float(np.mean([test.estimate.mean for test in tests]))
+
+
+def _measure(run: Run, task: str) -> str:
+    return select(run.tested, task=task)[0].measure
 
 
 def _sent(run: Run, task: str, stage: str, links: Sequence[str]) -> float:

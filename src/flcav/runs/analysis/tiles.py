@@ -1,7 +1,7 @@
 """The numbers at the top of a run's report: gain, gain over a control, megabytes of the budgets, and cost at home."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,10 +32,21 @@ def list_tiles(run: Run) -> list[Tile]:
 
 
 def _tell_gain(run: Run, task: str) -> Iterator[Tile]:
-    for each, finding in select_claims(run, task, EDGE):
-        before, after = (_mean(run, MAIN, stage, each) for stage in (PRETRAIN, EDGE))
-        title = f"{_measure(run, each)} in {each.region}{_of(run, task)}"
-        yield Tile(title, f"{before:.3f} → {after:.3f}", tell_change(each.estimate), finding.verdict)
+    """Yield the gain of edge FL: the claim on the mean over regions, or the mean with the claims of all regions."""
+    claims = select_claims(run, task, EDGE)
+    if not claims:
+        return
+    each = replace(claims[0][0], regions=tuple(region for one, _ in claims for region in one.places))
+    before, after = (_mean(run, MAIN, stage, each) for stage in (PRETRAIN, EDGE))
+    verdicts = {finding.verdict for _, finding in claims}
+    notes = [tell_change(each.estimate)]
+    if len(claims) > 1:
+        notes = [f"{one.region} {tell_change(one.estimate)}" for one, _ in claims]
+        if len(verdicts) > 1:
+            notes = [f"{note} {finding.verdict}" for note, (_, finding) in zip(notes, claims, strict=True)]
+    title = f"{_measure(run, each)} in {' and '.join(each.places)}{_of(run, task)}"
+    value = f"{before:.3f} → {after:.3f}"
+    yield Tile(title, value, ", ".join(notes), verdicts.pop() if len(verdicts) == 1 else None)
 
 
 def _tell_control(run: Run, task: str) -> Iterator[Tile]:
