@@ -9,9 +9,11 @@ from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
+import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure, FigureBase
+from scipy.optimize import isotonic_regression
 
 from flcav.statistics.estimates import Estimate
 
@@ -107,12 +109,15 @@ def interval(axes: Axes, x: float, estimate: Estimate, **look: Any) -> None:
 
 
 def keep_apart(heights: Sequence[float], gap: float, top: float) -> list[float]:
-    """Return heights of labels for lines that end at `heights`: there or lower, `gap` apart and below `top`."""
-    places: dict[int, float] = {}
-    above = top
-    for i in sorted(range(len(heights)), key=lambda i: -heights[i]):
-        places[i] = above = min(heights[i], above - gap)
-    return [places[i] for i in range(len(heights))]
+    """Return heights of labels for lines that end at `heights`: `gap` apart, below `top`, and else as near as can be.
+
+    The squared distances from the ends are least, by isotonic regression.
+    """
+    order = sorted(range(len(heights)), key=lambda i: -heights[i])
+    steps = gap * np.arange(len(order))
+    even = isotonic_regression(np.array([heights[i] for i in order]) + steps, increasing=False).x
+    places = np.minimum(even, top) - steps
+    return [float(places[order.index(i)]) for i in range(len(heights))]
 
 
 VARIABLES = {  # colours of figures by the page's variable that takes their place

@@ -158,8 +158,11 @@ def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
 def costs(
     panels: Mapping[str, Mapping[str, tuple[float, MeanOverSeeds]]], cost: str, measure: str, front: Sequence[str]
 ) -> Figure:
-    """Return a panel per title with a measure against its cost: named points with intervals, joined along `front`."""
-    figure = style.canvas(PANEL_IN * len(panels), 3.6)
+    """Return a panel per title with a measure against its cost: points with intervals, joined along `front`.
+
+    Points are numbered; below is what the numbers stand for, the same in all panels.
+    """
+    figure = style.canvas(PANEL_IN * len(panels), 3.9)
     for axes, (title, points) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         best = sorted((points[name][0], points[name][1].mean) for name in front)
         axes.plot(*zip(*best, strict=True), color=style.SKY, zorder=1)
@@ -167,21 +170,13 @@ def costs(
             colour = style.BLUE if name in front else style.MUTED
             style.interval(axes, x, mean, color=colour, linewidth=1)
             axes.plot(x, mean.mean, "o", color=colour, markersize=5)
-            axes.annotate(
-                name,
-                (x, 0.03),
-                xycoords=axes.get_xaxis_transform(),
-                xytext=(-3, 0),
-                textcoords="offset points",
-                rotation=90,
-                ha="right",
-                va="bottom",
-                color=colour,
-                fontsize=style.SMALL,
-            )
+            text = str(list(points).index(name) + 1)
+            axes.annotate(text, (x, mean.mean), (6, 0), textcoords="offset points", va="center", color=colour)
         axes.set_xlim(0, None)
         axes.set_xlabel(cost)
-        axes.set_ylabel(measure)
+        axes.set_ylabel(f"{measure} (95 % interval)")
         axes.set_title(title)
         axes.grid(axis="y")
+    names = [f"{number}: {name}" for number, name in enumerate(next(iter(panels.values())), start=1)]
+    figure.supxlabel("      ".join(names), fontsize=style.SMALL)
     return figure
