@@ -13,6 +13,7 @@ from PIL import Image
 from toy_run import RECIPE, TOY, Studied
 
 from flcav.cli.main import run as command
+from flcav.cli.pictures import open_shown
 from flcav.dataset.store import Dataset
 from flcav.report.run_tables import judge_anew
 from flcav.reproductions.demo_arms.run import ARMS
@@ -240,3 +241,9 @@ def test_the_summary_of_seeds_is_beside_them(studied: tuple[Path, Any, Any]) -> 
     judged = {row["name"] for row in summary["differences"] if "judged" in row}
     assert "grid, objects: edge + cloud FL - further edge FL" in judged
     assert "grid, objects: central training (more) - pretrained" not in judged
+
+
+def test_the_viewer_shows_the_test_frames_of_a_run(finished: Path, result: Run) -> None:
+    shown = open_shown(finished)
+    assert shown.folder == finished / "work" / "grid-test-objects" / "data"
+    assert open_shown(shown.folder).folder == shown.folder
