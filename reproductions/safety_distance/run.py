@@ -172,7 +172,7 @@ COLOURS = (style.MUTED, style.BLUE)
 
 def bound_count(count: int) -> tuple[float, float]:
     """Return the exact 95 % interval of the mean of a Poisson variable of which `count` was seen (Garwood, 1936)."""
-    return (chi2.ppf(0.025, 2 * count) / 2 if count else 0.0, chi2.ppf(0.975, 2 * count + 2) / 2)
+    return float(chi2.ppf(0.025, 2 * count)) / 2 if count else 0.0, float(chi2.ppf(0.975, 2 * count + 2)) / 2
 
 
 @style.styled

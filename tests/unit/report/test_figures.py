@@ -12,9 +12,12 @@ from matplotlib.text import Text
 
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.report.charts.placement import draw_correlations
+from flcav.report.charts.studies import Bar, precision_table
 from flcav.report.pictures import perspective
 from flcav.report.pictures.changes import GONE, NEW, REMAINING, draw_changes
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
+from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.world.geodesy import find_on_ground
 from flcav.world.line_of_sight import Viewshed
@@ -270,3 +273,50 @@ def test_a_measure_of_one_scene_is_drawn_without_a_bar() -> None:
         1: {0.503, 0.447},
         2: {0.511, 0.468},
     }
+
+
+@pytest.mark.parametrize("top", [1.0, 0.62])
+def test_names_of_lines_stand_as_near_their_ends_as_can_be(top: float) -> None:
+    ends = [0.2, 0.61, 0.6, 0.58, 0.9]
+    places = style.keep_apart(ends, 0.1, top)
+    order = np.argsort(ends)[::-1]
+    assert (np.diff(np.array(places)[order]) <= -0.1 + 1e-12).all()
+    assert max(places) <= top
+    if top == 1.0:
+        assert places[0] == pytest.approx(0.2)
+        assert places[4] == pytest.approx(0.9)
+        assert np.mean([places[i] for i in (1, 2, 3)]) == pytest.approx(np.mean([0.61, 0.6, 0.58]))  # moved both ways
+
+
+def test_a_table_of_precisions_has_means_ranges_and_numbers_of_targets() -> None:
+    panels = {
+        "grid": [Bar("Car", 0.8, (0.7, 0.9), 120), Bar("Cyclist", 0.3, (0.3,), 9)],
+        "ring": [Bar("Car", 0.6, (0.6, 0.6), 80)],
+    }
+    axes = precision_table(panels, "AP").axes[0]
+    told = {text.get_text(): text.get_position() for text in axes.texts}
+    assert told.keys() == {"0.80 ±0.10", "120", "0.30", "9", "0.60 ±0.00", "80"}
+    assert told["80"][0] == 1
+    assert told["9"][1] == pytest.approx(1.24)
+
+
+def test_correlations_show_every_seed_and_the_mean_with_its_interval() -> None:
+    seeds = {"errors covered": {"all": [0.1, 0.5, -0.2]}, "traffic": {"all": [0.0, 0.2, 0.1]}}
+    means = {"errors covered": {"all": Estimate(0.13, -0.3, 0.6)}, "traffic": {"all": Estimate(0.1, None, None)}}
+    axes = draw_correlations(seeds, means).axes[0]
+    lines = [
+        (line.get_marker(), np.asarray(line.get_xdata()).tolist(), np.asarray(line.get_ydata()).tolist())
+        for line in axes.get_lines()
+    ]
+    assert ("o", [0.1, 0.5, -0.2], [0.0, 0.0, 0.0]) in lines
+    assert ("None", [-0.3, 0.6], [0.0, 0.0]) in lines
+    assert [x for marker, x, _ in lines if marker == "s"] == [[0.13], [0.1]]
+
+
+def test_arms_by_question_share_an_axis_and_marks() -> None:
+    figure = figures.arms_by_question({"a": ARMS["grid"], "b": ARMS["ring"], "c": ARMS["grid"]}, {"pretrained": 0.41})
+    assert [axes.get_title(loc="left") for axes in figure.axes][:3] == ["a", "b", "c"]
+    for axes in figure.axes[:3]:
+        assert 0.41 in [float(np.asarray(line.get_xdata())[0]) for line in axes.get_lines()]
+        assert "0.410  (0.380–0.450)" in [text.get_text() for text in axes.texts]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["pretrained"]

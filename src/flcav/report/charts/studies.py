@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -95,7 +96,7 @@ def precision_table(panels: Mapping[str, Sequence[Bar]], label: str) -> Figure:
             row = names.index(bar.name)
             means[row, column] = bar.mean
             half = (max(bar.seeds) - min(bar.seeds)) / 2 if len(bar.seeds) > 1 else None
-            look = {"ha": "center", "color": "white" if bar.mean > 0.6 else style.INK}
+            look: dict[str, Any] = {"ha": "center", "color": "white" if bar.mean > 0.6 else style.INK}
             text = f"{bar.mean:.2f}" + ("" if half is None else f" ±{half:.2f}")
             axes.text(column, row - (0 if bar.targets is None else 0.17), text, va="center", **look)
             if bar.targets is not None:
