@@ -15,6 +15,7 @@ from toy_run import RECIPE, TOY, Studied
 from flcav.cli.main import run as command
 from flcav.cli.pictures import open_shown
 from flcav.dataset.store import Dataset
+from flcav.perception.errors import load_errors
 from flcav.report.run_tables import judge_anew
 from flcav.reproductions.demo_arms.run import ARMS
 from flcav.reproductions.fig6a_allocation.findings import MEAN
@@ -24,6 +25,8 @@ from flcav.runs.frames import Frames
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.saved import ERRORS
+from flcav.runs.results.tests import ErrorsAfter
 from flcav.runs.results.training import StageResult, Watched
 from flcav.runs.stages.graph import Graph
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
@@ -247,3 +250,18 @@ def test_the_viewer_shows_the_test_frames_of_a_run(finished: Path, result: Run) 
     shown = open_shown(finished)
     assert shown.folder == finished / "work" / "grid-test-objects" / "data"
     assert open_shown(shown.folder).folder == shown.folder
+
+
+def test_what_became_of_the_errors_agrees_with_their_registry(finished: Path, result: Run) -> None:
+    for region in ("grid", "ring"):
+        registered = load_errors(finished / "work" / f"{region}-errors-objects" / ERRORS)
+        after = ErrorsAfter.load(finished / "work" / f"{region}-errors-after-objects")
+        assert len(after.remains) == len(registered)
+        assert len(after.new) == len(after.new_kinds)
+    assert result.counts is not None
+    assert [(row.arm, row.stage, row.region) for row in result.counts] == [
+        (test.arm, test.stage, test.region) for test in result.tested
+    ]
+    for row, test in zip(result.counts, result.tested, strict=True):
+        assert row.targets == test.result.numbers["targets"]
+        assert row.found <= row.targets
