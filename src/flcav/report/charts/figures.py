@@ -1,5 +1,6 @@
 """Figures of a run's report: tables and arrays in, matplotlib figures out; `style.png` encodes one."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
@@ -15,6 +16,7 @@ from flcav.storage.records import select
 
 WIDTH = 3.8  # of a figure on a phone [inch]
 TALLEST = 2.0  # greatest height of a map, in widths; a higher map is drawn narrower
+TITLE = 36  # characters of a line of a panel's title
 ACROSS = 2  # entries of a map's legend per line
 
 
@@ -105,6 +107,30 @@ def arms_by_question(
     for axes in drawn[-1]:
         axes.set_xlabel(label)
     style.key(figure, [line for line in drawn[0, 0].get_lines() if line.get_label() in marks])
+    return figure
+
+
+@style.styled
+def seeds(panels: Mapping[str, Mapping[str, Estimate]]) -> Figure:
+    """Return differences with 95 % intervals, a row per seed: panels by title, side by side, with 0 as a line."""
+    names = list(next(iter(panels.values())))
+    figure = style.canvas(1.0 + 3.4 * len(panels), 1.4 + 0.3 * len(names))
+    for axes, (title, rows) in zip(figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels.items()):
+        axes.axvline(0, color=style.MUTED, linewidth=1)
+        for y, change in enumerate(rows.values()):
+            colour = style.GREEN if change.mean > 0 else style.VERMILLION
+            if change.low is not None and change.high is not None:
+                axes.plot([change.low, change.high], [y, y], color=colour, linewidth=2)
+            axes.plot(change.mean, y, "s", color=colour, markersize=6)
+        better = sum((change.low or 0.0) > 0 for change in rows.values())
+        worse = sum((change.high or 0.0) < 0 for change in rows.values())
+        lines = [line for part in title.splitlines() for line in textwrap.wrap(part, TITLE)]
+        axes.set_title("\n".join(lines), fontweight="bold")
+        told = [f"{word} 0 in {count}" for word, count in (("above", better), ("below", worse)) if count]
+        axes.set_xlabel(f"{', '.join(told) or 'containing 0'} of {len(rows)} intervals (95 %)")
+        axes.set_yticks(range(len(names)), names)
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        axes.grid(axis="x")
     return figure
 
 
