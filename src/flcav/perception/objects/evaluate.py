@@ -366,13 +366,9 @@ class ObjectsOutcomes:
         """
         classes = outcomes.arrays[CLASSES].tolist()
         matches = [read_matches(outcomes, name) for name in classes]
-        hits = [each.hit[each.score >= THRESHOLD] for each in matches]
-        return Counted(
-            noun="cars" if classes == ["Car"] else "road users",
-            targets=sum(int(each.targets.sum()) for each in matches),
-            found=sum(int(hit.sum()) for hit in hits),
-            false=sum(int((~hit).sum()) for hit in hits),
-        )
+        hit = np.concatenate([each.hit[each.score >= THRESHOLD] for each in matches])
+        targets = sum(int(each.targets.sum()) for each in matches)
+        return Counted("cars" if classes == ["Car"] else "road users", targets, int(hit.sum()), int((~hit).sum()))
 
     def _mean_precision(self, outcomes: Outcomes, key: str, times: Times) -> Values:
         per_class = [weighted_precision(read_matches(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]
