@@ -6,6 +6,7 @@ The source folder is the repository's root, so that a link between two files is 
 import sys
 from pathlib import Path
 
+from docutils.nodes import document
 from pygments.lexers import TextLexer
 from sphinx.application import Sphinx
 
@@ -41,5 +42,12 @@ html_css_files = ["site.css"]
 
 
 def setup(app: Sphinx) -> None:
-    """Let tables stand in code blocks: `csv` is no language that is known to be coloured."""
+    """Let tables stand in code blocks: `csv` is no language that is known to be coloured; leave changes unsearched."""
     app.add_lexer("csv", TextLexer)
+    app.connect("doctree-read", leave_unsearched)
+
+
+def leave_unsearched(app: Sphinx, doctree: document) -> None:
+    """Keep the changelog out of the site's search, whose words stand in the pages of what changed."""
+    if app.env.docname == "CHANGELOG":
+        app.env.metadata["CHANGELOG"]["nosearch"] = ""

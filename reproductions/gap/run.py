@@ -130,6 +130,15 @@ ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     LONG_JOINT: ("joint_fourfold", CENTRAL),
     ORACLE: ("oracle", CENTRAL),
 }
+PANELS: Mapping[str, tuple[str, ...]] = {  # of the picture
+    "Labels of edge FL": (ROAD, TRACKS, JOINED, TRUTH),
+    "Faults of labels": (MISSED, UNSURE, FAR, OCCLUDED, FALSE, BOXES, PRESENCE, TRUTH),
+    "Steps, bytes and rounds": (TRUTH, TWICE, FOURFOLD, COARSE, LONGER, LONGEST),
+    "One network for both towns": (
+        *(GLOBAL, REPLAY, FROZEN, IMITATING, HALF, QUARTER),
+        *(GLOBAL_TRUTH, QUARTER_TRUTH, GLOBAL_PRESENCE, JOINT, LONG_JOINT),
+    ),
+}
 FOR_ALL = tuple(name for name, (_, stage) in ARMS.items() if stage in (PRETRAIN, CLOUD))
 AT_HOME = (*FOR_ALL, JOINT, LONG_JOINT)  # one network for both towns: scored in that of pretraining, too
 COMPARED = (  # (after, before): claims that the difference in AP50 is positive
@@ -242,8 +251,10 @@ def draw_megabytes(results: GapResult) -> bytes:
 
 
 def draw_gap(results: GapResult) -> bytes:
-    """Return the forest plot of the AP50 of all arms as a PNG."""
-    return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))
+    """Return forest plots of the AP50 of all arms, a panel per question, as a PNG."""
+    panels = {title: {name: results.ap50[name] for name in names} for title, names in PANELS.items()}
+    marks = {name: results.ap50[name].mean for name in (PRETRAINED, ORACLE)}
+    return style.png(figures.arms_by_question(panels, marks))
 
 
 def gap_tables(results: GapResult) -> dict[str, str]:

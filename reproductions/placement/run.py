@@ -35,7 +35,7 @@ from flcav.perception.objects.truth import choose_lidar
 from flcav.perception.outcomes import Outcomes
 from flcav.perception.weights import load_network
 from flcav.report import style
-from flcav.report.charts.placement import draw_gains
+from flcav.report.charts.placement import draw_correlations
 from flcav.reproductions.placement.records import (
     ADDED,
     COVERAGE,
@@ -333,17 +333,18 @@ def _correlate(poles: Sequence[PoleGain], name: str) -> dict[str, float]:
 
 
 def draw_proof(results: PlacementProof) -> dict[str, bytes]:
-    """Return a PNG per region, by file name: the gains of all poles against each predictor."""
+    """Return a PNG per region, by file name: rank correlations of the poles' gains with each predictor, by seed."""
     pictures = {}
     for region, proof in results.regions.items():
-        panels = {
-            (frames, name): {
-                seed.seed: [(pole.predictors[name], pole.gain[frames]) for pole in seed.poles] for seed in proof.seeds
-            }
-            for frames in FRAMES
+        seeds = {
+            name: {frames: [seed.correlation[name][frames] for seed in proof.seeds] for frames in FRAMES}
             for name in PREDICTORS
         }
-        pictures[f"placement-{region}.png"] = style.png(draw_gains(panels))
+        means = {
+            name: {frames: mean.as_estimate() for frames, mean in proof.means.correlation[name].items()}
+            for name in PREDICTORS
+        }
+        pictures[f"placement-{region}.png"] = style.png(draw_correlations(seeds, means))
     return pictures
 
 

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.stats import chi2
 
 from flcav.driving.driver import DriverSettings
 from flcav.driving.errors import ErrorModel, load_error_model
@@ -76,7 +77,7 @@ class SafetyDistance(Record):
             name: [(e.mean_speed, e.near_share, e.hard_brakes, e.faults) for e in self.settings if e.uncertain == kind]
             for name, kind in (("fixed", False), ("by uncertainty", True))
         }
-        return style.png(draw_trade_off(lines))
+        return style.png(draw_trade_off(lines, self.drives))
 
 
 def compare_margins(
@@ -169,17 +170,29 @@ PANELS = ("time below 1.5 s to collision [%]", "hard brakes a drive", "collision
 COLOURS = (style.MUTED, style.BLUE)
 
 
+def bound_count(count: int) -> tuple[float, float]:
+    """Return the exact 95 % interval of the mean of a Poisson variable of which `count` was seen (Garwood, 1936)."""
+    return float(chi2.ppf(0.025, 2 * count)) / 2 if count else 0.0, float(chi2.ppf(0.975, 2 * count + 2)) / 2
+
+
 @style.styled
-def draw_trade_off(lines: Mapping[str, Sequence[tuple[float, float, float, float]]]) -> Figure:
-    """Return three panels against mean speed; `lines`: points (mean speed [m/s], near share, hard brakes, faults)."""
-    figure = style.canvas(9.0, 3.0)
+def draw_trade_off(lines: Mapping[str, Sequence[tuple[float, float, float, int]]], drives: int) -> Figure:
+    """Return three panels against mean speed; `lines`: points (mean speed [m/s], near share, hard brakes, faults).
+
+    Collisions are few: they have the interval of a count, and no line joins them. `drives`: per setting.
+    """
+    figure = style.canvas(9.6, 3.2)
     panels = figure.subplots(1, len(PANELS))
     for number, (axes, title) in enumerate(zip(panels, PANELS)):
+        counted = number == len(PANELS) - 1
         for (name, points), colour in zip(lines.items(), COLOURS):
             values = np.array(points)
             height = values[:, number + 1] * (100 if number == 0 else 1)
-            axes.plot(values[:, 0], height, "o-", color=colour, markersize=4, label=name)
-        axes.set(xlabel="mean speed [m/s]", title=title)
+            look = "o" if counted else "o-"
+            axes.plot(values[:, 0], height, look, color=colour, markersize=4, label=name, clip_on=not counted, zorder=3)
+            for speed, *_, faults in points if counted else ():
+                style.interval(axes, speed, Estimate(faults, *bound_count(faults)), color=colour, linewidth=1)
+        axes.set(xlabel="mean speed [m/s]", title=f"{title}, in {drives} drives" if counted else title)
         axes.set_ylim(bottom=0)
         axes.grid(axis="y")
     style.key(figure, panels[0].get_lines())

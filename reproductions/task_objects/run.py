@@ -12,7 +12,7 @@ from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS, TRACKS, streets_study
 from flcav.perception.tracking import evaluate_tracks
 from flcav.report import style
-from flcav.report.charts.studies import Bar, precisions
+from flcav.report.charts.studies import Bar, precision_table
 from flcav.statistics.verdicts import Claim, describe_aims
 from flcav.storage.markdown import format_bullets, format_table
 
@@ -114,7 +114,10 @@ def _draw(results: StudyResult[ObjectsEvaluation]) -> bytes:
                 if (row.kind, row.iou) == ("3d", 0.5) and row.ap is not None:
                     rows.setdefault(name, []).append(row)
         panels[test] = [_bar(name, scores) for name, scores in rows.items()]
-    return style.png(precisions(panels))
+    panels = {test: [replace(bar, name=bar.name.replace("_", " ")) for bar in bars] for test, bars in panels.items()}
+    return style.png(
+        precision_table(panels, "AP in 3D at IoU 0.5: mean over seeds ± half their range; number of targets")
+    )
 
 
 def _is_share(name: str) -> bool:

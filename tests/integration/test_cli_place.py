@@ -222,7 +222,7 @@ def test_a_wrong_price_or_limit_is_one_sentence(more, change, named, files, caps
     assert err.count("\n") == 1
 
 
-def test_the_map_tells_what_is_covered_what_was_bought_and_what_it_sees(tmp_path, monkeypatch):
+def test_the_map_tells_what_is_covered_what_was_bought_and_what_it_sees(tmp_path, monkeypatch, capsys):
     town = load_town("grid")
     at = [pole.tolist() for pole in town.poles.position[:2]]
     rows = [f"mast-{number},{x},{y},{z},{number}" for number, (x, y, z) in enumerate(at, start=1)]
@@ -234,9 +234,11 @@ def test_the_map_tells_what_is_covered_what_was_bought_and_what_it_sees(tmp_path
     monkeypatch.setattr(figures, "town_map", lambda scene, width: drawn.append(scene) or Figure())
     files = [f"--{name}={tmp_path / name}.csv" for name in ("errors", "poles", "sensors")]
     assert called("place", *files, "--budget=5", "--town=grid", "--line-of-sight", f"--map={tmp_path / 'a.png'}") == 0
+    assert "beyond every pole: 1 of your 3 points" in capsys.readouterr().out
     (scene,) = drawn
     assert scene.covered.tolist() == [True, True, False]
     assert set(scene.viewsheds) == {"1", "2"}
+    assert scene.beyond.tolist() == [False, False, True]
     assert scene.notes[:2] == [
         "2 of your 3 points covered, cost 5",
         "camera, range 10 m, on poles mast-1 (1), mast-2 (2)",

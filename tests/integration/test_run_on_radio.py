@@ -8,7 +8,7 @@ import pytest
 from flcav.cli.main import run as command
 from flcav.network.clock.records import ClientTiming, load_rounds
 from flcav.network.ledger import Ledger
-from flcav.report.pages.run_page import draw
+from flcav.report.pages.run_page import Seen, draw
 from flcav.report.run_tables import tables
 from flcav.runs.driving import TOO_SLOW
 from flcav.runs.edge_stage import TRAIN_TIMES, Federations, name_results
@@ -70,7 +70,7 @@ def test_on_the_radio_stragglers_join_what_the_plan_gives_them_and_are_cut_off_a
         assert (int(planned), int(combined)) == (len(joins[name]), sum(not timing.dropped for timing in own))
         assert sum(int(each.split()[0]) for each in lost.split(", ") if each) == sum(bool(t.dropped) for t in own)
         assert float(seconds) == pytest.approx(lengths[name], abs=0.06)
-    assert {"timeline_grid", "timeline_ring"} <= {*draw(result, folder / "work")}
+    assert {"timeline_grid", "timeline_ring"} <= {*draw(result, folder / "work", Seen())}
 
 
 def test_on_the_radio_megabytes_of_stragglers_return_to_the_plan_which_says_who_uploads(

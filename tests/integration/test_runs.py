@@ -13,7 +13,9 @@ from PIL import Image
 from toy_run import RECIPE, TOY, Studied
 
 from flcav.cli.main import run as command
+from flcav.cli.pictures import open_shown
 from flcav.dataset.store import Dataset
+from flcav.perception.errors import load_errors
 from flcav.report.run_tables import judge_anew
 from flcav.reproductions.demo_arms.run import ARMS
 from flcav.reproductions.fig6a_allocation.findings import MEAN
@@ -23,6 +25,8 @@ from flcav.runs.frames import Frames
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.saved import ERRORS
+from flcav.runs.results.tests import ErrorsAfter
 from flcav.runs.results.training import StageResult, Watched
 from flcav.runs.stages.graph import Graph
 from flcav.statistics.verdicts import ESTIMATE, UNDECIDED, verdict
@@ -168,8 +172,12 @@ def test_findings_say_what_their_intervals_say(result: Run) -> None:
 
 def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:
     text = (finished / "report.html").read_text()
-    assert all(link.startswith("data:") for link in re.findall(r"""(?:src|href)\s*=\s*["']?([^"'\s>]+)""", text))
-    assert not re.search(r"url\(|@import|<script|<link|<iframe", text)
+    assert all(
+        link.startswith(("data:", "#")) for link in re.findall(r"""(?:src|xlink:href)\s*=\s*["']?([^"'\s>]+)""", text)
+    )
+    files = re.findall(r' href="([^"#]+)"', text)
+    assert all((finished / file).exists() for file in files)  # of the run's folder: results, pictures
+    assert not re.search(r"url\((?!#)|@import|<script|<link|<iframe", text)
     read = html.unescape(re.sub(r"\s+", " ", text))
     assert all(finding.sentence in read for finding in result.findings)
     names = {path.stem for path in (finished / "pictures").iterdir()}
@@ -236,3 +244,24 @@ def test_the_summary_of_seeds_is_beside_them(studied: tuple[Path, Any, Any]) -> 
     judged = {row["name"] for row in summary["differences"] if "judged" in row}
     assert "grid, objects: edge + cloud FL - further edge FL" in judged
     assert "grid, objects: central training (more) - pretrained" not in judged
+
+
+def test_the_viewer_shows_the_test_frames_of_a_run(finished: Path, result: Run) -> None:
+    shown = open_shown(finished)
+    assert shown.folder == finished / "work" / "grid-test-objects" / "data"
+    assert open_shown(shown.folder).folder == shown.folder
+
+
+def test_what_became_of_the_errors_agrees_with_their_registry(finished: Path, result: Run) -> None:
+    for region in ("grid", "ring"):
+        registered = load_errors(finished / "work" / f"{region}-errors-objects" / ERRORS)
+        after = ErrorsAfter.load(finished / "work" / f"{region}-errors-after-objects")
+        assert len(after.remains) == len(registered)
+        assert len(after.new) == len(after.new_kinds)
+    assert result.counts is not None
+    assert [(row.arm, row.stage, row.region) for row in result.counts] == [
+        (test.arm, test.stage, test.region) for test in result.tested
+    ]
+    for row, test in zip(result.counts, result.tested, strict=True):
+        assert row.targets == test.result.numbers["targets"]
+        assert row.found <= row.targets

@@ -313,23 +313,29 @@ class Reached(Protocol):
 
 @style.styled
 def draw_by_megabytes(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], names: Sequence[str]) -> Figure:
-    """Return the accuracy of every seed by uplink, a panel per setting, with a dot where each federation ends.
+    """Return the accuracy by uplink, a panel per setting: the mean over seeds, and a band from least to greatest.
 
-    `found` is by setting, seed and name.
+    `found` is by setting, seed and name. Between rounds an accuracy is interpolated; a line ends where the first of its
+    seeds does.
     """
-    figure = style.canvas(7.2, 3.4)
+    figure = style.canvas(7.6, 3.6)
     panels = figure.subplots(1, len(found), sharey=True, squeeze=False)[0]
     for panel, (setting, seeds) in zip(panels, found.items(), strict=True):
         for name, colour in zip(names, COLOURS, strict=False):
-            for number, by_name in enumerate(seeds.values()):
-                mb = np.asarray(by_name[name].up_mb)
-                accuracy = np.asarray(by_name[name].accuracy)
-                panel.plot(mb, accuracy, color=colour, linewidth=0.9, alpha=0.8, label=None if number else name)
-                panel.plot(mb[-1:], accuracy[-1:], "o", color=colour, markersize=3)
-        panel.set(xlabel="uplink of the vehicles [MB]", title=setting)
-    panels[0].set(ylabel="accuracy")
+            reached = [by_name[name] for by_name in seeds.values()]
+            mb = np.linspace(0.0, min(each.up_mb[-1] for each in reached), POINTS)
+            accuracy = np.array([np.interp(mb, each.up_mb, each.accuracy) for each in reached])
+            panel.fill_between(mb, accuracy.min(axis=0), accuracy.max(axis=0), color=colour, alpha=0.2, linewidth=0)
+            panel.plot(mb, accuracy.mean(axis=0), color=colour, linewidth=1.8, label=name)
+            panel.plot(mb[-1], accuracy.mean(axis=0)[-1], "o", color=colour, markersize=4)
+        panel.set(xlabel="uplink of the vehicles [MB]", title=f"{setting}, {len(seeds)} seeds")
+        panel.grid(axis="y")
+    panels[0].set(ylabel="accuracy: mean, least to greatest")
     style.key(figure, panels[0].get_legend_handles_labels()[0], ncols=3)
     return figure
+
+
+POINTS = 200  # of a line
 
 
 def _run(out: Path, options: Options) -> Outcome[GroupsResult]:

@@ -156,6 +156,12 @@ def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) ->
     masked = make_level(drives.test, "masked update", None, secure)
     summed = make_level(drives.test, "sum of all", None, secure, by_sum=True)
     results = LeakageResult(len(known), CLIP, DELTA, ROUNDS, tuple(levels), masked, summed, provenance())
+    return results, {"leakage.png": draw_results(results)}
+
+
+def draw_results(results: LeakageResult) -> bytes:
+    """Return the chart of accuracy and attacks by noise as a PNG."""
+    levels = results.levels
     lines = {
         "accuracy": [level.mean["accuracy"] for level in levels],
         "membership, area under the curve": [level.mean["membership_auc"] for level in levels],
@@ -163,7 +169,7 @@ def repeat_leakage(out: Path, seeds: int, progress: Report = ignore_progress) ->
         "picture recognised, of an update": [level.mean["recognised_round"] for level in levels],
     }
     ticks = [f"{level.name}\n{'∞' if level.epsilon is None else f'{level.epsilon:.2g}'}" for level in levels]
-    return results, {"leakage.png": style.png(draw_leakage(ticks, lines))}
+    return style.png(draw_leakage(ticks, lines))
 
 
 def split_members(drives: Drives, seed: int) -> tuple[dict[str, Pictures], dict[str, Pictures]]:
@@ -232,7 +238,6 @@ def make_level(
 
 
 COLOURS = (style.BLUE, style.VERMILLION, style.ORANGE, style.PURPLE)
-NAME_HEIGHT = 0.07  # height of a line of text, as a share of the axes
 
 
 @style.styled
@@ -240,19 +245,18 @@ def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSee
     """Return the chart of shares in [0, 1], a line per name; `levels` are the labels of ticks, noise and epsilon."""
     figure = style.canvas(8.6, 3.9)
     axes = figure.add_subplot()
-    ends = style.keep_apart([line[0].mean for line in lines.values()], NAME_HEIGHT, 1.03)
-    for (name, line), colour, end in zip(lines.items(), COLOURS, ends, strict=True):
-        axes.plot(range(len(levels)), [mean.mean for mean in line], "o-", color=colour, markersize=4)
+    for (name, line), colour in zip(lines.items(), COLOURS, strict=True):
+        axes.plot(range(len(levels)), [mean.mean for mean in line], "o-", color=colour, markersize=4, label=name)
         for x, mean in enumerate(line):
             style.interval(axes, x, mean, color=colour, linewidth=1)
-        axes.annotate(name, (-0.15, end), color=colour, va="center", ha="right", fontsize=style.SMALL)
     axes.axhline(0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
+    axes.annotate("chance of membership", (1, 0.5), (0, -10), xycoords=axes.get_yaxis_transform(), ha="right",
+                  textcoords="offset points", color=style.MUTED, fontsize=style.SMALL)  # fmt: skip
     axes.set_xticks(range(len(levels)), levels)
     axes.set(xlabel="noise of each vehicle, as a multiple of the clipping norm; below: ε", ylim=(-0.02, 1.04))
-    axes.set_xlim(-3.4, len(levels) - 0.7)
-    axes.spines["left"].set_visible(False)
-    axes.yaxis.tick_right()
+    axes.set(ylabel="share, mean over seeds (95 % interval)", xlim=(-0.2, len(levels) - 0.8))
     axes.grid(axis="y")
+    style.key(figure, axes.get_legend_handles_labels()[0], ncols=2)
     return figure
 
 

@@ -4,12 +4,16 @@ import os
 import sys
 from importlib.util import find_spec
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import typer
 
 from flcav.cli.options import check_finite, check_png
 from flcav.cli.terminal import echo
 from flcav.interface.wording import plural
+
+if TYPE_CHECKING:
+    from flcav.dataset.store import Dataset
 
 
 def birdseye(
@@ -67,14 +71,27 @@ def camera(
     echo(f"{out}: {seen.key}, {', '.join(shown for row in rows for shown in row)}")
 
 
+def open_shown(folder: Path) -> "Dataset":
+    """Return the dataset in a folder, or of a run's folder the test frames of its first federating region and task."""
+    from flcav.dataset.store import Dataset
+    from flcav.runs.frames import Frames
+    from flcav.runs.results.run import Run
+    from flcav.runs.running import WORK
+
+    if not (folder / Run.file).is_file():
+        return Dataset.open(folder)
+    run = Run.load(folder)
+    region, task = run.recipe.with_role("federate")[0], next(iter(run.recipe.tasks))
+    return Frames.open(folder / WORK / run.steps.recording(region, "test", task)).data
+
+
 def view(
-    folder: Path = typer.Argument(metavar="DIR", help="A dataset."),
+    folder: Path = typer.Argument(metavar="DIR", help="A dataset, or the folder of a run, for its test frames."),
     scene: str | None = typer.Option(None, "--scene", help="Name of the scene; else the first."),
     save: Path | None = typer.Option(None, "--save", help="Write this .rrd file instead of opening the viewer."),
 ) -> None:
     """Show a scene in Rerun: points, images, boxes, tracks, map, radar. Needs the extra `view`."""
     from flcav.config import InputError
-    from flcav.dataset.store import Dataset
     from flcav.interface import progress
     from flcav.interface.wording import format_install_command
     from flcav.storage.files import atomic_path
@@ -89,7 +106,7 @@ def view(
 
     from flcav.report.pictures.rerun_log import blueprint, log_scene
 
-    dataset = Dataset.open(folder)
+    dataset = open_shown(folder)
     scenes = dataset.manifest.scenes
     if scene is not None and scene not in scenes:
         raise InputError(f"{folder}: no scene '{scene}'; it has {', '.join(scenes)}")

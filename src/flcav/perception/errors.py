@@ -132,6 +132,17 @@ def keep_first(errors: Iterable[PerceptionError]) -> tuple[PerceptionError, ...]
     return tuple(kept.values())
 
 
+def is_among(error: PerceptionError, others: Iterable[PerceptionError], *, standing: bool = False) -> bool:
+    """Return whether the same mistake is among `others`; `standing`: as in `Registry`.
+
+    A miss or forecast is the same where scene and track are, a false positive within `SAME_PLACE_M` in the same scene.
+    """
+    alike = [other for other in others if other.kind == error.kind]
+    if error.kind == FALSE_POSITIVE:
+        return any(other.scene == error.scene and _distance(other, error) <= SAME_PLACE_M for other in alike)
+    return any(other.track == error.track and (standing or other.scene == error.scene) for other in alike)
+
+
 def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
     """Write mistakes as Parquet or CSV, by the suffix of `path`; raises `InputError` for any other suffix.
 

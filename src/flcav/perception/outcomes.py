@@ -128,6 +128,25 @@ class MeasuresMore(Protocol):
         ...
 
 
+@dataclass(frozen=True)
+class Counted:
+    """What a network found of a test's targets, as numbers of objects."""
+
+    noun: str  # of several targets, such as "cars"
+    targets: int
+    found: int
+    false: int | None  # detections of nothing; None for a task without them
+
+
+@runtime_checkable
+class Counts(Protocol):
+    """A task whose outcomes say how many targets a network found, at the score from which its detections are used."""
+
+    def count(self, outcomes: Outcomes) -> Counted:
+        """Return the numbers of targets, of those found, and of false detections."""
+        ...
+
+
 def further_measures(task: Task) -> Mapping[str, Measure]:
     """Return the further measures of a task by name; empty where it has none."""
     return task.further_measures if isinstance(task, MeasuresMore) else {}

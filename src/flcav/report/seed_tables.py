@@ -7,7 +7,9 @@ import numpy as np
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.run_tables import LABELS, judge_anew
+from flcav.runs.analysis.claims import word_claim
 from flcav.runs.analysis.costs import list_home_costs
+from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import MAIN, PRETRAIN
 from flcav.runs.results.run import Run, Summary
 from flcav.runs.results.tests import Difference
@@ -87,9 +89,27 @@ def _labels(runs: Sequence[Run]) -> str:
 
 
 def draw_seeds(runs: Sequence[Run]) -> bytes:
-    """Return a PNG of the differences of the primary claims, a row per seed."""
+    """Return a PNG of the differences of the primary claims and of the dearest cost at home, a row per seed."""
     panels: dict[str, dict[str, Estimate]] = {}
+    settings = resolve_settings(runs[0].recipe)
     for run in runs:
+        seed = f"seed {run.recipe.seed}"
         for difference, _ in _list_primary(run):
-            panels.setdefault(difference.name, {})[f"seed {run.recipe.seed}"] = difference.estimate
-    return style.png(figures.arms(panels, f"difference in {runs[0].tested[0].result.measure} (95 % interval)"))
+            claim = word_claim(difference, run.recipe, settings)
+            panels.setdefault(f"{claim}:\n{run.tested[0].measure} in {difference.region}", {})[seed] = (
+                difference.estimate
+            )
+    mean = {(row.region, row.task, row.measure): 0.0 for row in list_home_costs(runs[0])}
+    for run in runs:
+        for row in list_home_costs(run):
+            mean[row.region, row.task, row.measure] += row.difference.mean / len(runs)
+    if mean:
+        dearest = min(mean, key=lambda key: mean[key])
+        costs = {
+            f"seed {run.recipe.seed}": row.difference
+            for run in runs
+            for row in list_home_costs(run)
+            if (row.region, row.task, row.measure) == dearest
+        }
+        panels[f"The price, after cloud FL:\n{dearest[2]} at home in {dearest[0]}"] = costs
+    return style.png(figures.seeds(panels))

@@ -375,6 +375,10 @@ class Names:
         """Return the name of the step that registers a task's errors in a region."""
         return f"{region}-errors-{task}" + self._suffix(arm, PLANNED)
 
+    def remaining(self, region: str, task: str) -> str:
+        """Return the name of the step that compares a region's registered errors with those after edge FL."""
+        return f"{region}-errors-after-{task}"
+
     def place(self, arm: str, region: str) -> str:
         """Return the name of the step that places roadside sensors in a region."""
         return f"{region}-place" + self._suffix(arm, PLACED)

@@ -85,13 +85,19 @@ class SampleSize:
     by_trainings: bool  # whether some number of trainings detects it on the scenes at hand
     by_scenes: bool  # whether some number of scenes detects it with the trainings at hand
 
-    def describe(self, word: str) -> str:
-        """Return the numbers as text, and which of them does not suffice alone; `word`: the plural of a training."""
+    def tell(self, word: str) -> str:
+        """Return both numbers as text; `word`: the plural of a training."""
         if self.trainings is None or self.scenes is None:
             return f"more than {MOST_SEEDS} {word} on {MOST_SCENES} scenes"
-        trainings, scenes = self.now
         needed = f"{self.trainings} {word if self.trainings > 1 else word[:-1]}"
-        text = f"about {needed} on {'these ' if self.scenes == scenes else ''}{plural(self.scenes, 'scene')}"
+        return f"about {needed} on {'these ' if self.scenes == self.now[1] else ''}{plural(self.scenes, 'scene')}"
+
+    def describe(self, word: str) -> str:
+        """Return the numbers as text, and which of them does not suffice alone; `word`: the plural of a training."""
+        text = self.tell(word)
+        if self.trainings is None or self.scenes is None:
+            return text
+        trainings, scenes = self.now
         cannot = [] if self.by_trainings else [f"no number of {word} does on these {scenes} scenes"]
         if not self.by_scenes:
             these = f"one {word[:-1]}" if trainings == 1 else f"these {trainings} {word}"

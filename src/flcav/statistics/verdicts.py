@@ -83,6 +83,14 @@ class Judged:
         takes = f"about {self.seeds} {word}" if self.seeds else f"more than {MOST_SEEDS} {word}"
         return f"{text}; detecting an effect of this size takes {self.size.describe(word) if self.size else takes}"
 
+    def tell_needs(self, word: str = "seeds") -> str:
+        """Return what would decide an undecided claim, as text such as "needs about 7 trainings on 37 scenes"."""
+        if self.verdict != UNDECIDED or self.p is None:
+            return ""
+        if self.size is not None:
+            return f"needs {self.size.tell(word)}"
+        return f"needs about {self.seeds} {word}" if self.seeds else f"needs more than {MOST_SEEDS} {word}"
+
     @property
     def p_cell(self) -> str:
         """Return the corrected p for a table, and the uncorrected one of `alone`; empty where p is not known."""

@@ -3,12 +3,19 @@
 from dataclasses import replace
 from io import BytesIO
 
+import numpy as np
 import pytest
 from PIL import Image
 
 from flcav.driving.errors import load_error_model
 from flcav.driving.measures import DriveResult, Hit
-from flcav.reproductions.safety_distance.run import SafetyDistance, list_settings, summarise_margins
+from flcav.reproductions.safety_distance.run import (
+    SafetyDistance,
+    bound_count,
+    draw_trade_off,
+    list_settings,
+    summarise_margins,
+)
 from flcav.storage.records import from_json
 
 HIT = Hit(3.0, "car", "vehicle", 5.0, at_fault=True)
@@ -51,3 +58,15 @@ def test_margins_are_told_drawn_and_read_back(results: SafetyDistance) -> None:
     assert results.sentences()[0].startswith("fixed 0 m: 1 collisions at fault in 2 drives, 2.00 hard brakes a drive")
     with Image.open(BytesIO(results.picture())) as picture:
         assert picture.format == "PNG"
+
+
+def test_collisions_have_the_exact_interval_of_a_count_and_no_line() -> None:
+    assert bound_count(0) == pytest.approx((0.0, 3.689), abs=1e-3)  # tabulated by Garwood
+    assert bound_count(2) == pytest.approx((0.242, 7.225), abs=1e-3)
+    axes = draw_trade_off({"fixed": [(3.0, 0.01, 1.0, 2), (4.0, 0.02, 2.0, 0)]}, 48).axes[2]
+    assert axes.get_title(loc="left") == "collisions at fault, in 48 drives"
+    (dots,) = (line for line in axes.get_lines() if line.get_marker() == "o")
+    assert dots.get_linestyle() == "None"
+    assert [0.2422, 7.2247] in [
+        np.round(np.asarray(line.get_ydata(), np.float64), 4).tolist() for line in axes.get_lines()
+    ]

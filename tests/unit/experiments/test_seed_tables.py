@@ -4,12 +4,15 @@ from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
 
+import numpy as np
 import pytest
 from PIL import Image
 
+from flcav.report.charts import figures
 from flcav.report.seed_tables import draw_seeds, tables
 from flcav.runs.analysis.summary import count_claims
 from flcav.runs.results.run import Run, Summary
+from flcav.statistics.estimates import Estimate
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"
@@ -48,3 +51,12 @@ def test_the_picture_has_a_row_per_seed_and_claim(demo: Run) -> None:
     other = replace(demo, recipe=demo.recipe.model_copy(update={"seed": 2}))
     heights = [Image.open(BytesIO(draw_seeds(runs))).height for runs in ([demo], [demo, other])]
     assert heights[1] > heights[0]
+
+
+def test_the_picture_of_seeds_counts_intervals_beyond_0() -> None:
+    gains = {"seed 1": Estimate(0.1, 0.05, 0.15), "seed 2": Estimate(0.02, -0.01, 0.05)}
+    costs = {"seed 1": Estimate(-0.1, -0.15, -0.05), "seed 2": Estimate(-0.2, -0.3, -0.1)}
+    left, right = figures.seeds({"a claim": gains, "the price": costs}).axes
+    assert left.get_xlabel() == "above 0 in 1 of 2 intervals (95 %)"
+    assert right.get_xlabel() == "below 0 in 2 of 2 intervals (95 %)"
+    assert [0.05, 0.15] in [np.asarray(line.get_xdata()).tolist() for line in left.get_lines()]

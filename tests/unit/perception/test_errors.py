@@ -17,6 +17,7 @@ from flcav.perception.errors import (
     MISS,
     PerceptionError,
     Registry,
+    is_among,
     keep_first,
     pack_errors,
     save_errors,
@@ -184,3 +185,18 @@ def test_errors_need_a_task_with_places(drive, tmp_path: Path, capsys: pytest.Ca
         run(["errors", "weather", "--data", str(drive.folder), "--out", str(tmp_path / "errors.csv")])
     assert stopped.value.code == 2
     assert "no place in a town" in capsys.readouterr().err
+
+
+def test_the_same_mistake_is_one_of_the_same_object_or_a_false_box_nearby_in_the_same_scene() -> None:
+    def mistake(kind: str, scene: str, track: str, x: float = 0.0) -> PerceptionError:
+        return PerceptionError(x, 0.0, 0.0, 1.0, kind, "Car", 0, 0.0, scene, track)
+
+    others = [mistake(MISS, "one", "car3"), mistake(FALSE_POSITIVE, "one", "false_positive0", 10.0)]
+    assert is_among(mistake(MISS, "one", "car3", 50.0), others)
+    assert not is_among(mistake(MISS, "two", "car3"), others)
+    assert is_among(mistake(MISS, "two", "car3"), others, standing=True)
+    assert not is_among(mistake(MISS, "one", "car4"), others)
+    assert not is_among(mistake(FINAL_ERROR, "one", "car3"), others)
+    assert is_among(mistake(FALSE_POSITIVE, "one", "false_positive7", 11.9), others)
+    assert not is_among(mistake(FALSE_POSITIVE, "one", "false_positive0", 12.1), others)
+    assert not is_among(mistake(FALSE_POSITIVE, "two", "false_positive0", 10.0), others, standing=True)

@@ -3,6 +3,7 @@
 import numpy as np
 
 from flcav.geometry import Boxes
+from flcav.report.pictures.changes import ErrorChanges
 from flcav.report.pictures.clouds import ComparedSweep, MatchedDetections
 from flcav.report.pictures.maps import DENSEST, ErrorMap, poles_of
 from flcav.runs.provenance import Provenance
@@ -14,6 +15,7 @@ from flcav.runs.results.tests import Difference, RunFinding, Test, Tested
 from flcav.runs.results.training import Pretrained, Validated
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.storage.records import select
+from flcav.world.line_of_sight import Viewshed
 from flcav.world.map.town import load_town
 
 MEANS = {"grid": (0.412, 0.503, 0.511), "ring": (0.381, 0.447, 0.468)}
@@ -120,6 +122,25 @@ def error_map(town: str = "grid", errors: int = 61) -> ErrorMap:
     kind = np.where(rng.random(errors) < 0.7, "miss", "false_positive")
     xyz = np.c_[xy, np.full(errors, 0.8)]
     return ErrorMap(place, xyz, kind, poles_of(place), chosen={"2": 40.0}, conventional={DENSEST: ("8",)})
+
+
+def changes() -> ErrorChanges:
+    """Return errors of which every third remains, with two new ones, and one pole's view of the west."""
+    scene = error_map()
+    axis = np.linspace(-40, 40, 41)
+    site = scene.poles["2"]
+    west = Viewshed(site[0] + axis, site[1] + axis, np.broadcast_to(axis < 0, (41, 41)))
+    return ErrorChanges(
+        town=scene.town,
+        errors=scene.errors,
+        kind=scene.kind,
+        remains=np.arange(len(scene.errors)) % 3 == 0,
+        seen=np.zeros(len(scene.errors), np.bool_),
+        new=scene.errors[:2] + 3.0,
+        new_kind=np.array(["miss", "false_positive"]),
+        poles=dict(scene.poles),
+        viewsheds={"2": west},
+    )
 
 
 def sweep() -> ComparedSweep:

@@ -12,7 +12,12 @@ from matplotlib.text import Text
 
 from flcav.report import style
 from flcav.report.charts import figures
+from flcav.report.charts.placement import draw_correlations
+from flcav.report.charts.studies import Bar, precision_table
+from flcav.report.pictures import perspective
+from flcav.report.pictures.changes import GONE, NEW, REMAINING, draw_changes
 from flcav.report.pictures.maps import DENSEST, MOST_VISIBLE
+from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
 from flcav.world.geodesy import find_on_ground
 from flcav.world.line_of_sight import Viewshed
@@ -28,11 +33,12 @@ ARMS = {
 
 DRAWN: dict[str, Callable[[], Figure]] = {
     "town_map": lambda: figures.town_map(made_up_run.error_map()),
-    "before_after": lambda: figures.before_after(made_up_run.sweep()),
+    "changes": lambda: draw_changes(made_up_run.changes()),
+    "before_after": lambda: perspective.before_after(made_up_run.sweep()),
     "by_round": lambda: figures.by_round(ROUNDS, TESTED, "AP50"),
     "megabytes": lambda: figures.megabytes(SENT, BUDGETS),
     "arms": lambda: figures.arms(ARMS),
-    "overview": lambda: figures.overview(made_up_run.error_map(), made_up_run.sweep(), ROUNDS, TESTED, "AP50"),
+    "overview": lambda: figures.overview(made_up_run.changes(), made_up_run.sweep(), TESTED, "AP50"),
 }
 
 
@@ -161,22 +167,46 @@ def test_zones_stand_on_the_map_with_their_density() -> None:
 
 
 def test_sweeps_count_what_was_found_missed_and_false() -> None:
-    before, after = figures.before_after(made_up_run.sweep()).axes
-    counts = [[text.get_text() for text in axes.get_legend().get_texts()] for axes in (before, after)]  # type: ignore
-    assert counts == [["2 found", "3 missed", "1 false"], ["4 found", "1 missed", "0 false"]]
+    before, after = perspective.before_after(made_up_run.sweep()).axes
+    told = [axes.texts[0].get_text() for axes in (before, after)]
+    assert told == ["Pretrained: 2 of 5 found, 1 false", "Edge + cloud FL: 4 of 5 found, 0 false"]
 
 
-def test_ahead_is_up_and_left_is_left() -> None:
-    sweep = made_up_run.sweep()
-    axes = figures.before_after(sweep).axes[0]
-    centres = [
-        np.asarray(path.vertices)[:4].mean(axis=0)
-        for boxes in axes.collections
-        for path in boxes.get_paths()
-        if len(np.asarray(path.vertices)) == 5
-    ]
-    for x, y, _ in sweep.targets.center:
-        assert np.isclose(centres, (-y, x)).all(axis=1).any()
+def test_a_sweep_is_seen_from_behind_and_above() -> None:
+    ground_m = -1.7
+    eye = np.array([[perspective.EYE[0], 0.0, ground_m + perspective.EYE[1]]])
+    along = np.array([[np.cos(perspective.DOWN), 0.0, -np.sin(perspective.DOWN)]])  # the axis of view
+    at, depth = perspective.project(eye + 20 * along + [[0, 0, 0], [0, 2, 0]], ground_m)
+    np.testing.assert_allclose(depth, 20)
+    np.testing.assert_allclose(at, [[0, 0], [-0.1, 0]], atol=1e-12)  # 2 m to the left at 20 m
+    near, far = perspective.project(np.array([[10.0, 0, ground_m], [40.0, 0, ground_m]]), ground_m)[0]
+    assert near[1] < far[1]
+
+
+def test_the_map_of_changes_counts_what_is_gone_left_and_new_and_draws_no_disc() -> None:
+    changes = made_up_run.changes()
+    figure = draw_changes(changes)
+    axes = figure.axes[0]
+    words = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert words[:3] == [f"{changes.gone} gone", f"{len(changes.errors) - changes.gone} left", "2 new"]
+    assert not [patch for patch in axes.patches if isinstance(patch, Circle)]
+    by_colour: dict[str, int] = {}
+    for line in axes.get_lines():
+        colour = str(line.get_color())
+        by_colour[colour] = by_colour.get(colour, 0) + len(np.asarray(line.get_xdata()))
+    assert by_colour[GONE] == changes.gone
+    assert by_colour[REMAINING] == len(changes.errors) - changes.gone
+    assert by_colour[NEW] == 2
+
+
+def test_a_drawing_of_a_page_takes_its_colours_and_fonts() -> None:
+    drawn = style.svg(draw_changes(made_up_run.changes()))
+    assert drawn.startswith("<svg")
+    assert f"{made_up_run.changes().gone} gone</text>" in drawn
+    assert "var(--house)" in drawn
+    assert not any(colour in drawn for colour in style.VARIABLES)
+    assert "font-family" not in drawn
+    assert drawn == style.svg(draw_changes(made_up_run.changes()))
 
 
 def test_validation_and_test_frames_stand_on_axes_of_their_own() -> None:
@@ -243,3 +273,50 @@ def test_a_measure_of_one_scene_is_drawn_without_a_bar() -> None:
         1: {0.503, 0.447},
         2: {0.511, 0.468},
     }
+
+
+@pytest.mark.parametrize("top", [1.0, 0.62])
+def test_names_of_lines_stand_as_near_their_ends_as_can_be(top: float) -> None:
+    ends = [0.2, 0.61, 0.6, 0.58, 0.9]
+    places = style.keep_apart(ends, 0.1, top)
+    order = np.argsort(ends)[::-1]
+    assert (np.diff(np.array(places)[order]) <= -0.1 + 1e-12).all()
+    assert max(places) <= top
+    if top == 1.0:
+        assert places[0] == pytest.approx(0.2)
+        assert places[4] == pytest.approx(0.9)
+        assert np.mean([places[i] for i in (1, 2, 3)]) == pytest.approx(np.mean([0.61, 0.6, 0.58]))  # moved both ways
+
+
+def test_a_table_of_precisions_has_means_ranges_and_numbers_of_targets() -> None:
+    panels = {
+        "grid": [Bar("Car", 0.8, (0.7, 0.9), 120), Bar("Cyclist", 0.3, (0.3,), 9)],
+        "ring": [Bar("Car", 0.6, (0.6, 0.6), 80)],
+    }
+    axes = precision_table(panels, "AP").axes[0]
+    told = {text.get_text(): text.get_position() for text in axes.texts}
+    assert told.keys() == {"0.80 ±0.10", "120", "0.30", "9", "0.60 ±0.00", "80"}
+    assert told["80"][0] == 1
+    assert told["9"][1] == pytest.approx(1.24)
+
+
+def test_correlations_show_every_seed_and_the_mean_with_its_interval() -> None:
+    seeds = {"errors covered": {"all": [0.1, 0.5, -0.2]}, "traffic": {"all": [0.0, 0.2, 0.1]}}
+    means = {"errors covered": {"all": Estimate(0.13, -0.3, 0.6)}, "traffic": {"all": Estimate(0.1, None, None)}}
+    axes = draw_correlations(seeds, means).axes[0]
+    lines = [
+        (line.get_marker(), np.asarray(line.get_xdata()).tolist(), np.asarray(line.get_ydata()).tolist())
+        for line in axes.get_lines()
+    ]
+    assert ("o", [0.1, 0.5, -0.2], [0.0, 0.0, 0.0]) in lines
+    assert ("None", [-0.3, 0.6], [0.0, 0.0]) in lines
+    assert [x for marker, x, _ in lines if marker == "s"] == [[0.13], [0.1]]
+
+
+def test_arms_by_question_share_an_axis_and_marks() -> None:
+    figure = figures.arms_by_question({"a": ARMS["grid"], "b": ARMS["ring"], "c": ARMS["grid"]}, {"pretrained": 0.41})
+    assert [axes.get_title(loc="left") for axes in figure.axes][:3] == ["a", "b", "c"]
+    for axes in figure.axes[:3]:
+        assert 0.41 in [float(np.asarray(line.get_xdata())[0]) for line in axes.get_lines()]
+        assert "0.410  (0.380–0.450)" in [text.get_text() for text in axes.texts]
+    assert [text.get_text() for text in figure.legends[0].get_texts()] == ["pretrained"]

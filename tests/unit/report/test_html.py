@@ -8,7 +8,7 @@ import pytest
 from jinja2 import UndefinedError
 
 from flcav.report.pages.html import render
-from flcav.report.pages.run_page import page
+from flcav.report.pages.run_page import Seen, page
 from flcav.runs.recipe import MAIN
 from flcav.runs.results.plans import Plan
 from flcav.runs.results.run import Run
@@ -18,7 +18,8 @@ from flcav.statistics.estimates import Estimate
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
 PIXEL = b"\x89PNG made up"
-PICTURES: dict[str, bytes] = dict.fromkeys(("map_grid", "before_after", "rounds_objects", "megabytes"), PIXEL)
+PICTURES: dict[str, bytes] = {"before_after": PIXEL}
+DRAWINGS: dict[str, str] = dict.fromkeys(("rounds_objects", "megabytes"), "<svg><g></g></svg>")
 
 
 def results() -> dict[str, Any]:
@@ -53,13 +54,19 @@ class Page(HTMLParser):
 
 
 def test_the_page_needs_nothing_but_itself() -> None:
-    text = render(results(), PICTURES)
+    text = render(results(), PICTURES, drawings=DRAWINGS)
     read = Page(text)
     assert read.open == []
     assert not {"script", "link", "iframe"} & {tag for tag, _ in read.tags}
-    sources = [attributes[key] for _, attributes in read.tags for key in ("src", "href") if key in attributes]
-    assert len(sources) == 4
-    assert all(str(source).startswith("data:image/png;base64,") for source in sources)
+    sources = [str(attributes["src"]) for _, attributes in read.tags if "src" in attributes]
+    assert len(sources) == 1
+    assert all(source.startswith("data:image/png;base64,") for source in sources)
+    assert sum(tag == "svg" for tag, _ in read.tags) == 2
+    links = {str(attributes["href"]) for _, attributes in read.tags if "href" in attributes}
+    places = {f"#{attributes['id']}" for _, attributes in read.tags if "id" in attributes}
+    assert {link for link in links if link.startswith("#")} <= places
+    files = {"results.csv", "results.json", "pictures/", "ledgers/", "work/"}
+    assert {link for link in links if not link.startswith("#")} == files  # beside the page
     assert "url(" not in text
     assert "viewport" in {attributes.get("name") for tag, attributes in read.tags if tag == "meta"}
     assert all(attributes.get("alt") for tag, attributes in read.tags if tag == "img")
@@ -68,8 +75,8 @@ def test_the_page_needs_nothing_but_itself() -> None:
 def test_the_page_tells_the_numbers() -> None:
     text = Page(render(results(), PICTURES)).text
     for shown in (
-        "objects, edge FL 0.475 0.446–0.502",  # (0.503 + 0.447) / 2, and both intervals in quadrature, halved
-        "the mean over grid and ring, with 95 % intervals",
+        "objects AP50 edge FL 0.475 0.446–0.502",  # (0.503 + 0.447) / 2, and both intervals in quadrature, halved
+        "Means over grid and ring, with 95 % intervals",
         "edge + cloud FL ring 0.468 0.427–0.506 not known 0.278 0.960 96 8",
         "ideal road detector, upper bound",
         "grid, objects: edge FL - pretrained +0.091 +0.041 to +0.141 0.015 of 9",
@@ -84,17 +91,37 @@ def test_the_page_tells_the_numbers() -> None:
 
 def test_an_interval_that_one_scene_leaves_unknown_is_said() -> None:
     told = results()
-    first = told["stages"][0]
-    told["stages"][0] = replace(first, estimate=replace(first.estimate, low=None, high=None))
+    first = told["means"][0]
+    told["means"][0] = replace(first, estimate=replace(first.estimate, low=None, high=None))
     assert f"pretrained {first.estimate.mean:.3f} no interval: one scene" in Page(render(told, PICTURES)).text
 
 
 def test_verdicts_stand_at_their_findings() -> None:
     text = render(results(), PICTURES)
     told = Page(text).text
-    assert "undecided grid, objects Does cloud help? What cloud did." in told
+    assert "undecided Does cloud help? What cloud did." in told
     assert told.count("What pole did.") == 1
     assert '<span class="badge did-not-hold">did not hold</span>' in text
+    assert "Edge FL beats the pretrained network grid 0.412 → 0.503 +0.091 +0.041 to +0.141 held" in told
+
+
+def test_the_bars_of_differences_share_an_axis_with_0_on_it() -> None:
+    told = results()
+    low, high = told["axis"]
+    assert low < 0 < 0.141 < high
+    text = render(told, {})
+    assert f"left: {100 * (0.091 - low) / (high - low):.2f}%" in text
+    assert f"left: {100 * (0.041 - low) / (high - low):.2f}%; width: {100 * 0.1 / (high - low):.2f}%" in text
+
+
+def test_the_map_of_changes_comes_first_with_its_counts() -> None:
+    changes = made_up_run.changes()
+    run = made_up_run.run()
+    text = render(page(run, Seen({"grid": changes})), PICTURES, drawings=DRAWINGS | {"map_grid": "<svg></svg>"})
+    read = Page(text)
+    assert next(tag for tag, _ in read.tags if tag in ("svg", "img")) == "svg"
+    assert f"{changes.gone} of 61 errors in grid are gone, 2 are new." in read.text
+    assert "Pole 2 of 9, by most errors in reach: 19 of them within 40 m, 0 in sight past the houses." in read.text
 
 
 def test_plans_that_were_made_anew_are_told() -> None:
@@ -116,7 +143,8 @@ def test_values_are_escaped() -> None:
 
 
 def test_a_picture_that_was_not_made_is_left_out() -> None:
-    read = Page(render(results(), {"megabytes": PIXEL}))
+    read = Page(render(results(), PICTURES, drawings={"megabytes": "<svg></svg>"}))
+    assert [tag for tag, _ in read.tags].count("svg") == 1
     assert [tag for tag, _ in read.tags].count("img") == 1
 
 
@@ -137,21 +165,11 @@ def test_the_uploads_of_vehicles_are_on_the_page_where_they_are_planned() -> Non
     assert "suburb/cav0 211 suburb/cav1 109" in told
 
 
-def test_a_placed_pole_is_told_with_what_it_covers_and_with_its_ties() -> None:
-    run = made_up_run.run()
-    assert "put on pole 2 of 9: 19 of 61 registered mistakes are in reach, more than of any other choice." in (
-        Page(render(page(run), PICTURES)).text
-    )
-    tied = Run.load(DEMO, RESULTS)
-    told = Page(render(page(tied), {})).text
-    assert "put on pole 2 of 9: 17 of 109 registered mistakes are in reach, as many as of pole 6." in told
-
-
 def test_what_federated_learning_costs_at_home_is_on_the_page() -> None:
     run = Run.load(DEMO, RESULTS)
     told = Page(render(page(run), {})).text
-    assert "AP70 of objects in suburb, the town of pretraining: 0.547 pretrained, 0.125 after" in told
+    assert "At home in suburb, that network loses AP70 0.547 → 0.125." in told
     cost = HomeCost("suburb", "objects", "AP70", 0.5, 0.1, Estimate(-0.4, -0.5, -0.3), 3)
     told = Page(render(page(replace(run, home=(cost,))), {})).text
-    assert "0.100 after federated learning, -0.400 (95 % interval -0.500 to -0.300)." in told
-    assert "costs at home" not in Page(render(results(), PICTURES)).text
+    assert "AP70 at home, in suburb 0.500 → 0.100 −0.400 (−0.500 to −0.300)" in told
+    assert "At home" not in Page(render(results(), PICTURES)).text

@@ -8,7 +8,15 @@ import pytest
 
 from flcav.perception.metrics import Matches
 from flcav.perception.objects.evaluate import CLASSES, HIDDEN, KEPT
-from flcav.perception.outcomes import Outcomes, as_measurable, count_once, difference, further_measures
+from flcav.perception.outcomes import (
+    Counted,
+    Counts,
+    Outcomes,
+    as_measurable,
+    count_once,
+    difference,
+    further_measures,
+)
 from flcav.perception.tasks import TASKS, task_named
 from flcav.runs.analysis.costs import list_home_costs
 from flcav.runs.results.run import Run
@@ -61,3 +69,17 @@ def test_results_tell_the_cost_of_every_measure_at_home() -> None:
     assert list_home_costs(replace(run, home=(kept,))) == [own, kept]
     again = Run.from_json(replace(run, home=(kept,)).as_json(), "again")
     assert again.home == (kept,)
+
+
+def test_found_and_false_are_counted_from_the_score_at_which_errors_are_registered() -> None:
+    tested = outcomes({"3d50": 0.7, "bev50": 0.9, "3d70": 0.3})
+    assert isinstance(OBJECTS, Counts)
+    score, hit = tested.arrays["Car/3d50/score"], tested.arrays["Car/3d50/hit"]
+    found = sum(1 for s, h in zip(score, hit, strict=True) if s >= 0.3 and h)
+    false = sum(1 for s, h in zip(score, hit, strict=True) if s >= 0.3 and not h)
+    assert 0 < false < found
+    assert OBJECTS.count(tested) == Counted("cars", 48, found, false)
+    weather = task_named("weather")
+    assert isinstance(weather, Counts)
+    named = Outcomes(np.array(["a", "a", "b"]), {"truth": np.array([0, 1, 2]), "named": np.array([0, 2, 2])})
+    assert weather.count(named) == Counted("pictures", 3, 2, None)

@@ -9,8 +9,9 @@ import pytest
 
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
+from flcav.runs.results.tests import SweepTotal
 from flcav.runs.stages import testing
-from flcav.runs.stages.testing import detect_before_after
+from flcav.runs.stages.testing import choose_sweep, detect_before_after
 
 
 def cars(*places: float) -> Boxes:
@@ -28,7 +29,7 @@ FOUND = {  # by frame: before, after
 }
 
 
-def test_the_sweep_that_is_shown_is_the_median_by_gain(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sweep_that_is_shown_changes_as_all_together_do(monkeypatch: pytest.MonkeyPatch) -> None:
     def detect(network: Any, frames: list[int], score_threshold: float) -> list[Boxes]:
         return [cars(*FOUND[frame][network.number]) for frame in frames]
 
@@ -41,5 +42,21 @@ def test_the_sweep_that_is_shown_is_the_median_by_gain(monkeypatch: pytest.Monke
     monkeypatch.setattr(testing, "detect_in", detect)
     split: Any = SimpleNamespace(data=SimpleNamespace(frame=lambda i: i), vehicles=tuple(TARGETS))
     shown = detect_before_after(Path("0"), Path("1"), split)
-    assert shown.frame == 4  # gains 2, 1, -1, 1: the median is 1, and this frame has more targets than the other
-    assert (shown.before.found, shown.after.found) == ((True, False, False), (True, True, False))
+    # Of all 8 targets 2 were found and then 7, with 1 false detection and then 2. Frame 5 alone has more found and more
+    # false ones.
+    assert shown.frame == 5
+    assert shown.total == SweepTotal(sweeps=5, targets=8, found=(2, 7), false=(1, 2))
+    assert (shown.before.found, shown.after.found) == ((True, False), (True, True))
+
+
+@pytest.mark.parametrize(
+    ("counts", "chosen"),
+    [
+        ([(4, 1, 3, 1, 0), (4, 2, 3, 1, 0), (4, 2, 4, 2, 1)], 1),  # all change alike: the nearest shares, 5/12 to 10/12
+        ([(4, 2, 2, 1, 1), (4, 1, 3, 2, 0), (4, 3, 2, 0, 1)], 1),  # the sums are like none but this
+        ([(0, 0, 0, 1, 0), (4, 3, 2, 0, 1)], 1),  # a run that got worse; a sweep without targets shows nothing
+        ([(2, 1, 1, 0, 0), (3, 1, 1, 0, 0)], 1),  # nothing changes: 2/5 is nearer to 1/3 than to 1/2
+    ],
+)
+def test_the_rule_of_the_sweep(counts: list[tuple[int, ...]], chosen: int) -> None:
+    assert choose_sweep(np.array(counts)) == chosen

@@ -13,6 +13,8 @@ from flcav.cli.terminal import Answer, answer_json
 from flcav.interface.wording import plural
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
     from scipy.sparse import csr_array
 
     from flcav.config import Json
@@ -129,8 +131,9 @@ def place(
         result, least = cover_share(candidates, cover or 0.0, method=method.value)
     limit = budget if budget is not None else float(count or result.cost)
     conventional = _place_conventionally(candidates, given, limit, here, traces)
+    beyond = np.asarray(candidates.covers.sum(axis=0)).ravel() == 0
     if map_ is not None and here is not None:
-        _draw(map_, here, given, result, conventional, seen, traces)
+        _draw(map_, here, given, result, conventional, seen, traces, beyond)
     hidden = None
     if driving and here is not None:
         from flcav.driving.studies.pole_gain import count_hidden
@@ -166,6 +169,8 @@ def place(
     }
     yield from given.notes
     yield from _list_lines(given, np.diff(candidates.covers.indptr).tolist(), result, conventional, least, here)
+    if beyond.any():
+        yield f"beyond every pole: {beyond.sum()} of {given.count()}"
     if curve:
         yield from _list_curve(given, [*steps, result])
     if hidden is not None:
@@ -295,10 +300,12 @@ def _draw(
     conventional: "dict[str, Placement | None]",
     seen: "csr_array | None",
     traces: "list[Trace]",
+    beyond: "NDArray[np.bool_]",
 ) -> None:
     """Write the map of errors, poles, the placement, and the placements by conventional rules.
 
-    With line of sight (`seen`), the map shows the viewsheds of the sensors.
+    With line of sight (`seen`), the map shows the viewsheds of the sensors. `beyond` (E,): whether no pole reaches an
+    error.
     """
     from flcav.report import style
     from flcav.report.charts.figures import town_map
@@ -333,6 +340,7 @@ def _draw(
         heat=True,
         title=f"{town.name}: {plural(len(placed.chosen), 'sensor')} for {given.count()}",
         noun=given.noun,
+        beyond=beyond,
     )
     write_bytes(path, style.png(town_map(scene, MAP_IN)))
 

@@ -18,6 +18,7 @@ from flcav.geometry import Boxes, concatenate
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
 from flcav.perception.agents import frame_reader
+from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import (
     FoundCars,
     Matches,
@@ -45,7 +46,7 @@ from flcav.perception.objects.truth import (
     share_range,
 )
 from flcav.perception.ops.boxes import Kind
-from flcav.perception.outcomes import Measure, Outcomes, Times, Values
+from flcav.perception.outcomes import Counted, Measure, Outcomes, Times, Values
 from flcav.perception.task import Evaluated
 from flcav.statistics.bootstrap import REDRAWS
 from flcav.statistics.streams import stream
@@ -357,6 +358,17 @@ class ObjectsOutcomes:
             "targets": float(sum(int(matches.targets.sum()) for matches in per_class)),
             "hidden": float(outcomes.arrays[HIDDEN].sum()),
         }
+
+    def count(self, outcomes: Outcomes) -> Counted:
+        """Return the numbers of targets, of those found at IoU 0.5 in 3D, and of false detections, over all classes.
+
+        Detections below the score `THRESHOLD` do not count.
+        """
+        classes = outcomes.arrays[CLASSES].tolist()
+        matches = [read_matches(outcomes, name) for name in classes]
+        hit = np.concatenate([each.hit[each.score >= THRESHOLD] for each in matches])
+        targets = sum(int(each.targets.sum()) for each in matches)
+        return Counted("cars" if classes == ["Car"] else "road users", targets, int(hit.sum()), int((~hit).sum()))
 
     def _mean_precision(self, outcomes: Outcomes, key: str, times: Times) -> Values:
         per_class = [weighted_precision(read_matches(outcomes, name, key), times) for name in outcomes.arrays[CLASSES]]

@@ -21,7 +21,7 @@ from flcav.perception.device import inference
 from flcav.perception.images import Picture, read_pictures
 from flcav.perception.marks import Bars
 from flcav.perception.metrics import interval_words
-from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
+from flcav.perception.outcomes import Counted, Outcomes, Times, Values, weighted_mean
 from flcav.perception.task import Evaluated, Finding, Result
 from flcav.perception.weather.model import Classifier, LeNetConfig
 from flcav.perception.weather.samples import Sample, label_pictures, reduce_picture, stack_pictures
@@ -217,3 +217,8 @@ class WeatherOutcomes:
         truth, named = outcomes.arrays["truth"], outcomes.arrays["named"]
         recalls = [float((named[truth == label] == label).mean()) for label in np.unique(truth)]
         return {"least recall": min(recalls), "pictures": float(len(truth))}
+
+    def count(self, outcomes: Outcomes) -> Counted:
+        """Return the number of images, and of those whose class is predicted correctly."""
+        truth, named = outcomes.arrays["truth"], outcomes.arrays["named"]
+        return Counted("pictures", len(truth), int((truth == named).sum()), None)

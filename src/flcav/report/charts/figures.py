@@ -1,12 +1,14 @@
 """Figures of a run's report: tables and arrays in, matplotlib figures out; `style.png` encodes one."""
 
+import textwrap
 from collections.abc import Mapping, Sequence
 
 from matplotlib.figure import Figure
 
 from flcav.report import style
 from flcav.report.charts import runs
-from flcav.report.pictures import clouds, maps
+from flcav.report.pictures import clouds, maps, perspective
+from flcav.report.pictures.changes import ErrorChanges, draw_changed, list_key
 from flcav.runs.results.run import ArmCost
 from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
@@ -14,8 +16,8 @@ from flcav.storage.records import select
 
 WIDTH = 3.8  # of a figure on a phone [inch]
 TALLEST = 2.0  # greatest height of a map, in widths; a higher map is drawn narrower
+TITLE = 36  # characters of a line of a panel's title
 ACROSS = 2  # entries of a map's legend per line
-EXTENT: clouds.Extent = (0.0, 48.0, 24.0)  # behind, ahead, aside [m]: range of the network `tiny`
 
 
 @style.styled
@@ -35,18 +37,6 @@ def town_map(scene: maps.ErrorMap, width_in: float = WIDTH) -> Figure:
     maps.draw_coordinates(axes, scene.town)
     axes.set_title(scene.title, fontweight="bold")
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=ACROSS)
-    return figure
-
-
-@style.styled
-def before_after(sweep: clouds.ComparedSweep, extent: clouds.Extent = EXTENT) -> Figure:
-    """Return a sweep with the detections of a network before training, and below it with those after training."""
-    figure = style.canvas(WIDTH, 2 * WIDTH)
-    for axes, detections in zip(figure.subplots(2), (sweep.before, sweep.after), strict=True):
-        clouds.draw_detections(axes, sweep, detections, extent)
-        axes.set_title(detections.title, fontweight="bold", pad=20)
-        style.key(axes, clouds.key(detections), loc="lower left", bbox_to_anchor=(-0.02, 0.98))
-        axes.set(xlabel="metres to the right", ylabel="metres ahead")
     return figure
 
 
@@ -72,12 +62,13 @@ def megabytes(rows: Sequence[Row], budgets: Mapping[str, float]) -> Figure:
 
 
 @style.styled
-def gains(costs: Sequence[ArmCost]) -> Figure:
-    """Return the measures of arms against their uplink [MB], a panel per task."""
+def gains(costs: Sequence[ArmCost], between: Mapping[tuple[str, str], tuple[float, Estimate]] | None = None) -> Figure:
+    """Return the measures of arms against their uplink [MB], a panel per task; `between`: by arm and task."""
     tasks = dict.fromkeys(cost.task for cost in costs)
     figure = style.canvas(1.4 * WIDTH, 0.75 * WIDTH * len(tasks))
     for axes, task in zip(figure.subplots(len(tasks), squeeze=False)[:, 0], tasks, strict=True):
-        runs.draw_gains(axes, select(costs, task=task))
+        of_task = {arm: point for (arm, at), point in (between or {}).items() if at == task}
+        runs.draw_gains(axes, select(costs, task=task), of_task)
         axes.set_title(task, fontweight="bold")
     figure.axes[-1].set_xlabel("uplink of stages II and III [MB]")
     return figure
@@ -92,6 +83,54 @@ def arms(towns: Mapping[str, Mapping[str, Estimate]], label: str = "AP50 (95 % i
         runs.draw_arms(axes, town, rows)
         axes.set_title(town, fontweight="bold")
     figure.axes[-1].set_xlabel(label)
+    return figure
+
+
+@style.styled
+def arms_by_question(
+    panels: Mapping[str, Mapping[str, Estimate]], marks: Mapping[str, float], label: str = "AP50 (95 % interval)"
+) -> Figure:
+    """Return forest plots of a measure, named by `label`, by arm: a panel per title, two abreast.
+
+    `marks`: values by name that all panels have as vertical lines.
+    """
+    rows = [list(panels)[i : i + 2] for i in range(0, len(panels), 2)]
+    heights = [max(len(panels[title]) for title in row) for row in rows]
+    figure = style.canvas(13.2, sum(0.32 * height + 0.6 for height in heights) + 0.4)
+    drawn = figure.subplots(len(rows), 2, sharex=True, squeeze=False, height_ratios=heights)
+    for axes, (title, arms_) in zip(drawn.ravel(), panels.items(), strict=False):
+        runs.draw_arms(axes, title, arms_)
+        axes.set_title(title, fontweight="bold")
+        axes.set_ylim(max(heights[list(panels).index(title) // 2], len(arms_)) - 0.5, -0.5)
+        for (name, value), dash in zip(marks.items(), ((0, (1, 1.5)), (0, (4, 2))), strict=False):
+            axes.axvline(value, color=style.MUTED, linewidth=1, linestyle=dash, label=name, zorder=0)
+    for axes in drawn[-1]:
+        axes.set_xlabel(label)
+    style.key(figure, [line for line in drawn[0, 0].get_lines() if line.get_label() in marks])
+    return figure
+
+
+@style.styled
+def seeds(panels: Mapping[str, Mapping[str, Estimate]]) -> Figure:
+    """Return differences with 95 % intervals, a row per seed: panels by title, side by side, with 0 as a line."""
+    names = list(next(iter(panels.values())))
+    figure = style.canvas(1.0 + 3.4 * len(panels), 1.4 + 0.3 * len(names))
+    for axes, (title, rows) in zip(figure.subplots(1, len(panels), sharey=True, squeeze=False)[0], panels.items()):
+        axes.axvline(0, color=style.MUTED, linewidth=1)
+        for y, change in enumerate(rows.values()):
+            colour = style.GREEN if change.mean > 0 else style.VERMILLION
+            if change.low is not None and change.high is not None:
+                axes.plot([change.low, change.high], [y, y], color=colour, linewidth=2)
+            axes.plot(change.mean, y, "s", color=colour, markersize=6)
+        better = sum((change.low or 0.0) > 0 for change in rows.values())
+        worse = sum((change.high or 0.0) < 0 for change in rows.values())
+        lines = [line for part in title.splitlines() for line in textwrap.wrap(part, TITLE)]
+        axes.set_title("\n".join(lines), fontweight="bold")
+        told = [f"{word} 0 in {count}" for word, count in (("above", better), ("below", worse)) if count]
+        axes.set_xlabel(f"{', '.join(told) or 'containing 0'} of {len(rows)} intervals (95 %)")
+        axes.set_yticks(range(len(names)), names)
+        axes.set_ylim(len(names) - 0.5, -0.5)
+        axes.grid(axis="x")
     return figure
 
 
@@ -125,25 +164,19 @@ def by_costs(costs: Mapping[str, Mapping[str, Sequence[tuple[float, Estimate]]]]
 
 
 @style.styled
-def overview(
-    scene: maps.ErrorMap, sweep: clouds.ComparedSweep, rounds: Sequence[Row], tested: Sequence[Row], measure: str
-) -> Figure:
-    """Return the overview of a run: map of errors, a sweep before and after, a measure by round and by stage."""
-    figure = style.canvas(9.6, 4.4)
-    grid = figure.add_gridspec(1, 3, width_ratios=(4.1, 2.1, 3.4))
+def overview(changes: ErrorChanges, sweep: clouds.ComparedSweep, tested: Sequence[Row], measure: str) -> Figure:
+    """Return the overview of a run: what became of the errors in a town, a sweep before and after, and the measure."""
+    figure = style.canvas(12.8, 5.2)
+    grid = figure.add_gridspec(1, 3, width_ratios=(4.4, 5.0, 3.0))
     left, middle, right = (figure.add_subfigure(grid[column]) for column in range(3))
     axes = left.add_subplot()
-    maps.draw_errors(axes, scene)
-    axes.set_title(f"{scene.town.name}: mistakes, and the pole placed for them", fontweight="bold")
-    style.key(left, axes.get_legend_handles_labels()[0], ncols=ACROSS)
+    draw_changed(axes, changes)
+    axes.set_title(f"{changes.town.name}: errors before and after edge FL", fontweight="bold")
+    style.key(left, list_key(changes), ncols=3)
     for axes, detections in zip(middle.subplots(2), (sweep.before, sweep.after), strict=True):
-        clouds.draw_detections(axes, sweep, detections, EXTENT)
-        axes.set_title(detections.title, fontweight="bold")
-        axes.set(xticks=[], yticks=[0, 20, 40])
-    middle.supylabel("metres ahead", fontsize=style.TEXT, color=style.MUTED)
-    style.key(middle, clouds.key(), columnspacing=0.8)
-    above, below = right.subplots(2, height_ratios=(3, 2))
-    runs.draw_by_round(above, rounds, measure)
-    above.set_title(f"{measure} through the stages", fontweight="bold", pad=22)
-    runs.draw_tested(below, tested, measure)
+        perspective.draw_sweep(axes, sweep, detections)
+    style.key(middle.axes[1], perspective.list_key(), loc="lower center", labelcolor=perspective.TEXT)
+    axes = right.add_subplot()
+    runs.draw_tested(axes, tested, measure, runs.LINE)
+    axes.set_title(f"{measure} with 95 % intervals", fontweight="bold")
     return figure

@@ -2,38 +2,38 @@
 
 from collections.abc import Mapping, Sequence
 
-import numpy as np
 from matplotlib.figure import Figure
 
 from flcav.report import style
+from flcav.statistics.estimates import Estimate
 
-SEED_COLOURS = (style.BLUE, style.ORANGE, style.GREEN, style.PURPLE, style.SKY, style.VERMILLION)
-SEED_MARKERS = ("o", "s", "^")  # the next one once all colours are used
+FRAME_COLOURS = (style.BLUE, style.ORANGE)  # of two choices of frames
 
 
 @style.styled
-def draw_gains(panels: Mapping[tuple[str, str], Mapping[int, Sequence[tuple[float, float]]]]) -> Figure:
-    """Return the gain in AP50 against predictors, with a row of panels per choice of frames.
+def draw_correlations(
+    seeds: Mapping[str, Mapping[str, Sequence[float]]], means: Mapping[str, Mapping[str, Estimate]]
+) -> Figure:
+    """Return rank correlations of poles' gains with predictors: a dot per seed, the mean with its 95 % interval.
 
-    `panels` has, by (frames, predictor) and seed, a point (predictor, gain) for every pole.
+    `seeds` and `means` are by predictor and choice of frames.
     """
-    rows, columns = (list(dict.fromkeys(key[axis] for key in panels)) for axis in (0, 1))
-    figure = style.canvas(3.6 * len(columns), 2.6 * len(rows) + 0.4)
-    drawn = np.atleast_2d(figure.subplots(len(rows), len(columns), sharey="row", sharex="col", squeeze=False))
-    for (frames, predictor), seeds in panels.items():
-        axes = drawn[rows.index(frames), columns.index(predictor)]
-        axes.axhline(0, color=style.RULE, linewidth=1)
-        for number, (seed, points) in enumerate(seeds.items()):
-            x, y = np.array(points, dtype=np.float64).T
-            colour = SEED_COLOURS[number % len(SEED_COLOURS)]
-            marker = SEED_MARKERS[number // len(SEED_COLOURS) % len(SEED_MARKERS)]
-            axes.plot(x, y, marker, color=colour, markersize=5, alpha=0.8, label=f"seed {seed}")
-        axes.grid(axis="y")
-        if frames == rows[-1]:
-            axes.set_xlabel(f"{predictor} of the pole")
-        if predictor == columns[0]:
-            axes.set_ylabel(f"gain in AP50\n{frames}")
-    style.key(figure, [line for line in drawn[0, 0].get_lines() if not line.get_label().startswith("_")])
+    figure = style.canvas(7.6, 0.62 * len(seeds) + 1.0)
+    axes = figure.add_subplot()
+    axes.axvline(0, color=style.MUTED, linewidth=1)
+    for row, (predictor, by_frames) in enumerate(seeds.items()):
+        for number, (frames, values) in enumerate(by_frames.items()):
+            y, colour = row + 0.3 * (number - (len(by_frames) - 1) / 2), FRAME_COLOURS[number]
+            mean = means[predictor][frames]
+            axes.plot(values, [y] * len(values), "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
+            if mean.low is not None and mean.high is not None:
+                axes.plot([mean.low, mean.high], [y, y], color=colour, linewidth=2)
+            axes.plot(mean.mean, y, "s", color=colour, markersize=6, label=frames if row == 0 else None)
+    axes.set_yticks(range(len(seeds)), list(seeds))
+    axes.set(xlim=(-1, 1), ylim=(len(seeds) - 0.5, -0.5))
+    axes.set_xlabel("rank correlation with the gain in AP50; dots: seeds, squares: mean, 95 % interval")
+    axes.grid(axis="x")
+    style.key(figure, axes.get_legend_handles_labels()[0])
     return figure
 
 

@@ -39,10 +39,10 @@ def draw_by_round(axes: Axes, rounds: Sequence[Row], measure: str) -> None:
     axes.grid(axis="y")
 
 
-def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
+def draw_tested(axes: Axes, tested: Sequence[Row], measure: str, name_height: float = TALL) -> None:
     """Draw the measure on test frames with its interval after every stage, a colour per town.
 
-    `tested` are rows of `tabulate`, one per stage and region.
+    `tested` are rows of `tabulate`, one per stage and region; `name_height`: of a name, in axes.
     """
     stages = [stage for stage in STAGES if select(tested, stage=stage)]
     towns = list(dict.fromkeys(row.region for row in tested))
@@ -58,7 +58,7 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str) -> None:
         ends[town] = points[-1]
     axes.set(xlim=(0, max(len(stages), 1) + 0.12), xlabel="test frames", ylabel=measure)
     axes.set_ylim(0, None)
-    _name_ends(axes, ends, colours, TALL)
+    _name_ends(axes, ends, colours, name_height)
     axes.set_xticks([place + 0.5 for place in range(len(stages))], [STAGES[stage] for stage in stages])
     axes.grid(axis="y")
 
@@ -156,8 +156,11 @@ def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]
     axes.set(xlabel="uplink megabytes (1 MB = 10⁶ bytes)", ylim=(len(budgets) - 0.6, -0.65))
 
 
-def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
-    """Draw the measure of each arm of a task against its uplink [MB], with a line from pretraining."""
+def draw_gains(axes: Axes, costs: Sequence[ArmCost], between: Mapping[str, tuple[float, Estimate]]) -> None:
+    """Draw the measure of each arm of a task against its uplink [MB], with a line from pretraining.
+
+    `between`: uplink and measure of arms after edge FL, where cloud FL follows.
+    """
     palette = cycle((style.BLUE, *style.OTHER_COLOURS, style.VERMILLION))
     colours = dict(zip((cost.arm for cost in costs), palette, strict=False))
     most = max(cost.uplink_mb for cost in costs)
@@ -166,7 +169,12 @@ def draw_gains(axes: Axes, costs: Sequence[ArmCost]) -> None:
         colour = colours[cost.arm]
         near = [x for x in at.values() if abs(x - cost.uplink_mb) < most / 50]
         at[cost.arm] = x = cost.uplink_mb + len(near) * most / 60
-        axes.plot([0, x], [cost.before, cost.after.mean], color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
+        path = [(0.0, cost.before), (x, cost.after.mean)]
+        if cost.arm in between:
+            middle, reached = between[cost.arm]
+            path.insert(1, (middle, reached.mean))
+            _draw_interval(axes, middle, reached, colour)
+        axes.plot(*zip(*path, strict=True), color=colour, linewidth=1.2, linestyle=(0, (3, 2)))
         axes.plot(0, cost.before, "o", color=colour, markerfacecolor="white", markersize=6, clip_on=False)
         _draw_interval(axes, x, cost.after, colour)
     low, top = axes.get_ylim()

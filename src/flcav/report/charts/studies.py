@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -80,6 +81,40 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
     return figure
 
 
+@style.styled
+def precision_table(panels: Mapping[str, Sequence[Bar]], label: str) -> Figure:
+    """Return a table of means, darker where higher: a row per figure, a column per title, empty where a test lacks it.
+
+    A cell has the mean, half the range over seeds where there are several, and below it the number of targets.
+    """
+    names = list(dict.fromkeys(bar.name for bars in panels.values() for bar in bars))
+    figure = style.canvas(2.6 + 1.25 * len(panels), 0.8 + 0.42 * len(names))
+    axes = figure.add_subplot()
+    means = np.full((len(names), len(panels)), np.nan)
+    for column, bars in enumerate(panels.values()):
+        for bar in bars:
+            row = names.index(bar.name)
+            means[row, column] = bar.mean
+            half = (max(bar.seeds) - min(bar.seeds)) / 2 if len(bar.seeds) > 1 else None
+            look: dict[str, Any] = {"ha": "center", "color": "white" if bar.mean > 0.6 else style.INK}
+            text = f"{bar.mean:.2f}" + ("" if half is None else f" ±{half:.2f}")
+            axes.text(column, row - (0 if bar.targets is None else 0.17), text, va="center", **look)
+            if bar.targets is not None:
+                axes.text(column, row + 0.24, f"{bar.targets}", va="center", fontsize=style.SMALL, **look)
+    axes.imshow(means, cmap=SHADES, vmin=0, vmax=1, aspect="auto")
+    axes.set_xticks(range(len(panels)), list(panels))
+    axes.xaxis.tick_top()
+    axes.set_yticks(range(len(names)), names)
+    axes.set_xticks(np.arange(-0.5, len(panels)), minor=True)
+    axes.set_yticks(np.arange(-0.5, len(names)), minor=True)
+    axes.grid(which="minor", color="white", linewidth=2)
+    axes.tick_params(which="minor", length=0)
+    axes.set_xlabel(label, loc="left")
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    return figure
+
+
 Panels = Mapping[str, Mapping[str, Sequence[Bar]]]  # bars by test and slice, named with its number of samples
 
 
@@ -124,8 +159,11 @@ def _draw(axes: Axes, slices: Mapping[str, Sequence[Bar]]) -> None:
 def costs(
     panels: Mapping[str, Mapping[str, tuple[float, MeanOverSeeds]]], cost: str, measure: str, front: Sequence[str]
 ) -> Figure:
-    """Return a panel per title with a measure against its cost: named points with intervals, joined along `front`."""
-    figure = style.canvas(PANEL_IN * len(panels), 3.6)
+    """Return a panel per title with a measure against its cost: points with intervals, joined along `front`.
+
+    Points are numbered; below is what the numbers stand for, the same in all panels.
+    """
+    figure = style.canvas(PANEL_IN * len(panels), 3.9)
     for axes, (title, points) in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
         best = sorted((points[name][0], points[name][1].mean) for name in front)
         axes.plot(*zip(*best, strict=True), color=style.SKY, zorder=1)
@@ -133,21 +171,13 @@ def costs(
             colour = style.BLUE if name in front else style.MUTED
             style.interval(axes, x, mean, color=colour, linewidth=1)
             axes.plot(x, mean.mean, "o", color=colour, markersize=5)
-            axes.annotate(
-                name,
-                (x, 0.03),
-                xycoords=axes.get_xaxis_transform(),
-                xytext=(-3, 0),
-                textcoords="offset points",
-                rotation=90,
-                ha="right",
-                va="bottom",
-                color=colour,
-                fontsize=style.SMALL,
-            )
+            text = str(list(points).index(name) + 1)
+            axes.annotate(text, (x, mean.mean), (6, 0), textcoords="offset points", va="center", color=colour)
         axes.set_xlim(0, None)
         axes.set_xlabel(cost)
-        axes.set_ylabel(measure)
+        axes.set_ylabel(f"{measure} (95 % interval)")
         axes.set_title(title)
         axes.grid(axis="y")
+    names = [f"{number}: {name}" for number, name in enumerate(next(iter(panels.values())), start=1)]
+    figure.supxlabel("      ".join(names), fontsize=style.SMALL)
     return figure

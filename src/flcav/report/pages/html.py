@@ -5,14 +5,22 @@ from collections.abc import Mapping
 from typing import Any
 
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
+from markupsafe import Markup
+
+from flcav.statistics.verdicts import signed
 
 
-def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: str = "report.html.j2") -> str:
+def render(
+    results: Mapping[str, Any],
+    pictures: Mapping[str, bytes],
+    template: str = "report.html.j2",
+    drawings: Mapping[str, str] | None = None,
+) -> str:
     """Return the page about `results` as HTML, with style and pictures embedded.
 
-    `pictures` are PNG files by name, as in `run_page.draw` or `plan_page`; missing ones are left out. `template` is
-    report.html.j2 for a run, plan.html.j2 for a plan, release.html.j2 for a release. Raises `jinja2.UndefinedError`
-    where `results` lack a value of the page.
+    `pictures` are PNG files by name, as in `plan_page`, `drawings` SVG elements by name, as in `run_page`; missing ones
+    are left out. `template` is report.html.j2 for a run, plan.html.j2 for a plan, release.html.j2 for a release. Raises
+    `jinja2.UndefinedError` where `results` lack a value of the page.
     """
     environment = Environment(
         loader=ChoiceLoader([PackageLoader("flcav", "report"), PackageLoader("flcav", "runs/extras")]),
@@ -21,10 +29,12 @@ def render(results: Mapping[str, Any], pictures: Mapping[str, bytes], template: 
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {"signed": "{:+.3f}".format, "ap": "{:.3f}".format, "mb": "{:.1f}".format}
+    environment.filters |= {"signed": signed, "ap": "{:.3f}".format, "mb": "{:.1f}".format}
     environment.filters |= {"error": "{:.4f}".format, "count": "{:,.0f}".format, "percent": "{:.0%}".format}
     return environment.get_template(template).render(
-        results, pictures={name: _data_uri(png) for name, png in pictures.items()}
+        results,
+        pictures={name: _data_uri(png) for name, png in pictures.items()},
+        drawings={name: Markup(svg) for name, svg in (drawings or {}).items()},
     )
 
 

@@ -1,7 +1,7 @@
 """HTML page and pictures of a run, from its results and the files of its steps."""
 
-from collections.abc import Sequence
-from dataclasses import replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -13,18 +13,20 @@ from flcav.dataset.store import Dataset
 from flcav.federation.privacy import SEEDED
 from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
-from flcav.perception.errors import PerceptionError, load_errors
+from flcav.perception.errors import load_errors
 from flcav.perception.objects.truth import choose_lidar
 from flcav.plugins import load_named
 from flcav.report import style
 from flcav.report.charts import figures
 from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
-from flcav.report.pictures import clouds, maps
+from flcav.report.pictures import clouds, maps, perspective
+from flcav.report.pictures.changes import ErrorChanges, draw_changes, look_from_poles
 from flcav.runs.analysis.answer import list_stage_means, tell_answer
 from flcav.runs.analysis.caveats import PLACED_BARE
-from flcav.runs.analysis.costs import list_arm_costs, list_home_costs
-from flcav.runs.arms import Names
+from flcav.runs.analysis.claims import ClaimRow, list_claims
+from flcav.runs.analysis.costs import list_arm_costs, list_edge_points, list_home_costs
+from flcav.runs.analysis.tiles import list_tiles
 from flcav.runs.driving import CLOCK
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN
@@ -32,7 +34,7 @@ from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import ArmCost, Run
 from flcav.runs.results.saved import ERRORS
 from flcav.runs.results.table import Row, tabulate
-from flcav.runs.results.tests import WORDS, SweepComparison, SweepDetections
+from flcav.runs.results.tests import WORDS, ErrorsAfter, SweepComparison, SweepDetections
 from flcav.runs.results.training import TOGETHER
 from flcav.runs.running import WORK
 from flcav.runs.stages.testing import LOOK
@@ -40,7 +42,8 @@ from flcav.runs.training.records import list_rounds
 from flcav.storage.files import write_bytes
 from flcav.storage.records import select
 
-OBJECTS = "objects"
+OBJECTS, SWEEP, OVERVIEW = "objects", "before_after", "overview"
+PHOTOS = (SWEEP, OVERVIEW)  # pictures of many points, which the page has as PNG files, the latter not at all
 SHOWN_ROUNDS = 3  # number of rounds in a timeline
 
 
@@ -58,24 +61,47 @@ def write_report(run: Run, out: Path | str) -> Path:
     Raises `InputError` where the folders of its steps are missing.
     """
     out = Path(out)
-    pictures = draw(run, out / WORK)
+    seen = read_seen(run, out / WORK)
+    figures_ = draw(run, out / WORK, seen)
+    pictures = {name: style.png(figure) for name, figure in figures_.items()}
     for name, png in pictures.items():
         write_bytes(out / "pictures" / f"{name}.png", png)
-    shown = {name: png for name, png in pictures.items() if name != "overview"}
-    write_bytes(out / "report.html", html.render(page(run), shown).encode())
+    drawings = {name: style.svg(figure) for name, figure in figures_.items() if name not in PHOTOS}
+    shown = {name: pictures[name] for name in PHOTOS if name in pictures and name != OVERVIEW}
+    write_bytes(out / "report.html", html.render(page(run, seen), shown, drawings=drawings).encode())
     return out / "report.html"
 
 
-def page(run: Run) -> dict[str, Any]:
-    """Return the values of the page for its template."""
+@dataclass(frozen=True)
+class Seen:
+    """What the steps of a run have beside its results: errors before and after by region, and the chosen sweep."""
+
+    changes: Mapping[str, ErrorChanges] = field(default_factory=dict)
+    sweep: SweepComparison | None = None
+
+
+def read_seen(run: Run, work: Path) -> Seen:
+    """Return the errors by region and the chosen sweep, those that the run has."""
+    placed = run.arms[MAIN].placed
+    changes = {place.region: found for place in placed if (found := _read_changes(run, work, place)) is not None}
+    return Seen(changes, SweepComparison.load(work / LOOK) if (work / LOOK).is_dir() else None)
+
+
+def page(run: Run, seen: Seen | None = None) -> dict[str, Any]:
+    """Return the values of the page for its template; `seen`: None where only the results are at hand."""
     recipe, main = run.recipe, run.arms[MAIN]
+    claims = list_claims(run)
     return {
         **vars(main),
         **vars(run),
+        "seen": seen or Seen(),
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
-        "stages": list_stage_means(run),
+        "means": list_stage_means(run),
         "answer": tell_answer(run),
+        "tiles": list_tiles(run),
+        "claims": claims,
+        "axis": _span(claims),
         "plans": main.plans,
         "uploads": {task: plan.uploads for task, plan in main.plan.tasks.items() if plan.uploads is not None},
         "made": {None: "before the run", PRETRAIN: "after stage I", EDGE: "after stage II"},
@@ -102,17 +128,25 @@ def page(run: Run) -> dict[str, Any]:
     }
 
 
+def _span(claims: Sequence[ClaimRow]) -> tuple[float, float]:
+    """Return the ends of the common axis of all differences, which has 0 within."""
+    ends = [0.0]
+    for row in claims:
+        change = row.change
+        ends += [change.mean, *(end for end in (change.low, change.high) if end is not None)]
+    low, high = min(ends), max(ends)
+    room = 0.04 * (high - low) or 0.01
+    return low - room, high + room
+
+
 def _list_costs(run: Run) -> Sequence[ArmCost]:
     return run.costs or list_arm_costs(run)
 
 
-def draw(run: Run, work: Path) -> dict[str, bytes]:
-    """Return the pictures as PNG files by name: maps, measures by round, timelines, traffic and others."""
+def draw(run: Run, work: Path, seen: Seen) -> dict[str, Figure]:
+    """Return the pictures by name: maps, measures by round, timelines, traffic and others."""
     main = run.arms[MAIN]
-    drawn = {}
-    scenes = [(placed, scene) for placed in main.placed if (scene := _map(run, work, placed)) is not None]
-    for placed, scene in scenes:
-        drawn[f"map_{placed.region}"] = figures.town_map(scene)
+    drawn = {f"map_{region}": draw_changes(changes) for region, changes in seen.changes.items()}
     rows = tabulate(run)
     charts = {task: _chart(run, rows, task) for task in run.recipe.tasks}
     for task, chart in charts.items():
@@ -122,14 +156,15 @@ def draw(run: Run, work: Path) -> dict[str, bytes]:
         drawn |= load_named("chart", section.chart, {section.chart: section.chart}, DrawSection)(run)
     budgets = {link: use.budget_mb for link, use in main.links.items()}
     drawn["megabytes"] = figures.megabytes(select(rows, arm=MAIN), budgets)
-    if costs := [cost for cost in _list_costs(run) if cost.gain_per_mb is not None]:
-        drawn["gain"] = figures.gains(costs)
-    sweep = _sweep(work, run.steps, run) if (work / LOOK).is_dir() else None
-    if sweep is not None:
-        drawn["before_after"] = figures.before_after(sweep)
-        if scenes:
-            drawn["overview"] = figures.overview(scenes[0][1], sweep, *charts[OBJECTS])
-    return {name: style.png(figure) for name, figure in drawn.items()}
+    costs = _list_costs(run)
+    if any(cost.uplink_mb for cost in costs):
+        drawn["gain"] = figures.gains(costs, list_edge_points(run))
+    if seen.sweep is not None:
+        sweep = _read_sweep(work, run, seen.sweep)
+        drawn[SWEEP] = perspective.before_after(sweep)
+        if seen.changes:
+            drawn[OVERVIEW] = figures.overview(next(iter(seen.changes.values())), sweep, *charts[OBJECTS][1:])
+    return drawn
 
 
 def _timelines(run: Run, work: Path) -> dict[str, Figure]:
@@ -160,25 +195,30 @@ def _file_name(task: str) -> str:
     return task.replace(":", "_")
 
 
-def _map(run: Run, work: Path, placed: Placed) -> maps.ErrorMap | None:
-    """Return the map of a region's errors and poles; None without a town, poles, or tasks of the placement."""
+def _read_changes(run: Run, work: Path, placed: Placed) -> ErrorChanges | None:
+    """Return a region's errors and what became of them; None without a town, poles, or tasks of the placement."""
     names, tasks = run.steps, run.recipe.placement.tasks
-    if not tasks:
+    if not tasks or not placed.poles or not (work / names.remaining(placed.region, tasks[0])).is_dir():
         return None
-    drive = Frames.open(work / names.recording(placed.region, "registry", tasks[0])).data
-    town = drive.town()
-    if town is None or not placed.poles:
+    town = Frames.open(work / names.recording(placed.region, "registry", tasks[0])).data.town()
+    if town is None:
         return None
-    errors: list[PerceptionError] = []
-    for task in tasks:
-        errors += load_errors(work / names.errors(MAIN, placed.region, task) / ERRORS)
-    return maps.ErrorMap(
-        town,
-        np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3),
-        np.array([error.kind for error in errors], dtype=np.str_),
-        {number: at for number, at in maps.poles_of(town).items() if int(number) in {p.pole for p in placed.poles}},
-        {str(pole): placed.range_m for pole in placed.chosen},
-        conventional={maps.DENSEST: (str(placed.densest),)},
+    errors = [error for task in tasks for error in load_errors(work / names.errors(MAIN, placed.region, task) / ERRORS)]
+    after = [ErrorsAfter.load(work / names.remaining(placed.region, task)) for task in tasks]
+    at = np.array([(error.x, error.y, error.z) for error in errors]).reshape(-1, 3)
+    poles = maps.poles_of(town)
+    known = {str(pole.pole) for pole in placed.poles}
+    viewsheds, seen = look_from_poles(town, poles, [str(pole) for pole in placed.chosen], at, placed.range_m)
+    return ErrorChanges(
+        town=town,
+        errors=at,
+        kind=np.array([error.kind for error in errors], dtype=np.str_),
+        remains=np.array([one for each in after for one in each.remains], dtype=np.bool_),
+        seen=seen,
+        new=np.array([one for each in after for one in each.new]).reshape(-1, 3),
+        new_kind=np.array([kind for each in after for kind in each.new_kinds], dtype=np.str_),
+        poles={name: where for name, where in poles.items() if name in known},
+        viewsheds=viewsheds,
     )
 
 
@@ -191,13 +231,12 @@ def _chart(run: Run, rows: Sequence[Row], task: str) -> tuple[list[Row], list[Ro
     return [*rounds, *select(rows, task=task, quantity="watched.rounds.score")], tested, tested[0].measure
 
 
-def _sweep(work: Path, names: Names, run: Run) -> clouds.ComparedSweep:
-    looked = SweepComparison.load(work / LOOK)
+def _read_sweep(work: Path, run: Run, looked: SweepComparison) -> clouds.ComparedSweep:
     region = run.recipe.with_role("federate")[0]
-    data: Dataset = Frames.open(work / names.recording(region, "test", OBJECTS)).data
+    data: Dataset = Frames.open(work / run.steps.recording(region, "test", OBJECTS)).data
     frame = data.frame(looked.frame)
     points, ground_m = clouds.read_sweep(frame, choose_lidar(frame), DatasetGround(data).relief)
-    before, after = _detections("pretrained", looked.before), _detections("after the last stage", looked.after)
+    before, after = _detections("Pretrained", looked.before), _detections("After edge FL", looked.after)
     return clouds.ComparedSweep(points, ground_m, _boxes(looked.targets), before, after)
 
 

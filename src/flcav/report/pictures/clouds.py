@@ -7,7 +7,6 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, heading_vectors, transform_points
@@ -79,26 +78,6 @@ def draw_boxes(
     dash = (0, (3, 2)) if dashed else "solid"
     axes.add_collection(PolyCollection(list(outlines), facecolor=(colour, fill), linestyle=[dash], **look))
     axes.add_collection(LineCollection(list(ticks), **look))
-
-
-def draw_detections(axes: Axes, sweep: ComparedSweep, found: MatchedDetections, extent: Extent) -> None:
-    """Draw a sweep with hits, misses and false positives of one network's detections in different colours."""
-    draw_points(axes, sweep.points, sweep.ground_m, extent)
-    draw_boxes(axes, sweep.targets, style.INK)
-    draw_boxes(axes, sweep.targets[~found.found], style.MISSED, fill=0.6)
-    draw_boxes(axes, found.boxes[found.hit], style.HIT, fill=0.35)
-    draw_boxes(axes, found.boxes[~found.hit], style.FALSE, fill=0.2, dashed=True)
-    axes.plot(0, 0, "^", color=style.INK, markersize=7, clip_on=False, zorder=5)
-
-
-def key(found: MatchedDetections | None = None) -> list[Patch]:
-    """Return the legend of `draw_detections`, with counts where `found` is given."""
-    entries = (("found", style.HIT, 0.35), ("missed", style.MISSED, 0.6), ("false", style.FALSE, 0.2))
-    counts = ("", "", "") if found is None else (found.found.sum(), (~found.found).sum(), (~found.hit).sum())
-    return [
-        Patch(facecolor=(colour, fill), edgecolor=colour, label=f"{count} {word}".strip())
-        for count, (word, colour, fill) in zip(counts, entries, strict=True)
-    ]
 
 
 @style.styled

@@ -73,6 +73,7 @@ class ErrorMap:
     zone_m: float = 0.0
     heat: bool = False  # whether to show the density of the errors
     title: str = ""  # above the map
+    beyond: NDArray[np.bool_] | None = None  # (E,) whether no candidate reaches the error; None: not shown
     noun: str = "error"  # name of a place: "error", or "point" for user-defined places
 
 
@@ -209,7 +210,13 @@ def _plot_errors(axes: Axes, scene: ErrorMap) -> None:
     looks = KINDS | {kind: (kind, OTHERS[i % len(OTHERS)]) for i, kind in enumerate(other_kinds)}
     rest = "" if scene.covered is None else ", uncovered"
     crowd = {"markersize": 3.5} if len(scene.errors) > DENSE else {}
-    states = ((rest, ~covered, {}), (", covered", covered, {"color": style.BLUE}))
+    far = np.zeros(len(scene.errors), np.bool_) if scene.beyond is None else scene.beyond & ~covered
+    ring = {"color": style.MUTED, "markerfacecolor": "none", "markeredgecolor": style.MUTED, "markeredgewidth": 1.0}
+    states = (
+        (rest, ~covered & ~far, {}),
+        (", beyond every pole", far, ring),
+        (", covered", covered, {"color": style.BLUE}),
+    )
     for state, chosen, colour in states:
         for kind, (label, look) in looks.items():
             if (of_kind := (scene.kind == kind) & chosen).any():

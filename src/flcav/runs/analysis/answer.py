@@ -1,6 +1,6 @@
 """The answer of a run to its question, whether vehicles can teach a network towns that it has never seen."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,20 +10,21 @@ from flcav.runs.analysis.costs import list_home_costs
 from flcav.runs.analysis.findings import OVER_EDGE, OVER_PRETRAINING
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN
 from flcav.runs.results.run import Run
-from flcav.runs.results.tests import Difference, RunFinding, Test
+from flcav.runs.results.tests import Difference, FoundCount, HomeCost, RunFinding
 from flcav.statistics.estimates import Estimate, average_estimates
-from flcav.statistics.verdicts import HELD, NOT_HELD, signed
+from flcav.statistics.verdicts import HELD, NOT_HELD
 from flcav.storage.records import select
 
 PRICE = ", at a price"
 BEFORE = {EDGE: (PRETRAIN, OVER_PRETRAINING), CLOUD: (EDGE, OVER_EDGE)}  # stage: the one before, and the question
+NUMBERS = ("no", "one", "two", "three", "four", "five", "six")
 
 Claimed = tuple[Difference, RunFinding]  # a difference of the run itself, and the verdict on it
 
 
 @dataclass(frozen=True)
 class Answer:
-    """A word or two that follow from the verdicts, and the sentences behind them."""
+    """A word or two that follow from the verdicts, and the sentences behind them, the first with the gain."""
 
     word: str
     sentences: tuple[str, ...]
@@ -35,26 +36,25 @@ def tell_answer(run: Run) -> Answer | None:
     A claim on the mean over regions counts in place of those of the regions. The price is a measure that fell in a town
     of pretraining, by more than its 95 % interval.
     """
-    claims = {task: found for task in run.recipe.tasks if (found := _select_claims(run, task, EDGE))}
+    claims = {task: found for task in run.recipe.tasks if (found := select_claims(run, task, EDGE))}
     if not claims:
         return None
     verdicts = {finding.verdict for found in claims.values() for _, finding in found}
     home = list_home_costs(run)
     if HELD in verdicts:
         word = "Yes" if verdicts == {HELD} else "In part"
-        word += PRICE if any((row.difference.high or 0.0) < 0 for row in home) else ""
+        word += PRICE if any(map(fell, home)) else ""
     else:
         word = "No" if verdicts == {NOT_HELD} else "This run cannot tell"
-    sentences = [
-        sentence
-        for task, found in claims.items()
-        for sentence in _tell(run, task, found, _select_claims(run, task, CLOUD))
-    ]
-    for region in dict.fromkeys(row.region for row in home):
-        rows = select(home, region=region)
-        changes = [f"{row.measure} of {row.task} from {row.before:.3f} to {row.after:.3f}" for row in rows]
-        sentences.append(f"In {region}, where it was pretrained, federated learning took {' and '.join(changes)}.")
+    regions = {task: tuple(region for each, _ in found for region in each.places) for task, found in claims.items()}
+    sentences = [*_tell_edge(run, regions), *_tell_cloud(run, regions)]
+    sentences += _tell_home(home)
     return Answer(word, tuple(sentences))
+
+
+def fell(cost: HomeCost) -> bool:
+    """Return whether a measure fell at home by more than its interval."""
+    return (cost.difference.high or 0.0) < 0
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ def list_stage_means(run: Run) -> list[StageMean]:
     return means
 
 
-def _select_claims(run: Run, task: str, stage: str) -> list[Claimed]:
+def select_claims(run: Run, task: str, stage: str) -> list[Claimed]:
     """Return the claims that a stage is better than the one before, if there is one, of the mean over regions."""
     before, question = BEFORE[stage]
     verdicts = {finding.place: finding for finding in select(run.findings, question=question)}
@@ -93,31 +93,77 @@ def _select_claims(run: Run, task: str, stage: str) -> list[Claimed]:
     return [claimed for claimed in found if claimed[0].regions is not None] or found
 
 
-def _tell(run: Run, task: str, claims: Sequence[Claimed], later: Sequence[Claimed]) -> Iterator[str]:
-    """Yield sentences on the stages of a task, by the claims of edge FL and those of cloud FL."""
-    for each, finding in claims:
-        before, after = (
-            select(run.tested, arm=MAIN, stage=stage, task=task, region=each.places) for stage in (PRETRAIN, EDGE)
-        )
-        low, high = each.estimate.low, each.estimate.high
-        interval = "" if low is None or high is None else f", 95 % interval {signed(low)} to {signed(high)}"
-        yield (
-            f"In {each.region}, edge FL took {after[0].measure} of {task} from {_average(before):.3f} to "
-            f"{_average(after):.3f} ({finding.verdict}: {signed(each.estimate.mean)}{interval})."
-        )
-    yield f"This took {_sent(run, task, EDGE)} of uplink."
-    if later:
-        regions = tuple(region for each, _ in claims for region in each.places)
-        mean = _average(select(run.tested, arm=MAIN, stage=CLOUD, task=task, region=regions))
-        verdicts = ", ".join(f"{finding.verdict} in {each.region}" for each, finding in later)
-        mean_of = "it" if len(claims) == 1 else "their mean"
-        yield f"Cloud FL took {mean_of} to {mean:.3f} ({verdicts}), for {_sent(run, task, CLOUD)} more."
+def _tell_edge(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """Yield a sentence on edge FL of all tasks in the regions of their claims: counts, or else the measure."""
+    told = []
+    for task, places in regions.items():
+        before, after = (_sum_counts(run, task, stage, places) for stage in (PRETRAIN, EDGE))
+        if before is not None and after is not None:
+            right = f"{before.found:.0f} → {after.found:.0f} of {after.targets} {after.noun} found"
+            if before.false is not None and after.false is not None:
+                right += f" and {before.false:.0f} → {after.false:.0f} false"
+        else:
+            means = [_average(run, task, stage, places) for stage in (PRETRAIN, EDGE)]
+            right = f"{_measure(run, task)} of {task} {means[0]:.3f} → {means[1]:.3f}"
+        told.append(f"{right}, for {_sent(run, task, EDGE, ('wireless',)):.0f} MB of radio")
+    most = max(len(places) for places in regions.values())
+    towns = f"{NUMBERS[most] if most < len(NUMBERS) else most} unseen town{'' if most == 1 else 's'}"
+    yield f"In {towns}: {'; '.join(told)}."
 
 
-def _average(tests: Sequence[Test]) -> float:
+def _tell_cloud(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
+    """Yield a sentence on the network for all towns of each task, where there is one."""
+    told, sent = [], 0.0
+    for task, places in regions.items():
+        if not select(run.tested, arm=MAIN, stage=CLOUD, task=task, region=places):
+            continue
+        sent += _sent(run, task, CLOUD, LINKS)
+        last = _sum_counts(run, task, CLOUD, places)
+        if last is not None:
+            told.append(f"finds {last.found:.0f}{'' if last.false is None else f', {last.false:.0f} false'}")
+        else:
+            told.append(f"has {_measure(run, task)} {_average(run, task, CLOUD, places):.3f}")
+    if told:
+        yield f"One network for all towns, averaged by the cloud for {sent:.0f} MB more, {', '.join(told)}."
+
+
+def _tell_home(home: Sequence[HomeCost]) -> Iterator[str]:
+    """Yield a sentence for each town of pretraining: what fell by more than its interval, else the main measures."""
+    for region in dict.fromkeys(row.region for row in home):
+        rows = select(home, region=region)
+        shown = [row for row in rows if fell(row)] or list({row.task: row for row in reversed(rows)}.values())
+        changes = [
+            f"{row.measure}{f' of {row.task}' if len({each.task for each in rows}) > 1 else ''} "
+            f"{row.before:.3f} → {row.after:.3f}"
+            for row in shown
+        ]
+        yield f"At home in {region}, that network {'loses' if any(map(fell, shown)) else 'has'} {', '.join(changes)}."
+
+
+def _sum_counts(run: Run, task: str, stage: str, regions: tuple[str, ...]) -> FoundCount | None:
+    """Return the counts of the run itself after a stage, summed over regions; None where one is not known."""
+    rows = select(run.counts or (), arm=MAIN, stage=stage, task=task, region=regions)
+    if len(rows) != len(regions):
+        return None
+    false = [row.false for row in rows if row.false is not None]
+    return FoundCount(
+        *(MAIN, stage, " and ".join(regions), task, rows[0].noun),
+        targets=sum(row.targets for row in rows),
+        found=sum(row.found for row in rows),
+        false=sum(false) if len(false) == len(rows) else None,
+        trainings=rows[0].trainings,
+    )
+
+
+def _average(run: Run, task: str, stage: str, regions: tuple[str, ...]) -> float:
+    tests = select(run.tested, arm=MAIN, stage=stage, task=task, region=regions)
     return float(np.mean([test.estimate.mean for test in tests]))
 
 
-def _sent(run: Run, task: str, stage: str) -> str:
-    mb = sum(row.mb for row in select(run.arms[MAIN].spent, task=task, stage=stage, link=LINKS))
-    return f"{mb:.1f} MB"
+def _measure(run: Run, task: str) -> str:
+    return select(run.tested, task=task)[0].measure
+
+
+def _sent(run: Run, task: str, stage: str, links: Sequence[str]) -> float:
+    """Return the uplink traffic [MB] of a stage of a task on links."""
+    return sum(row.mb for row in select(run.arms[MAIN].spent, task=task, stage=stage, link=links))

@@ -11,6 +11,7 @@ from flcav.runs.analysis.costs import collect_home_costs, list_arm_costs
 from flcav.runs.analysis.differences import (
     collect_regional_tests,
     collect_test,
+    count_found,
     list_differences,
     number_retrainings,
 )
@@ -58,6 +59,7 @@ def collect_results(graph: Graph, work: Path) -> Run:
         gap_closed=gaps_closed(tests, recipe),
         provenance=provenance(recipe.seed),
         home=collect_home_costs(graph, work) or None,
+        counts=tuple(count for test in tests if (count := count_found(work, test)) is not None) or None,
         **{name: row for collect in load_all(RESULTS) for name, row in collect(graph, work).items()},
         caveats=(
             *list_caveats(recipe, main.labels.values(), settings.values()),

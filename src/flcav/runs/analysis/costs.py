@@ -70,6 +70,17 @@ def _row(name: str, arm: ArmResult, task: str, tests: Sequence[Test], before: fl
     )
 
 
+def list_edge_points(run: Run) -> dict[tuple[str, str], tuple[float, Estimate]]:
+    """Return uplink [MB] and mean measure after edge FL by arm and task, of arms that have a later stage."""
+    points = {}
+    for cost in list_arm_costs(run):
+        tests = select(run.tested, arm=cost.arm, stage=EDGE, task=cost.task, region=cost.regions)
+        if cost.stage != EDGE and tests and len(tests) == len(cost.regions):
+            mb = sum(row.mb for row in select(run.arms[cost.arm].spent, task=cost.task, stage=EDGE))
+            points[cost.arm, cost.task] = (mb, average_estimates([test.estimate for test in tests]))
+    return points
+
+
 def collect_home_costs(graph: Graph, work: Path) -> tuple[HomeCost, ...]:
     """Collect the costs in the towns of pretraining in the tasks' further measures, such as AP70.
 

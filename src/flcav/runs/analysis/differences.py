@@ -6,13 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from flcav.perception.outcomes import Outcomes, Values, difference, share_test_scenes
+from flcav.perception.outcomes import Counts, Outcomes, Values, difference, share_test_scenes
 from flcav.perception.tasks import task_named
 from flcav.runs.analysis.findings import is_joint, pair_of
 from flcav.runs.arms import Setting, name_repeat
 from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.saved import OUTCOMES
-from flcav.runs.results.tests import Difference, RegionalTest, Test, Tested, name_stage
+from flcav.runs.results.tests import Difference, FoundCount, RegionalTest, Test, Tested, name_stage
 from flcav.runs.spread import figure_key, test_key
 from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, Spread, average_estimates, measure_spread, widen, widen_share
@@ -25,7 +25,8 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
     result = Tested.load(work / step)
     again = [test_folder(graph, name_repeat(arm, n), stage, region, task) for n in number_retrainings(graph)]
     again = [name for name in again if name != step]  # drops those that share this network
-    retrained = tuple(Tested.load(work / name).estimate.mean for name in again)
+    repeated = [Tested.load(work / name) for name in again]
+    retrained = tuple(tested.estimate.mean for tested in repeated)
     values = (result.estimate.mean, *retrained)
     spread = measure_spread(values) or graph.spreads.get(test_key(task, region, arm, stage))
     folders = [(work / name,) for name in (step, *again)]
@@ -35,7 +36,31 @@ def collect_test(graph: Graph, work: Path, arm: str, stage: str, region: str, ta
         estimate = mean.as_estimate()
     elif spread is not None:
         estimate = widen_share(estimate, spread)
-    return Test(arm, stage, region, task, step, result, estimate, spread, retrained, mean, tuple(again) or None)
+    numbers = _average_numbers([result, *repeated]) if repeated else None
+    trained = {"retrained": retrained, "over_trainings": mean, "retrained_steps": tuple(again) or None}
+    return Test(arm, stage, region, task, step, result, estimate, spread, **trained, averaged=numbers)
+
+
+def _average_numbers(tests: Sequence[Tested]) -> dict[str, float | None]:
+    """Return the means over trainings of the further numbers of a test; None for one that a training lacks."""
+    by_name = {name: [test.numbers.get(name) for test in tests] for name in tests[0].numbers}
+    known = {name: [value for value in values if value is not None] for name, values in by_name.items()}
+    return {name: float(np.mean(values)) if len(values) == len(tests) else None for name, values in known.items()}
+
+
+def count_found(work: Path, test: Test) -> FoundCount | None:
+    """Return what the networks of a test found, as means over its trainings; None for a task that does not count."""
+    task = task_named(test.task)
+    if not isinstance(task, Counts):
+        return None
+    counted = [task.count(Outcomes.load(work / step / OUTCOMES)) for step in test.steps]
+    false = [each.false for each in counted if each.false is not None]
+    return FoundCount(
+        *(test.arm, test.stage, test.region, test.task, counted[0].noun, counted[0].targets),
+        found=float(np.mean([each.found for each in counted])),
+        false=float(np.mean(false)) if false else None,
+        trainings=len(counted),
+    )
 
 
 def mean_over_trainings(

@@ -156,6 +156,32 @@ def findings(
     `settings`: those of all arms. `caveats`: those of the labels, by task.
     """
     values = {test.key: test for test in tests}
+    judged = judge_differences(differences, tests, arms, settings, recipe)
+    families = Counter(each.asked.kind for each in judged)
+    return tuple(
+        replace(_finding(each, values, caveats, families[each.asked.kind]), kind=each.asked.named) for each in judged
+    )
+
+
+@dataclass(frozen=True)
+class JudgedDifference:
+    """A difference of the run itself with the verdict on it."""
+
+    difference: Difference
+    asked: ClaimQuestion
+    judged: Judged | None  # None: an estimate of a loss, arms that do not differ, or no known spread
+    same: str | None  # the sentence for arms that do not differ
+
+
+def judge_differences(
+    differences: Sequence[Difference],
+    tests: Sequence[Test],
+    arms: Mapping[str, ArmResult],
+    settings: Mapping[str, Setting],
+    recipe: RunRecipe,
+) -> list[JudgedDifference]:
+    """Return the differences of the run itself with their questions and verdicts, in the order of the findings."""
+    values = {test.key: test for test in tests}
     claimed = [each for each in differences if each.arm == MAIN]
     questions = ask_all(claimed, recipe, settings)
     same = [_tell_same_poles(each, arms, settings) for each in claimed]
@@ -163,13 +189,8 @@ def findings(
         None if none_differs else _mean(each, sum(test.result.scenes for test in _after(each, values)))
         for each, none_differs in zip(claimed, same, strict=True)
     ]
-    families = Counter(about.kind for about in questions)
-    return tuple(
-        replace(_finding(each, judged, about, values, none_differs, caveats, families[about.kind]), kind=about.named)
-        for each, judged, about, none_differs in zip(
-            claimed, judge_asked(questions, means), questions, same, strict=True
-        )
-    )
+    judged = judge_asked(questions, means)
+    return [JudgedDifference(*row) for row in zip(claimed, questions, judged, same, strict=True)]
 
 
 def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
@@ -180,15 +201,13 @@ def _mean(each: Difference, scenes: int) -> MeanOverSeeds | None:
 
 
 def _finding(
-    compared: Difference,
-    judged: Judged | None,
-    asked: ClaimQuestion,
+    found: JudgedDifference,
     values: Mapping[tuple[str, str, str, str], Test],
-    same: str | None,
     caveats: Mapping[str, str],
     family: int,
 ) -> RunFinding:
-    """Return the finding of a difference, one of `family` claims; `same`: the sentence for arms that do not differ."""
+    """Return the finding of a difference, one of `family` claims."""
+    compared, asked, judged, same = found.difference, found.asked, found.judged, found.same
     tests = _after(compared, values)
     measure = tests[0].result.measure
     earlier, later = (float(np.mean([test.estimate.mean for test in at])) for at in (_before(compared, values), tests))

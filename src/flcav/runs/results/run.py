@@ -11,7 +11,7 @@ from flcav.runs.recipe import RunRecipe
 from flcav.runs.registry import SECTIONS, PageSection, RunRows, load_all
 from flcav.runs.results.plans import Placed, Plan
 from flcav.runs.results.saved import Saved
-from flcav.runs.results.tests import Difference, HomeCost, RegionalTest, RunFinding, Test, Tested
+from flcav.runs.results.tests import Difference, FoundCount, HomeCost, RegionalTest, RunFinding, Test, Tested
 from flcav.runs.results.training import Pretrained, PrivacySpent, StageResult, Watched
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.seeds import MeanOverSeeds
@@ -106,6 +106,7 @@ class _RunFigures(Saved):
     elapsed_s: float = 0.0  # wall time of all starts together [s]
     costs: Annotated[tuple[ArmCost, ...] | None, LEFT_OUT] = None  # by arm and task
     home: Annotated[tuple[HomeCost, ...] | None, LEFT_OUT] = None  # in the tasks' further measures
+    counts: Annotated[tuple[FoundCount, ...] | None, LEFT_OUT] = None  # of the tests of tasks that count
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN
 from flcav.runs.results.saved import Saved
 from flcav.statistics.estimates import Estimate, Spread
 from flcav.statistics.seeds import MeanOverSeeds
-from flcav.storage.records import LEFT_OUT
+from flcav.storage.records import LEFT_OUT, Record
 
 WORDS = {  # names of stages in reports
     PRETRAIN: "pretrained",
@@ -52,6 +52,9 @@ class Test:
     retrained: tuple[float, ...] = ()  # the measure by retraining of the arm, on the same frames
     over_trainings: Annotated[MeanOverSeeds | None, LEFT_OUT] = None  # mean over this run's trainings, same scenes
     retrained_steps: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # their folders, in the order of `retrained`
+    averaged: Annotated[Mapping[str, float | None] | None, LEFT_OUT] = (
+        None  # `result.numbers`, as means over the same trainings as `estimate`
+    )
 
     @property
     def key(self) -> tuple[str, str, str, str]:
@@ -72,6 +75,11 @@ class Test:
     def measure(self) -> str:
         """The name of the measure, such as AP50."""
         return self.result.measure
+
+    @property
+    def numbers(self) -> Mapping[str, float | None]:
+        """The task's other numbers: means over trainings, or in results of earlier versions of the first training."""
+        return self.result.numbers if self.averaged is None else self.averaged
 
     @property
     def over_scenes(self) -> Estimate:
@@ -148,6 +156,21 @@ class HomeCost:
 
 
 @dataclass(frozen=True)
+class FoundCount(Record):
+    """What an arm's network found of the targets of a region's test frames after a stage, as means over trainings."""
+
+    arm: str
+    stage: str
+    region: str
+    task: str
+    noun: str  # of several targets, such as "cars"
+    targets: int
+    found: float
+    false: float | None  # detections of nothing; None for a task without them
+    trainings: int  # of which this is the mean
+
+
+@dataclass(frozen=True)
 class RunFinding:
     """The verdict of a run on one claim, or its estimate of a loss."""
 
@@ -180,3 +203,29 @@ class SweepComparison(Saved):
     targets: tuple[tuple[float, ...], ...]  # boxes as in `SweepDetections`
     before: SweepDetections
     after: SweepDetections
+    total: Annotated["SweepTotal | None", LEFT_OUT] = None  # of all sweeps it was chosen from
+
+
+@dataclass(frozen=True)
+class SweepTotal:
+    """Numbers of detections of two networks in all test sweeps of a region, at the score of the shown ones."""
+
+    sweeps: int
+    targets: int
+    found: tuple[int, int]  # before, after
+    false: tuple[int, int]  # before, after
+
+
+@dataclass(frozen=True)
+class ErrorsAfter(Saved):
+    """Errors of a pretrained network in the frames that they were registered in, and those of the network after it.
+
+    An error remains if the later network misses the same object of the scene, or has a false positive within
+    `SAME_PLACE_M` of it.
+    """
+
+    region: str
+    task: str
+    remains: tuple[bool, ...]  # by registered error
+    new: tuple[tuple[float, float, float], ...]  # positions of errors that were not registered [m, world frame]
+    new_kinds: tuple[str, ...]
