@@ -210,7 +210,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
         proven.append(bound)
         rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
         values.append(instance.error(x))
-        model = milp(aim, bounds=within, constraints=LinearConstraint(np.array(rows), ub=values))
+        model = milp(aim, bounds=within, constraints=LinearConstraint(np.array(rows), ub=np.array(values)))  # pyright: ignore
         weights = require_optimum(model)[1:]
         if -model.fun - max(proven) <= 0.02 * max(gap, DUAL_GAP) * (max(proven) + instance.floor):
             break
