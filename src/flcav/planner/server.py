@@ -2,7 +2,7 @@
 
 Whoever knows the token of the address is answered: it is sent as a bearer token, which no other site's page can make a
 browser send, so that there is nothing to forge. No request names a path: towns are those of flcav or were opened
-here, files of the page are three by name, and what is uploaded is read from a temporary folder that is removed.
+here, files of the page are four by name, and what is uploaded is read from a temporary folder that is removed.
 """
 
 import contextlib
@@ -43,7 +43,7 @@ from flcav.planner.planning import plan_budgets, plan_more, with_budgets
 
 ASSETS = Path(__file__).with_name("assets")
 SHOWN = {"": ("index.html", "text/html"), "planner.js": ("planner.js", "text/javascript")}
-SHOWN |= {"planner.css": ("planner.css", "text/css")}
+SHOWN |= {"planner.css": ("planner.css", "text/css"), "scene.js": ("scene.js", "text/javascript")}
 MOST_BYTES = 16_000_000  # of a request
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "

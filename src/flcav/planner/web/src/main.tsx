@@ -23,6 +23,7 @@ function App() {
     past: [],
   });
   const [tab, setTab] = useState<Tab>(shared.tab ?? "place");
+  const [solid, setSolid] = useState(shared.solid);
   const [budgets, setBudgets] = useState<Budgets | null>(null);
   const [busy, setBusy] = useState("");
   const [problem, setProblem] = useState("");
@@ -77,9 +78,9 @@ function App() {
   useEffect(() => {
     if (!start || api.saved) return;
     const numbers = budgets && tab === "plan" ? [budgets.wireless_mb, budgets.wireline_mb, ...(budgets.horizon_s ? [budgets.horizon_s] : [])] : [];
-    const address = writeAddress(space?.key ?? "", tab, placing, numbers);
+    const address = writeAddress(space?.key ?? "", tab, placing, numbers, solid);
     if (address.length < 2000) history.replaceState(null, "", `${location.pathname}#${address}`);
-  }, [space, tab, placing, budgets, start]);
+  }, [space, tab, placing, budgets, start, solid]);
 
   const open = (name: string) => {
     setBusy(`Opening ${name} …`);
@@ -133,7 +134,7 @@ function App() {
         </div>
       )}
       {busy && <div class="busy" role="status"><i aria-hidden="true" />{busy}</div>}
-      {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, say, fail }} />}
+      {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }} />}
       {tab === "plan" && start?.problem && budgets && <PlanTab {...{ api, problem: start.problem, budgets, setBudgets, say, fail }} />}
       {tab === "replay" && start?.run && <Replay run={start.run} say={say} />}
       {start && !space && !start.problem && !start.run && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} />}

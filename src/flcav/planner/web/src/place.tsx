@@ -1,11 +1,14 @@
 /** The tab Place: a map with sensors, and beside it what they cover, what could be covered, and what that costs. */
-import { useEffect, useLayoutEffect, useMemo, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Api } from "./api";
 import { Curve } from "./curve";
-import { saveMap, saveText } from "./saving";
+import { saveBlob, saveMap, saveText } from "./saving";
+import type { TownScene } from "./scene/town";
 import { useLooks } from "./looks";
-import { placeOf, TownView, wordOf } from "./map";
+import { TownView, wordOf } from "./map";
+import { Town3D } from "./map3d";
 import { Bar, Command, Legend } from "./parts";
+import { placeOf } from "./standing";
 import type { Best, NewPole, Placing, Stand, Workspace } from "./types";
 
 type Props = {
@@ -14,6 +17,8 @@ type Props = {
   placing: Placing;
   setPlacing: (next: Placing, forget?: boolean) => void;
   undo: (() => void) | null;
+  solid: boolean; // whether the map is shown in three dimensions
+  setSolid: (solid: boolean) => void;
   say: (text: string) => void;
   fail: (error: unknown) => void;
 };
@@ -21,7 +26,8 @@ type Props = {
 const plural = (count: number, noun: string) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 const number = (value: number) => String(Math.round(value * 100) / 100);
 
-export function Place({ api, space, placing, setPlacing, undo, say, fail }: Props) {
+export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }: Props) {
+  const scene = useRef<TownScene | null>(null);
   const [drag, setDrag] = useState<Stand | null>(null);
   const [kind, setKind] = useState(0);
   const [selected, setSelected] = useState<number | null>(null);
@@ -179,22 +185,27 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
   const filters = api.saved ? [] : [...counts((row) => space.errors[row].kind), ...counts((row) => space.errors[row].class)];
   const fair = !api.saved || without.length === 0;
 
+  const shownOn = {
+    ...{ space, stands, kinds, looks, covered, shown, kind, sight, news, moving, carried, selected },
+    onlyPoles: api.saved,
+    onCarried: () => setCarried(null),
+    onDrag: setDrag,
+    onPut: put,
+    onToggle: toggle,
+    onRemove: remove,
+    onRange: range,
+    onSelect: setSelected,
+  };
   return (
     <div class="place">
       <main class="stage">
       <h1 class="said">Sensors in {space.map.name}</h1>
-      <TownView
-        {...{ space, stands, kinds, looks, covered, shown, kind, sight, news, moving, carried, selected }}
-        onlyPoles={api.saved}
-        onCarried={() => setCarried(null)}
-        onDrag={setDrag}
-        onPut={put}
-        onToggle={toggle}
-        onRemove={remove}
-        onRange={range}
-        onSelect={setSelected}
-      />
-      <Legend space={space} covered={placing.stands.length > 0} />
+      {solid ? <Town3D {...shownOn} fail={fail} keep={(made) => (scene.current = made)} /> : <TownView {...shownOn} />}
+      <div class="views" role="group" aria-label="View">
+        <button type="button" aria-pressed={!solid} onClick={() => setSolid(false)}>Above</button>
+        <button type="button" aria-pressed={solid} onClick={() => setSolid(true)}>3D</button>
+      </div>
+      <Legend space={space} covered={placing.stands.length > 0} solid={solid} />
       </main>
       <aside class="panel" aria-label="Sensors and what they cover">
         {space.errors.length > 0 ? (
@@ -395,8 +406,8 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
                 {{ csv: "CSV", geojson: "GeoJSON", yaml: "Recipe" }[ending]}
               </button>
             ))}
-            <button type="button" onClick={() => saveMap("svg", space.map.name)}>SVG</button>
-            <button type="button" onClick={() => saveMap("png", space.map.name)}>PNG</button>
+            {!solid && <button type="button" onClick={() => saveMap("svg", space.map.name)}>SVG</button>}
+            <button type="button" onClick={() => (solid ? scene.current?.picture((png) => png && saveBlob(png, `${space.map.name}.png`)) : saveMap("png", space.map.name))}>PNG</button>
             {!api.saved && <button type="button" onClick={() => navigator.clipboard.writeText(location.href).then(() => say("The link is copied"), fail)}>Copy link</button>}
           </div>
           <Command api={api} space={space} placing={placing} say={say} fail={fail} />

@@ -18,7 +18,9 @@ export type TownMap = {
   roads: Point[][];
   sidewalks: Point[][];
   houses: Point[][];
-  trees: [number, number, number][];
+  heights: number[]; // of the houses [m]
+  trees: [number, number, number, number][]; // x, y, radius, height [m]
+  relief: { columns: number; rows: number; z: number[] } | null; // heights of the ground over the bounds, rows from the south [m]
   streets: { name: string; line: Point[] }[];
 };
 export type Workspace = {
