@@ -13,7 +13,7 @@ import threading
 from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import uvicorn
 from fastapi import Depends, FastAPI, Request
@@ -40,6 +40,9 @@ from flcav.planner.placing import (
     trace_curve,
 )
 from flcav.planner.planning import plan_budgets, plan_more, with_budgets
+
+if TYPE_CHECKING:
+    from flcav.planner.footage import Footage  # loads torch, as runs do
 
 ASSETS = Path(__file__).with_name("assets")
 SHOWN = {"": ("index.html", "text/html"), "planner.js": ("planner.js", "text/javascript")}
@@ -137,6 +140,12 @@ class AskedPlan(Body):
     wireless_mb: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
     wireline_mb: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
     horizon_s: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = None
+
+
+class AskedFootage(Body):
+    """A region or a task of the run, whose recordings are shown."""
+
+    name: str = Field(default="", max_length=64)
 
 
 class LimitBody:
@@ -273,6 +282,19 @@ def make_app(desk: Desk, token: str) -> FastAPI:
     def more(asked: AskedPlan) -> dict[str, Json]:
         return plan_more(_budgeted(desk, asked))
 
+    @app.post("/api/drive", **guarded)
+    def drive(asked: AskedFootage) -> dict[str, Json]:
+        return _footage(desk).drive(asked.name)
+
+    @app.post("/api/sweep", **guarded)
+    def sweep() -> dict[str, Json]:
+        return _footage(desk).sweep()
+
+    @app.post("/api/picture", **guarded)
+    def picture(asked: AskedFootage) -> dict[str, Json]:
+        with busy:
+            return _footage(desk).picture(asked.name)
+
     @app.get("/")
     @app.get("/{name}")
     def file(name: str = "") -> Response:
@@ -306,6 +328,12 @@ def _budgeted(desk: Desk, asked: AskedPlan) -> Problem:
     if desk.problem is None:
         raise InputError("there is no problem to plan: flcav planner PROBLEM.yaml")
     return with_budgets(desk.problem, asked.wireless_mb, asked.wireline_mb, asked.horizon_s)
+
+
+def _footage(desk: Desk) -> "Footage":
+    if desk.footage is None:
+        raise InputError("there is no run to replay: flcav planner RUN")
+    return desk.footage
 
 
 def _describe(desk: Desk, key: str) -> dict[str, Json]:

@@ -1,5 +1,6 @@
 /** What the page asks: a server, or in a saved page what was computed before. */
-import type { Best, Look, NewPole, Placing, Plan, Saving, Stand, Start, Workspace } from "./types";
+import type { SweepData } from "./scene/sweep";
+import type { Best, Look, NewPole, Picture, Placing, Plan, RegionDrive, Saving, Stand, Start, Workspace } from "./types";
 
 export interface Api {
   saved: boolean;
@@ -14,6 +15,9 @@ export interface Api {
   files(key: string, asked: Placing): Promise<{ csv: string; geojson: string; yaml: string; command: string }>;
   plan(budgets: Budgets): Promise<Plan>;
   more(budgets: Budgets): Promise<{ savings?: Saving[] }>;
+  drive(region: string): Promise<RegionDrive>;
+  sweep(): Promise<SweepData>;
+  picture(task: string): Promise<Picture>;
 }
 export type Budgets = { wireless_mb: number; wireline_mb: number; horizon_s: number | null };
 
@@ -90,6 +94,9 @@ export function makeLive(poles: () => number): Api {
       }),
     plan: (budgets) => ask("plan", budgets),
     more: (budgets) => ask("plan-more", budgets),
+    drive: (name) => ask("drive", { name }),
+    sweep: () => ask("sweep", {}),
+    picture: (name) => ask("picture", { name }),
   };
 }
 
@@ -118,5 +125,8 @@ export function makeSaved(saved: Saved): Api {
     files: async () => ({ csv: "", geojson: "", yaml: "", command: saved.command }),
     plan: none,
     more: none,
+    drive: none,
+    sweep: none,
+    picture: none,
   };
 }

@@ -136,7 +136,7 @@ function App() {
       {busy && <div class="busy" role="status"><i aria-hidden="true" />{busy}</div>}
       {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }} />}
       {tab === "plan" && start?.problem && budgets && <PlanTab {...{ api, problem: start.problem, budgets, setBudgets, say, fail }} />}
-      {tab === "replay" && start?.run && <Replay run={start.run} say={say} />}
+      {tab === "replay" && start?.run && <Replay api={api} run={start.run} say={say} fail={fail} />}
       {start && !space && !start.problem && !start.run && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} />}
       <p class="said" role="status" aria-live="polite">{said}</p>
     </>

@@ -52,11 +52,13 @@ function drawBoxes(boxes: Box[], colour: string): Group {
 export class SweepScene {
   private readonly stage: Stage;
   private readonly sides: Scene[] = [];
+  private readonly apart: Color;
 
   /** Draw both sides of a sweep in an element, side by side or, where it is narrow, one above the other. */
   constructor(host: HTMLElement, data: SweepData) {
     const told = tellSweep(data);
     this.stage = new Stage(host, `A sweep in three dimensions. ${told[0]}; ${told[1]}. Arrows turn it, plus and minus go nearer and away`, (stage, width, height) => this.paint(stage, width, height));
+    this.apart = new Color(colourOf(host, "page", "#ffffff"));
     const colours = { found: colourOf(host, "seen", "#0072b2"), missed: colourOf(host, "miss", "#e0872b"), false: colourOf(host, "false", "#c4461f") };
     const points = this.cloud(host, data);
     for (const side of [data.before, data.after]) {
@@ -92,9 +94,13 @@ export class SweepScene {
     const [w, h] = narrow ? [width, height / 2] : [width / 2, height];
     camera.aspect = w / h;
     camera.updateProjectionMatrix();
+    renderer.setScissorTest(false);
+    renderer.setClearColor(this.apart);
+    renderer.clear();
     renderer.setScissorTest(true);
     this.sides.forEach((scene, n) => {
-      const frame: [number, number, number, number] = narrow ? [0, (1 - n) * h, w, h] : [n * w, 0, w, h];
+      const gap = n ? 2 : 0; // between the sides
+      const frame: [number, number, number, number] = narrow ? [0, (1 - n) * (h + 1), w, h - 1] : [n * w + gap, 0, w - gap, h];
       renderer.setViewport(...frame);
       renderer.setScissor(...frame);
       renderer.render(scene, camera);
