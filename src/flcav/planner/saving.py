@@ -46,7 +46,8 @@ def _join(saved: str) -> bytes:
     page, style, program, scene = ((ASSETS / name).read_text("utf-8") for name in names)
     policy = f'<meta charset="utf-8">\n<meta http-equiv="content-security-policy" content="{POLICY}">'
     program, scene = (text.replace("</script", "<\\/script") for text in (program, scene))
-    data = f'<script type="application/json" id="saved">{saved}</script>\n<script type="text/plain" id="scene">{scene}</script>'
+    data = f'<script type="application/json" id="saved">{saved}</script>'
+    data += f'\n<script type="text/plain" id="scene">{scene}</script>'
     parts = {
         '<meta charset="utf-8">': policy,
         '<link rel="stylesheet" href="planner.css">': f"<style>\n{style}</style>",

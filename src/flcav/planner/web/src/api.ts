@@ -8,6 +8,7 @@ export interface Api {
   open(town: string): Promise<Workspace>;
   workspace(key: string): Promise<Workspace>;
   drop(file: File, workspace: string): Promise<Workspace>;
+  dropRun(name: string, files: Record<string, string>): Promise<Start>;
   look(key: string, stand: Stand, range_m: number, sight: boolean): Promise<Look>;
   best(key: string, asked: Placing, limit: { count?: number; budget?: number }): Promise<Best>;
   curve(key: string, asked: Placing): Promise<Best[]>;
@@ -74,6 +75,7 @@ export function makeLive(poles: () => number): Api {
     workspace: (key) => ask("workspace", { town: key }),
     drop: (file, workspace) =>
       send(`/api/drop?name=${encodeURIComponent(file.name)}&workspace=${encodeURIComponent(workspace)}`, file),
+    dropRun: (name, files) => ask("drop-run", { name, files }),
     look: (key, stand, range_m, sight) =>
       ask("look", {
         workspace: key,
@@ -111,6 +113,7 @@ export function makeSaved(saved: Saved): Api {
     open: async () => saved.workspace,
     workspace: async () => saved.workspace,
     drop: none,
+    dropRun: none,
     look: async (_key, stand, range_m) => {
       const kind = saved.start.kinds.findIndex((each) => each.range_m === range_m);
       return saved.looks[`${stand.pole} ${kind}`] ?? { area: "", covered: [], z: 0 };

@@ -123,7 +123,7 @@ export function Replay({ api, run, say, fail }: { api: Api; run: RunInfo; say: (
         </section>
         <section>
           <h2>Road sensors</h2>
-          <ul class="facts">{run.placed.map((each) => <li>{each.region}: pole {each.poles.join(", ")} covers {each.covered} of {each.errors} errors</li>)}</ul>
+          <ul class="facts">{run.placed.map((each) => <li>{each.region}: {each.poles.length ? `pole ${each.poles.join(", ")} covers ${each.covered} of ${each.errors} errors` : `no sensor; ${each.errors} errors`}</li>)}</ul>
         </section>
         <section>
           <h2>Findings</h2>
