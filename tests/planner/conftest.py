@@ -3,7 +3,6 @@
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_run import DEMO, FLCAV, make_run
 
 from flcav.world.map.town import load_town
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLCAV = Path(sys.executable).with_name("flcav")
+SOFTWARE_GL = ("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader")  # no GPU is needed
+PROBLEM = Path(__file__).parents[2] / "recipes" / "allocation" / "objects.yaml"
 
 
 @dataclass
@@ -62,12 +63,38 @@ def served(table) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="session")
+def plan() -> Iterator[Served]:
+    planner = serve(PROBLEM)
+    yield planner
+    planner.stop()
+
+
+@pytest.fixture(scope="session")
+def replay() -> Iterator[Served]:
+    planner = serve(DEMO)
+    yield planner
+    planner.stop()
+
+
+@pytest.fixture(scope="session")
+def recorded_run(tmp_path_factory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="session")
+def recorded(recorded_run) -> Iterator[Served]:
+    planner = serve(recorded_run)
+    yield planner
+    planner.stop()
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install playwright")
     if CHROMIUM is None:
         pytest.skip("no Chromium: apt-get install chromium")
     with api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", *SOFTWARE_GL])
         yield found
         found.close()
 

@@ -19,6 +19,7 @@ from flcav.dataset.store import Dataset
 from flcav.perception.errors import PerceptionError, load_errors
 from flcav.perception.marks import PictureBoxes
 from flcav.perception.objects.task import OBJECTS
+from flcav.perception.signs.task import SIGNS
 from flcav.perception.tasks import task_named
 from flcav.planner.placing import describe_town
 from flcav.runs.frames import DATA, Frames
@@ -38,6 +39,7 @@ APART_S = 0.8  # least time between two poses that the page is given [s]
 PEDESTRIAN = "pedestrian"
 MOST_POINTS = 60_000  # of a sweep
 MOST_PX = 960  # width of a picture
+MOST_FRAMES = 60  # of a test, among which the picture with most labels is looked for
 
 
 @dataclass(frozen=True)
@@ -104,7 +106,8 @@ class Footage:
         if task not in self._tasks_with_pictures():
             raise InputError(f"the run has no pictures of {shorten(task)}")
         region, data = next((each, data) for each, data in self._tests(task) if data.cameras(0))
-        labels = [_labels(data.frame(i), data.cameras(i)[0]) for i in range(len(data))]
+        signs = task == SIGNS.name
+        labels = [_labels(data.frame(i), data.cameras(i)[0], signs=signs) for i in range(min(len(data), MOST_FRAMES))]
         frame = int(np.argmax([len(each) for each in labels]))
         return {
             **_as_jpeg(np.asarray(data.plane(frame, data.cameras(frame)[0], "rgb"))),
@@ -236,18 +239,14 @@ def _boxes(rows: Sequence[Sequence[float]]) -> list[Json]:
     return [[round(value, 2) for value in row[:7]] for row in rows]
 
 
-def _labels(frame: Frame, camera: str) -> list[Json]:
-    """Return what is labelled in a picture: signs and signals, or else the road users that are visible."""
-    signs = frame.annotations.signs.get(camera)
-    if signs is not None and len(signs):
-        return [[*map(_tenth, box), str(kind)] for box, kind in zip(signs.box.tolist(), signs.kind, strict=True)]
-    views = frame.annotations.views.get(camera)
-    if views is None:
-        return []
+def _labels(frame: Frame, camera: str, *, signs: bool) -> list[Json]:
+    """Return what is labelled in a picture: signs and signals, or the road users that are visible."""
+    if signs:
+        seen = frame.annotations.signs[camera]
+        return [[*map(_tenth, box), str(kind)] for box, kind in zip(seen.box.tolist(), seen.kind, strict=True)]
+    shown, labels = frame.annotations.views[camera].shown_box.tolist(), frame.annotations.boxes.label
     return [
-        [*map(_tenth, box), str(label)]
-        for box, label in zip(views.shown_box.tolist(), frame.annotations.boxes.label, strict=True)
-        if np.isfinite(box).all()
+        [*map(_tenth, box), str(label)] for box, label in zip(shown, labels, strict=True) if np.isfinite(box).all()
     ]
 
 

@@ -254,7 +254,7 @@ export function Told({ error, row, stands, poles, looks }: { error: Wrong; row: 
         <dt>seen by</dt><dd>{by.length ? by.map((each) => (each.pole === null ? "own place" : `pole ${poles[each.pole].id}`)).join(", ") : "none"}</dd>
         {error.occlusion != null && <><dt>hidden from the vehicle</dt><dd>{Math.round(error.occlusion * 100)} %</dd></>}
         {error.returns != null && <><dt>LiDAR returns</dt><dd>{error.returns}</dd></>}
-        {error.scene && <><dt>scene</dt><dd>{error.scene}</dd></>}
+        {error.scene && <><dt>sweep of</dt><dd>{error.scene}{error.track ? `, ${error.track}` : ""}</dd></>}
         {error.weight !== 1 && <><dt>weight</dt><dd>{error.weight}</dd></>}
       </dl>
     </>

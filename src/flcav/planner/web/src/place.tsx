@@ -4,6 +4,7 @@ import type { Api } from "./api";
 import { Curve } from "./curve";
 import { saveBlob, saveMap, saveText } from "./saving";
 import type { TownScene } from "./scene/town";
+import { KindsSection, number } from "./kinds";
 import { useLooks } from "./looks";
 import { TownView, wordOf } from "./map";
 import { Town3D } from "./map3d";
@@ -24,7 +25,6 @@ type Props = {
 };
 
 const plural = (count: number, noun: string) => `${count} ${noun}${count === 1 ? "" : "s"}`;
-const number = (value: number) => String(Math.round(value * 100) / 100);
 
 export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }: Props) {
   const scene = useRef<TownScene | null>(null);
@@ -167,7 +167,10 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
   });
 
   const noun = space.noun;
+  const fair = !api.saved || without.length === 0;
   const current = best && bestFor === bestAsked && !drag && placing.stands.length ? best : null;
+  const after = same === "count" && !priced && current ? curve?.find((each) => each.pairs.length === placing.stands.length + 1) : null;
+  const more = after && current && fair ? { ...after, gain: Math.max(even ? after.covered - current.covered : after.weight - current.weight, 0) } : null;
   const limited = same === "cost" ? `for ${number(cost)}` : `with ${plural(placing.stands.length, "sensor")}`;
   const beyond = current?.beyond ?? curve?.[0]?.beyond ?? null;
   useEffect(() => {
@@ -183,7 +186,6 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
     return [...found];
   };
   const filters = api.saved ? [] : [...counts((row) => space.errors[row].kind), ...counts((row) => space.errors[row].class)];
-  const fair = !api.saved || without.length === 0;
 
   const shownOn = {
     ...{ space, stands, kinds, looks, covered, shown, kind, sight, news, moving, carried, selected },
@@ -226,6 +228,7 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
               )}
               {!current && placing.stands.length > 0 && <li class="wait">{refused || (drag ? "Best possible: when you let go" : "Computing the best possible …")}</li>}
               {!placing.stands.length && <li>Drag a sensor onto the map, or press a pole. O shows the optimum.</li>}
+              {more && <li id="next">With one more: <b>{even ? more.covered : number(more.weight)}</b> at best, {more.gain > 0 ? `+${number(more.gain)}` : "nothing more"}</li>}
               {beyond !== null && <li id="beyond"><b>{beyond}</b> out of reach of every {placing.stands.some((each) => each.pole === null) ? "pole and place of yours" : "pole"}</li>}
               {priced && placing.stands.length > 0 && <li>Cost: <b id="cost">{number(cost)}</b></li>}
             </ul>
@@ -268,55 +271,7 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
           </section>
         )}
 
-        <section>
-          <h2>Kinds of sensors</h2>
-          <div class="kinds">
-            {kinds.map((each, n) => (
-              <div class={`kind${n === kind ? " on" : ""}`} key={n}>
-                <button
-                  type="button"
-                  class={`chip k${n % 6}`}
-                  aria-pressed={n === kind}
-                  title="Drag it onto the map, or choose it for the poles you press"
-                  onClick={() => setKind(n)}
-                  onPointerDown={(event) => {
-                    if (event.pointerType === "touch") return;
-                    setKind(n);
-                    const start = [event.clientX, event.clientY];
-                    const away = (moved: PointerEvent) => {
-                      if (Math.hypot(moved.clientX - start[0], moved.clientY - start[1]) < 5) return;
-                      end();
-                      setCarried(n);
-                    };
-                    const end = () => [window.removeEventListener("pointermove", away), window.removeEventListener("pointerup", end)];
-                    window.addEventListener("pointermove", away);
-                    window.addEventListener("pointerup", end);
-                  }}
-                >
-                  <i aria-hidden="true" /> {each.name}
-                </button>
-                {api.saved ? (
-                  <span class="fixed">{each.range_m} m{priced ? ` · ${number(each.cost)}` : ""}</span>
-                ) : (
-                  <>
-                    <label>
-                      <span>range</span>
-                      <input type="number" min={1} max={2000} step={1} value={each.range_m} aria-label={`Range of ${each.name} in metres`} onChange={(event) => range(n, Number(event.currentTarget.value || each.range_m) - each.range_m)} />
-                      <span>m</span>
-                    </label>
-                    <label>
-                      <span>price</span>
-                      <input type="number" min={0} step="any" value={each.cost} aria-label={`Price of ${each.name}`} onChange={(event) => setKindField(n, { cost: Math.max(0, Number(event.currentTarget.value) || 0) })} />
-                    </label>
-                  </>
-                )}
-              </div>
-            ))}
-            {!api.saved && kinds.length < 6 && (
-              <button type="button" class="quiet" onClick={() => setPlacing({ ...placing, kinds: [...kinds, { name: `kind ${kinds.length + 1}`, range_m: kinds[kinds.length - 1].range_m * 2, cost: kinds[kinds.length - 1].cost * 2 }] })}>+ another kind</button>
-            )}
-          </div>
-        </section>
+        <KindsSection {...{ placing, setPlacing, kind, setKind, priced, range, setKindField, setCarried }} fixed={api.saved} />
 
         {placing.stands.length > 0 && (
           <section>
