@@ -1,12 +1,17 @@
 """Three dimensions: the map with sensors that are dragged, and a sweep before and after, also in a page of its own."""
 
+import base64
 import json
 import re
+import subprocess
 
+import numpy as np
 import pytest
 from conftest import serve
+from made_run import FLCAV
 from test_place import COVERED, drag, middle_of, placed, seen_from, show, wait_for
 
+from flcav.dataset.store import Dataset
 from flcav.planner.replaying import open_run
 from flcav.planner.server import ASSETS
 
@@ -31,7 +36,7 @@ def test_three_dimensions_are_loaded_when_they_are_wanted(opened, served):
     page.wait_for_selector(".scene canvas")
     assert page.evaluate("typeof flcavScene") == "object"
     assert "v=3d" in page.url
-    other = show(opened, f"{page.url}&{served.address.partition('#')[2]}")
+    other = opened(f"{page.url}&{served.address.partition('#')[2]}")
     other.wait_for_selector(".scene canvas")
 
 
@@ -44,6 +49,7 @@ def test_what_is_seen_in_three_dimensions_is_what_is_seen_from_above(opened, ser
     wait_for(page, COVERED, str(seen_from(table, 5)))
     drag(page, middle_of(page, ".kind .chip"), middle(page, "#pole-6"))
     wait_for(page, "#stands", "Pole 7")
+    wait_for(page, "#best", "with 2 sensors")
     page.keyboard.press("o")
     wait_for(page, COVERED, str(placed(table, 2)["covered"]))
 
@@ -70,10 +76,6 @@ def test_the_town_is_turned_by_keys(opened, served):
 
 
 def test_a_saved_page_has_three_dimensions_too(opened, table, tmp_path):
-    import subprocess
-
-    from made_run import FLCAV
-
     page_file = tmp_path / "grid.html"
     typed = [str(FLCAV), "planner", "grid", "--errors", str(table), "--html", str(page_file)]
     subprocess.run(typed, check=True, capture_output=True)
@@ -109,8 +111,6 @@ def test_a_sweep_is_shown_in_any_page(opened, recorded_run, tmp_path):
 
 
 def test_points_and_boxes_of_a_sweep_are_those_of_its_frame(opened, recorded_run, recorded):
-    from flcav.dataset.store import Dataset
-
     page = opened(recorded.address)
     page.locator(".sweep").scroll_into_view_if_needed()
     page.wait_for_selector(".sweep canvas")
@@ -121,9 +121,5 @@ def test_points_and_boxes_of_a_sweep_are_those_of_its_frame(opened, recorded_run
     frame = Dataset.open(recorded_run / "work" / "grid-test-objects" / "data").frame(0)
     desk = open_run(recorded_run)
     assert desk.footage is not None
-    import base64
-
-    import numpy as np
-
     sent = np.frombuffer(base64.b64decode(str(desk.footage.sweep()["points"])), "<i2").reshape(-1, 3) / 100
     assert np.abs(sent - next(iter(frame.lidar.values()))[:, :3]).max() <= 0.00501

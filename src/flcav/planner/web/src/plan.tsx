@@ -9,6 +9,7 @@ const percent = (value: number) => `${Math.round(value * 1000) / 10} %`;
 
 export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props) {
   const [plan, setPlan] = useState<Plan | null>(null);
+  const [planFor, setPlanFor] = useState("");
   const [savings, setSavings] = useState<Saving[] | null>(null);
   const asked = JSON.stringify(budgets);
   useEffect(() => {
@@ -19,6 +20,7 @@ export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props)
         performance.measure("plan", "plan-asked");
         if (!current) return;
         setPlan(found);
+        setPlanFor(asked);
         say(found.infeasible ? found.infeasible : `${problem.measure} ${digits(found.objective)}`);
       }).catch(fail);
     }, 60);
@@ -56,7 +58,7 @@ export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props)
           )}
         </section>
       </aside>
-      <main class="sheet">
+      <main class="sheet" aria-busy={planFor !== asked}>
         {!plan && <p class="wait">Planning …</p>}
         {plan?.infeasible && <div class="alert"><h2>No plan fits</h2><p>{plan.infeasible}</p></div>}
         {feasible && (
