@@ -16,6 +16,7 @@ from test_place import wait_for
 
 MAP = Path(__file__).parents[2] / "recipes" / "maps" / "quarter.xodr"
 ACCIDENTS = "date;latitude;longitude\n2026-03-02;49,00012;8,39931\n2026-03-19;49,00021;8,39922\n"
+LISTENING_MS = 300  # until the browser tells of file dialogues: one that opens before stays open, and blocks the next
 MOST_TABS = 120  # presses of Tab until what is wanted has the focus
 
 
@@ -35,6 +36,7 @@ class Pointer:
 
     def choose(self, target: Any, file: Path) -> None:
         with self.page.expect_file_chooser() as dialogue:
+            self.page.wait_for_timeout(LISTENING_MS)
             target.locator("xpath=..").click()
         dialogue.value.set_files(file)
 
@@ -67,6 +69,7 @@ class Keys:
     def choose(self, target: Any, file: Path) -> None:
         self.reach(target)
         with self.page.expect_file_chooser() as dialogue:
+            self.page.wait_for_timeout(LISTENING_MS)
             self.page.keyboard.press("Enter")
         dialogue.value.set_files(file)
 
