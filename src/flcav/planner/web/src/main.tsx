@@ -172,7 +172,11 @@ function Welcome({ cards, onOpen, onFile, onFolder }: WelcomeProps) {
   return (
     <main class="welcome">
       <h1>Where should sensors stand?</h1>
-      <p>Choose a town, or <label class="file inline"><input type="file" accept=".xodr" onChange={(event) => onFile(event.currentTarget.files?.[0])} /><span>open a map of your own (.xodr)</span></label>. Then drop a table of errors or accidents on its map. A finished run is replayed: <label class="file inline"><input type="file" {...{ webkitdirectory: "" }} onChange={(event) => event.currentTarget.files?.length && onFolder(Promise.resolve(chosenFolder(event.currentTarget.files)))} /><span>open a run's folder</span></label>.</p>
+      <p>Choose a town, then drop a table of errors or accidents on its map. Or bring your own: an OpenDRIVE map, or the folder of a finished run, which is replayed.</p>
+      <div class="row">
+        <label class="file inline"><input type="file" accept=".xodr" onChange={(event) => onFile(event.currentTarget.files?.[0])} /><span>Open a map (.xodr) …</span></label>
+        <label class="file inline"><input type="file" {...{ webkitdirectory: "" }} onChange={(event) => event.currentTarget.files?.length && onFolder(Promise.resolve(chosenFolder(event.currentTarget.files)))} /><span>Open a run's folder …</span></label>
+      </div>
       <div class="towns">
         {cards.map((card) => {
           const [x0, y0, x1, y1] = card.bounds;

@@ -224,7 +224,7 @@ const Sign = memo(
     const r = px(many ? 2.6 : 4);
     const at = (event: PointerEvent) => {
       const frame = (event.currentTarget as Element).closest(".map")!.getBoundingClientRect();
-      onHover({ error: row, x: Math.min(event.clientX - frame.left, frame.width - 230), y: event.clientY - frame.top });
+      onHover({ error: row, x: Math.min(event.clientX - frame.left, frame.width - 272), y: Math.min(event.clientY - frame.top, frame.height - 170) });
     };
     const common = { class: `e ${error.kind}${seen ? " seen" : ""}`, onPointerEnter: at, onPointerLeave: () => onHover(null) };
     if (error.kind === "false_positive")

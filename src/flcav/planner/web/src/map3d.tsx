@@ -101,7 +101,7 @@ export function Town3D({ fail, keep, ...props }: MapProps & { fail: (error: unkn
     if (event.buttons || !scene || event.target !== host.current?.firstChild) return setHover(null);
     const row = scene.errorAt(event);
     const frame = host.current.getBoundingClientRect();
-    setHover(row === null ? null : { error: row, x: Math.min(event.clientX - frame.left, frame.width - 230), y: event.clientY - frame.top });
+    setHover(row === null ? null : { error: row, x: Math.min(event.clientX - frame.left, frame.width - 272), y: Math.min(event.clientY - frame.top, frame.height - 170) });
   };
 
   const occupied = new Set(stands.map((each) => each.pole));
