@@ -1,4 +1,4 @@
-"""What a run recorded, in its replay: drives, misses, messages, a sweep and a picture; and a run's folder that is dropped."""
+"""What a run recorded, in its replay: drives, misses, messages, a sweep and a picture; and a run that is dropped."""
 
 import base64
 import json
@@ -94,6 +94,28 @@ def pack(folder, *names: str) -> dict[str, str]:
     return {name: base64.b64encode((folder / name).read_bytes()).decode() for name in names}
 
 
+# As the browser hands over a folder that was dropped: entries, of which the page reads what it needs.
+DROP = """files => {
+    const bytes = text => Uint8Array.from(atob(text), sign => sign.charCodeAt(0));
+    const asFile = (name, text) => ({isFile: true, name, file: done => done(new File([bytes(text)], name))});
+    const asFolder = (name, tree) => ({isDirectory: true, name, createReader: () => {
+        let left = Object.entries(tree).map(([each, inner]) => asEntry(each, inner));
+        return {readEntries: done => { const now = left; left = []; done(now); }};
+    }});
+    const asEntry = (name, tree) => (typeof tree === 'string' ? asFile : asFolder)(name, tree);
+    const root = {};
+    for (const [path, text] of Object.entries(files)) {
+        const parts = path.split('/');
+        let at = root;
+        for (const part of parts.slice(0, -1)) at = at[part] ??= {};
+        at[parts.at(-1)] = text;
+    }
+    const event = new Event('drop', {cancelable: true});
+    event.dataTransfer = {items: [{webkitGetAsEntry: () => asFolder('recorded', root)}], files: []};
+    window.dispatchEvent(event);
+}"""
+
+
 def test_a_runs_folder_is_opened_in_the_page(opened, recorded_run):
     planner = serve()
     try:
@@ -101,30 +123,14 @@ def test_a_runs_folder_is_opened_in_the_page(opened, recorded_run):
         page.locator(".card").first.wait_for()
         small = ["results.json", "work/grid-errors-objects/errors.parquet"]
         names = [*small, "work/grid-registry-objects/data/manifest.json"]
-        # As the browser hands over a folder that was dropped: entries, of which the page reads what it needs.
-        drop = """files => {
-            const asEntry = (name, tree) => typeof tree === 'string'
-                ? {isFile: true, isDirectory: false, name, file: done => done(new File([Uint8Array.from(atob(tree), c => c.charCodeAt(0))], name))}
-                : {isFile: false, isDirectory: true, name, createReader: () => { let left = Object.entries(tree);
-                    return {readEntries: done => { const now = left; left = []; done(now.map(([n, t]) => asEntry(n, t))); }}; }};
-            const root = {};
-            for (const [path, text] of Object.entries(files)) {
-                const parts = path.split('/'); let at = root;
-                for (const part of parts.slice(0, -1)) at = at[part] ??= {};
-                at[parts.at(-1)] = text;
-            }
-            const event = new Event('drop', {cancelable: true});
-            event.dataTransfer = {items: [{webkitGetAsEntry: () => asEntry('recorded', root)}], files: []};
-            window.dispatchEvent(event);
-        }"""
         with page.expect_request("**/api/drop-run") as asked:
-            page.evaluate(drop, pack(recorded_run, *names))
+            page.evaluate(DROP, pack(recorded_run, *names))
         assert sorted(json.loads(asked.value.post_data)["files"]) == small
-        wait_for(page, "#gained", "gained most")
+        page.locator("#gained").wait_for(timeout=60_000)  # what reads a run is loaded first
         wait_for(page, ".bar-alert", "flcav planner recorded")
         page.get_by_role("button", name="Place", exact=True).click()
         wait_for(page, "#total", "2")
-        page.evaluate(drop, {"notes.txt": ""})
+        page.evaluate(DROP, {"notes.txt": ""})
         wait_for(page, ".alert", "no folder of a finished run")
     finally:
         planner.stop()
