@@ -27,7 +27,7 @@ def show(opened, address: str, **options):
 
 def wait_for(page, selector: str, text: str) -> None:
     page.wait_for_function(
-        "([at, text]) => document.querySelector(at)?.textContent.includes(text)", arg=[selector, text], timeout=15_000
+        "([at, text]) => document.querySelector(at)?.textContent.includes(text)", arg=[selector, text], timeout=60_000
     )
 
 
