@@ -50,11 +50,10 @@ def _save_errors(data: Dataset, folder: Path) -> None:
     frame = data.frame(len(data) - 1)
     truth = frame.annotations
     cars = [row for row, label in enumerate(truth.boxes.label.tolist()) if label == "car"][:2]
+    at, names = truth.boxes.center[cars].tolist(), truth.track[cars].tolist()
     missed = [
-        PerceptionError(
-            *truth.boxes.center[row].tolist(), 1.0, "miss", "Car", 9, 0.2, frame.scene, str(truth.track[row])
-        )
-        for row in cars
+        PerceptionError(x, y, z, 1.0, "miss", "Car", 9, 0.2, frame.scene, name)
+        for (x, y, z), name in zip(at, names, strict=True)
     ]
     save_errors(missed, folder / "errors.parquet")
 

@@ -21,15 +21,15 @@ from flcav.perception.marks import PictureBoxes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.tasks import task_named
+from flcav.perception.weights import load_network
 from flcav.planner.placing import describe_town
 from flcav.runs.frames import DATA, Frames
 from flcav.runs.recipe import PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import Run
-from flcav.runs.results.saved import ERRORS
+from flcav.runs.results.saved import ERRORS, WEIGHTS
 from flcav.runs.results.tests import SweepComparison, SweepDetections
 from flcav.runs.stages.testing import LOOK, SHOWN_SCORE
-from flcav.runs.training.learning import load_stage_network
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
@@ -159,7 +159,7 @@ class Footage:
         for stage, title in ((PRETRAIN, "pretrained"), (stages[-1] if stages else PRETRAIN, "after the last stage")):
             folder = self.folder / WORK / self.run.steps.stage(self.arm, stage, region, name)
             try:
-                network = load_stage_network(task, folder)
+                network = load_network(task, folder / WEIGHTS)
             except InputError:
                 continue
             for finding in task.infer(network, data.folder, SHOWN_SCORE, [frame]):
@@ -245,9 +245,7 @@ def _labels(frame: Frame, camera: str, *, signs: bool) -> list[Json]:
         seen = frame.annotations.signs[camera]
         return [[*map(_tenth, box), str(kind)] for box, kind in zip(seen.box.tolist(), seen.kind, strict=True)]
     shown, labels = frame.annotations.views[camera].shown_box.tolist(), frame.annotations.boxes.label
-    return [
-        [*map(_tenth, box), str(label)] for box, label in zip(shown, labels, strict=True) if np.isfinite(box).all()
-    ]
+    return [[*map(_tenth, box), str(label)] for box, label in zip(shown, labels, strict=True) if np.isfinite(box).all()]
 
 
 def _as_jpeg(picture: NDArray[np.uint8]) -> dict[str, Json]:
