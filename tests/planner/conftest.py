@@ -3,7 +3,6 @@
 import re
 import shutil
 import subprocess
-import sys
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from made_run import DEMO, FLCAV, make_run
 
 from flcav.world.map.town import load_town
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
-FLCAV = Path(sys.executable).with_name("flcav")
+SOFTWARE_GL = "--enable-unsafe-swiftshader"  # three dimensions without a GPU; pages are drawn as without it
+PROBLEM = Path(__file__).parents[2] / "recipes" / "allocation" / "objects.yaml"
 
 
 @dataclass
@@ -39,19 +40,23 @@ def serve(*arguments: object) -> Served:
     return Served(process, line)
 
 
-@pytest.fixture(scope="session")
-def table(tmp_path_factory) -> Path:
-    """113 errors along the streets of the grid."""
-    path = tmp_path_factory.mktemp("planner") / "errors.csv"
+def write_errors(path: Path, count: int) -> Path:
+    """Write errors along the streets of the grid, reproducibly."""
     rng, roads = np.random.default_rng(2), load_town("grid").roads
     lines = ["x,y,z,weight,kind,class,returns,occlusion,scene,track"]
-    for number in range(113):
+    for number in range(count):
         road = roads[rng.integers(len(roads))]
         x, y = np.mean(road[rng.integers(len(road), size=2)], axis=0)
         kind, label = ("miss", "false_positive")[number % 5 == 0], ("Car", "Pedestrian")[number % 3 == 0]
         lines.append(f"{x:.2f},{y:.2f},0.8,1,{kind},{label},12,0.3,grid-0-000,t{number}")
     path.write_text("\n".join(lines) + "\n")
     return path
+
+
+@pytest.fixture(scope="session")
+def table(tmp_path_factory) -> Path:
+    """113 errors along the streets of the grid."""
+    return write_errors(tmp_path_factory.mktemp("planner") / "errors.csv", 113)
 
 
 @pytest.fixture(scope="session")
@@ -62,12 +67,38 @@ def served(table) -> Iterator[Served]:
 
 
 @pytest.fixture(scope="session")
+def plan() -> Iterator[Served]:
+    planner = serve(PROBLEM)
+    yield planner
+    planner.stop()
+
+
+@pytest.fixture(scope="session")
+def replay() -> Iterator[Served]:
+    planner = serve(DEMO)
+    yield planner
+    planner.stop()
+
+
+@pytest.fixture(scope="session")
+def recorded_run(tmp_path_factory) -> Path:
+    return make_run(tmp_path_factory.mktemp("run"))
+
+
+@pytest.fixture(scope="session")
+def recorded(recorded_run) -> Iterator[Served]:
+    planner = serve(recorded_run)
+    yield planner
+    planner.stop()
+
+
+@pytest.fixture(scope="session")
 def browser() -> Iterator[Any]:
     api = pytest.importorskip("playwright.sync_api", reason="no Playwright: pip install playwright")
     if CHROMIUM is None:
         pytest.skip("no Chromium: apt-get install chromium")
     with api.sync_playwright() as playwright:
-        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        found = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", SOFTWARE_GL])
         yield found
         found.close()
 

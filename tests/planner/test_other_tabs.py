@@ -8,32 +8,16 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from conftest import serve
+from conftest import PROBLEM
+from made_run import DEMO
 from test_place import wait_for
 
 import flcav.planner
 from flcav.optimization.graph import load_problem
 from flcav.planner.planning import plan_budgets, with_budgets
 
-ROOT = Path(__file__).parents[2]
-PROBLEM = ROOT / "recipes" / "allocation" / "objects.yaml"
-RUN = ROOT / "reproductions" / "runs" / "demo"
 WEB = Path(flcav.planner.__file__).parent / "web"
 AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
-
-
-@pytest.fixture(scope="module")
-def plan():
-    planner = serve(PROBLEM)
-    yield planner
-    planner.stop()
-
-
-@pytest.fixture(scope="module")
-def replay():
-    planner = serve(RUN)
-    yield planner
-    planner.stop()
 
 
 def test_a_plan_follows_its_sliders(opened, plan):
@@ -62,7 +46,7 @@ def test_budgets_that_allow_no_plan_are_told(opened, plan):
 
 def test_a_run_is_played_by_keys_and_names_the_round_that_gained_most(opened, replay):
     page = opened(replay.address)
-    results = json.loads((RUN / "results.json").read_text())
+    results = json.loads((DEMO / "results.json").read_text())
     scores = {
         (watched["stage"], each["round"], watched["region"]): each["score"]
         for watched in results["watched"]
@@ -83,16 +67,28 @@ def test_a_run_is_played_by_keys_and_names_the_round_that_gained_most(opened, re
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
 @pytest.mark.parametrize("width", [1440, 390])
-@pytest.mark.parametrize("tab", ["place", "plan", "replay"])
-def test_axe_finds_no_violation(opened, served, plan, replay, tab, width, scheme):
+@pytest.mark.parametrize("tab", ["place", "solid", "plan", "replay", "recorded"])
+def test_axe_finds_no_violation(opened, served, plan, replay, recorded, tab, width, scheme):
     if not AXE.exists():
         pytest.skip("no axe-core: npm ci in src/flcav/planner/web")
-    planner = {"place": served, "plan": plan, "replay": replay}[tab]
+    planner = {"place": served, "solid": served, "plan": plan, "replay": replay, "recorded": recorded}[tab]
     page = opened(planner.address, width=width, color_scheme=scheme, bypass_csp=True)
     if tab == "place":
         page.locator("#pole-1").click()
         wait_for(page, "#best", "with 1 sensor")
-    page.wait_for_selector({"place": ".step", "plan": ".task", "replay": ".scores"}[tab])
+    if tab == "solid":
+        page.get_by_role("button", name="3D").click()
+    if tab == "recorded":
+        page.locator(".sweep").scroll_into_view_if_needed()
+        page.wait_for_selector(".shot")
+    shown = {
+        "place": ".step",
+        "solid": ".scene canvas",
+        "plan": ".task",
+        "replay": ".scores",
+        "recorded": ".sweep canvas",
+    }
+    page.wait_for_selector(shown[tab])
     page.add_script_tag(path=AXE)
     found = page.evaluate("() => axe.run()")["violations"]
     assert [
@@ -103,6 +99,6 @@ def test_axe_finds_no_violation(opened, served, plan, replay, tab, width, scheme
 def test_the_bundle_is_that_of_its_sources(tmp_path):
     if not (WEB / "node_modules").exists() or shutil.which("npm") is None:
         pytest.skip("no esbuild: npm ci in src/flcav/planner/web")
-    bundle = tmp_path / "planner.js"
-    subprocess.run(["npm", "run", "-s", "bundle"], cwd=WEB, check=True, env={**os.environ, "OUT": str(bundle)})
-    assert bundle.read_bytes() == (WEB.parent / "assets" / "planner.js").read_bytes()
+    subprocess.run(["npm", "run", "-s", "bundle"], cwd=WEB, check=True, env={**os.environ, "OUT": str(tmp_path)})
+    for name in ("planner.js", "scene.js"):
+        assert (tmp_path / name).read_bytes() == (WEB.parent / "assets" / name).read_bytes()

@@ -5,6 +5,7 @@ import threading
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from flcav.config import InputError, Json, shorten
 from flcav.interface.wording import plural
@@ -15,6 +16,9 @@ from flcav.planner.planning import describe_problem
 from flcav.world.map.town import PACKAGED, TOWNS, Town, load_town
 from flcav.world.opendrive.importing import import_town
 from flcav.world.trace import Trace
+
+if TYPE_CHECKING:
+    from flcav.planner.footage import Footage  # loads torch, as runs do
 
 RANGE_M = 40.0  # of the one kind of sensor, where none is given: as in the article
 ONE_KIND = Kinds(("sensor",), (RANGE_M,), (0.0,))
@@ -33,6 +37,7 @@ class Desk:
     problem: Problem | None = None
     problem_name: str = ""
     run: Mapping[str, Json] | None = None  # a finished run, as `replay` tells it
+    footage: "Footage | None" = None  # what this run recorded
     spaces: dict[str, Workspace] = field(default_factory=dict)
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 

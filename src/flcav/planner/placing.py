@@ -31,6 +31,7 @@ SMOOTH = 1.0  # standard deviation of the smoothing of a viewshed's outline, in 
 WAYS = 12  # most steps of a curve of coverage
 NEW_EVERY_M = 20.0  # distance between the places at which a new pole is tried
 NEW_SHOWN = 3  # of them that are told
+CELL_M, MOST_CELLS = 5.0, 120  # of the grid of a relief's heights, and most of them in a row
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,11 +272,19 @@ def describe_town(town: Town) -> dict[str, Json]:
         "roads": [_rounded(road) for road in town.roads],
         "sidewalks": [_rounded(walk) for walk in town.sidewalks],
         "houses": [_rounded(house) for house in houses],
-        "trees": [
-            [round(float(tree[0]), 1), round(float(tree[1]), 1), round(float(tree[3]), 1)] for tree in town.trees
-        ],
+        "heights": height.round(1).tolist(),
+        "trees": town.trees[:, (0, 1, 3, 2)].round(1).tolist(),
+        "relief": None if town.relief is None else _sample_relief(town),
         "streets": streets,
     }
+
+
+def _sample_relief(town: Town) -> dict[str, Json]:
+    """Return heights of the ground [m] on a grid over the bounds, row by row from the south-west."""
+    x_low, y_low, x_high, y_high = town.bounds
+    columns, rows = (max(2, min(MOST_CELLS, round(side / CELL_M))) for side in (x_high - x_low, y_high - y_low))
+    x, y = np.meshgrid(np.linspace(x_low, x_high, columns), np.linspace(y_low, y_high, rows))
+    return {"columns": columns, "rows": rows, "z": town.grounds(x, y).round(1).ravel().tolist()}
 
 
 def _rounded(points: Array) -> list[list[float]]:

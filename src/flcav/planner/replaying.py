@@ -5,6 +5,7 @@ from pathlib import Path
 
 from flcav.config import InputError, Json
 from flcav.planner.desk import Desk, lay_out, with_errors
+from flcav.planner.footage import WORK, Footage
 from flcav.runs.results.run import ArmResult, Run
 from flcav.runs.results.saved import ERRORS
 from flcav.runs.results.training import StageResult
@@ -27,9 +28,10 @@ def open_run(folder: Path) -> Desk:
         raise InputError(f"{folder}: the run has no arm")
     arm = "main" if "main" in run.arms else next(iter(run.arms))
     task = run.recipe.placement.tasks[0] if run.recipe.placement.tasks else next(iter(run.recipe.tasks))
-    desk = Desk(run=describe_run(run, arm, folder.resolve().name))
+    footage = Footage(folder, run, arm)
+    desk = Desk(run={**describe_run(run, arm, folder.resolve().name), "footage": footage.shown}, footage=footage)
     for placed in run.arms[arm].placed:
-        errors = folder / "work" / run.steps.errors(arm, placed.region, task) / ERRORS
+        errors = folder / WORK / run.steps.errors(arm, placed.region, task) / ERRORS
         region = run.recipe.regions[placed.region]
         if errors.exists() and region.data is None:
             town = load_town(region.town or placed.region, folder)
@@ -94,7 +96,7 @@ def _list_moments(result: ArmResult) -> Iterator[tuple[dict[str, Json], dict[str
                 {
                     "server": record.server,
                     "task": each.task,
-                    "clients": len(record.clients),
+                    "clients": [name.rpartition("/")[2] for name in record.clients],
                     "failed": len(record.failed),
                     "loss": record.loss,
                     "up_mb": (record.up_bytes or 0) / MB,

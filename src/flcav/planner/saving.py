@@ -42,10 +42,12 @@ def save_page(desk: Desk) -> bytes:
 
 def _join(saved: str) -> bytes:
     """Return the page of the server with its style, its program and what is `saved` in it."""
-    page, style, program = ((ASSETS / name).read_text("utf-8") for name in ("index.html", "planner.css", "planner.js"))
+    names = ("index.html", "planner.css", "planner.js", "scene.js")
+    page, style, program, scene = ((ASSETS / name).read_text("utf-8") for name in names)
     policy = f'<meta charset="utf-8">\n<meta http-equiv="content-security-policy" content="{POLICY}">'
-    program = program.replace("</script", "<\\/script")
+    program, scene = (text.replace("</script", "<\\/script") for text in (program, scene))
     data = f'<script type="application/json" id="saved">{saved}</script>'
+    data += f'\n<script type="text/plain" id="scene">{scene}</script>'
     parts = {
         '<meta charset="utf-8">': policy,
         '<link rel="stylesheet" href="planner.css">': f"<style>\n{style}</style>",

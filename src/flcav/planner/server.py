@@ -2,24 +2,22 @@
 
 Whoever knows the token of the address is answered: it is sent as a bearer token, which no other site's page can make a
 browser send, so that there is nothing to forge. No request names a path: towns are those of flcav or were opened
-here, files of the page are three by name, and what is uploaded is read from a temporary folder that is removed.
+here, files of the page are four by name, and what is uploaded is read from a temporary folder that is removed.
 """
 
 import contextlib
 import secrets
 import socket
-import tempfile
 import threading
 from collections.abc import AsyncIterator, Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import uvicorn
 from fastapi import Depends, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import JSONResponse, Response
-from pydantic import BaseModel, ConfigDict, Field
 from starlette.middleware import Middleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -29,8 +27,6 @@ from flcav.optimization.problem import Problem
 from flcav.planner.desk import Desk
 from flcav.planner.exporting import export_placement
 from flcav.planner.placing import (
-    Kinds,
-    Question,
     describe_town,
     describe_workspace,
     find_best,
@@ -40,11 +36,26 @@ from flcav.planner.placing import (
     trace_curve,
 )
 from flcav.planner.planning import plan_budgets, plan_more, with_budgets
+from flcav.planner.requests import (
+    MOST_BYTES,
+    AskedBest,
+    AskedExport,
+    AskedFootage,
+    AskedLook,
+    AskedNew,
+    AskedPlacement,
+    AskedPlan,
+    AskedTown,
+    DroppedRun,
+)
+from flcav.planner.uploads import take_file, take_run
+
+if TYPE_CHECKING:
+    from flcav.planner.footage import Footage  # loads torch, as runs do
 
 ASSETS = Path(__file__).with_name("assets")
 SHOWN = {"": ("index.html", "text/html"), "planner.js": ("planner.js", "text/javascript")}
-SHOWN |= {"planner.css": ("planner.css", "text/css")}
-MOST_BYTES = 16_000_000  # of a request
+SHOWN |= {"planner.css": ("planner.css", "text/css"), "scene.js": ("scene.js", "text/javascript")}
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -55,88 +66,6 @@ HEADERS = {
     "referrer-policy": "no-referrer",
     "cache-control": "no-store",
 }
-
-Metres = Annotated[float, Field(ge=-1e6, le=1e6, allow_inf_nan=False)]
-Range = Annotated[float, Field(ge=1, le=2000, allow_inf_nan=False)]
-Price = Annotated[float, Field(ge=0, le=1e9, allow_inf_nan=False)]
-
-
-class Body(BaseModel):
-    """A request's body: no field is passed over."""
-
-    model_config = ConfigDict(extra="forbid")
-
-
-class SensorOffer(Body):
-    """A kind of sensor."""
-
-    name: str = Field(max_length=60)
-    range_m: Range
-    cost: Price = 0.0
-
-
-class AskedPlacement(Body):
-    """A question about a workspace."""
-
-    workspace: str = Field(max_length=64)
-    kinds: list[SensorOffer] = Field(min_length=1, max_length=12)
-    own: list[tuple[Metres, Metres]] = Field(default=[], max_length=100)
-    line_of_sight: bool = True
-    without: list[str] = Field(default=[], max_length=100)
-
-    def question(self) -> Question:
-        """Return it as `placing` takes it."""
-        kinds = Kinds(
-            tuple(each.name for each in self.kinds),
-            tuple(each.range_m for each in self.kinds),
-            tuple(each.cost for each in self.kinds),
-        )
-        return Question(kinds, tuple(self.own), self.line_of_sight, frozenset(self.without))
-
-
-class AskedBest(AskedPlacement):
-    """The best placement of a number of sensors, or within a budget."""
-
-    count: int | None = Field(default=None, ge=1, le=10_000)
-    budget: Price | None = None
-
-
-class AskedNew(AskedPlacement):
-    """A request for the places where a new pole sees most."""
-
-    kind: int = Field(ge=0)
-    uncovered: list[Annotated[int, Field(ge=0)]] = Field(max_length=1_000_000)
-
-
-class AskedLook(Body):
-    """What a sensor on a pole, or at a place of one's own, sees."""
-
-    workspace: str = Field(max_length=64)
-    pole: int | None = Field(default=None, ge=0)
-    x: Metres = 0.0
-    y: Metres = 0.0
-    range_m: Range
-    line_of_sight: bool = True
-
-
-class AskedExport(AskedPlacement):
-    """The files of a placement: pairs of a site, with own ones after the poles, and a kind."""
-
-    pairs: list[tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]] = Field(max_length=1000)
-
-
-class AskedTown(Body):
-    """A town of flcav to open."""
-
-    town: str = Field(max_length=64)
-
-
-class AskedPlan(Body):
-    """A plan for budgets of one's own [MB, s]."""
-
-    wireless_mb: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
-    wireline_mb: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)]
-    horizon_s: Annotated[float, Field(gt=0, le=1e9, allow_inf_nan=False)] | None = None
 
 
 class LimitBody:
@@ -224,7 +153,13 @@ def make_app(desk: Desk, token: str) -> FastAPI:
     @app.post("/api/drop", **guarded)
     async def drop(request: Request, name: str, workspace: str = "") -> dict[str, Json]:
         content = await request.body()
-        return await _in_thread(lambda: _describe(desk, _take(desk, workspace, name, content)), busy)
+        return await _in_thread(lambda: _describe(desk, take_file(desk, workspace, name, content)), busy)
+
+    @app.post("/api/drop-run", **guarded)
+    def drop_run(asked: DroppedRun) -> dict[str, Json]:
+        with busy:
+            take_run(desk, asked)
+            return desk.describe()
 
     @app.post("/api/look", **guarded)
     def look_from(asked: AskedLook) -> dict[str, Json]:
@@ -273,6 +208,19 @@ def make_app(desk: Desk, token: str) -> FastAPI:
     def more(asked: AskedPlan) -> dict[str, Json]:
         return plan_more(_budgeted(desk, asked))
 
+    @app.post("/api/drive", **guarded)
+    def drive(asked: AskedFootage) -> dict[str, Json]:
+        return _footage(desk).drive(asked.name)
+
+    @app.post("/api/sweep", **guarded)
+    def sweep() -> dict[str, Json]:
+        return _footage(desk).sweep()
+
+    @app.post("/api/picture", **guarded)
+    def picture(asked: AskedFootage) -> dict[str, Json]:
+        with busy:
+            return _footage(desk).picture(asked.name)
+
     @app.get("/")
     @app.get("/{name}")
     def file(name: str = "") -> Response:
@@ -308,24 +256,15 @@ def _budgeted(desk: Desk, asked: AskedPlan) -> Problem:
     return with_budgets(desk.problem, asked.wireless_mb, asked.wireline_mb, asked.horizon_s)
 
 
+def _footage(desk: Desk) -> "Footage":
+    if desk.footage is None:
+        raise InputError("there is no run to replay: flcav planner RUN")
+    return desk.footage
+
+
 def _describe(desk: Desk, key: str) -> dict[str, Json]:
     space = desk.find(key)
     return {"key": key, "map": describe_town(space.town), **describe_workspace(space)}
-
-
-def _take(desk: Desk, workspace: str, name: str, content: bytes) -> str:
-    """Put an uploaded file on the desk by the ending of its `name`; return the key of its workspace."""
-    ending = Path(name).suffix.lower()
-    if ending not in (".xodr", ".csv", ".parquet"):
-        raise InputError("a map (.xodr) or a table of errors (.csv, .parquet) is wanted")
-    stem = "".join(sign if sign.isalnum() or sign in "-_" else "_" for sign in Path(name).stem)[:60] or "file"
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{stem}{ending}"
-        path.write_bytes(content)
-        try:
-            return desk.open_map(path) if ending == ".xodr" else desk.add_errors(workspace, path)
-        except InputError as error:
-            raise InputError(str(error).replace(f"{folder}/", "")) from None
 
 
 def serve_planner(desk: Desk, port: int | None, report: Callable[[str], None]) -> None:

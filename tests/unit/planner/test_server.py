@@ -42,7 +42,7 @@ def test_the_page_asks_no_other_host(page):
     answer = page.get("/")
     assert answer.status_code == 200
     assert "connect-src 'self'" in answer.headers["content-security-policy"]
-    for name in ("", "planner.js", "planner.css"):
+    for name in ("", "planner.js", "planner.css", "scene.js"):
         text = page.get(f"/{name}").text
         for scheme in ("http:", "https:", "//"):
             hosts = [part.split('"')[0] for part in text.split(f'"{scheme}')[1:]]

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from scipy.optimize import Bounds, LinearConstraint, linprog, milp
+from scipy.optimize import Bounds, LinearConstraint, OptimizeResult, milp
 from scipy.sparse import coo_array, csr_array
 
 from flcav.geometry.arrays import Array
@@ -90,14 +90,7 @@ class Cuts:
 
     def relax(self) -> tuple[Array, float]:
         """Return the optimum x (n,) of the continuous relaxation, and its value; raises `InputError` if HiGHS fails."""
-        matrix, limit = self._rows()
-        bounds = np.stack((self._low(), self._high()), axis=1)
-        equal, total = self._equations()
-        result = linprog(
-            *(self._objective(), matrix, limit, equal, total),
-            bounds=bounds,
-            method="highs",
-        )
+        result = self._minimise(np.zeros(len(self._low())))
         return require_optimum(result)[: len(self.program.low)], float(result.fun) / self._scale
 
     def solve(self, gap: float) -> tuple[Array, float]:
@@ -105,20 +98,24 @@ class Cuts:
 
         Raises `InputError` where HiGHS fails.
         """
-        matrix, limit = self._rows()
         whole = np.r_[np.ones(len(self.program.low)), np.zeros(len(self.program.terms)), np.ones(self._tabulated)]
+        result = self._minimise(whole, gap)
+        return np.round(require_optimum(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
+
+    def _minimise(self, whole: Array, gap: float = 0.0) -> OptimizeResult:
+        """Return HiGHS's optimum to a relative `gap`, where `whole` variables are integers."""
+        matrix, limit = self._rows()
         equal, total = self._equations()
         constraints = [LinearConstraint(matrix, ub=limit)]  # pyright: ignore[reportArgumentType]
         if equal is not None:
             constraints.append(LinearConstraint(equal, total, total))  # pyright: ignore[reportArgumentType]
-        result = milp(
+        return milp(
             self._objective(),
             integrality=whole,
             bounds=Bounds(self._low(), self._high()),  # pyright: ignore[reportArgumentType]
             constraints=constraints,
             options={"mip_rel_gap": gap},
         )
-        return np.round(require_optimum(result)[: len(self.program.low)]), float(result.mip_dual_bound) / self._scale
 
     @property
     def _tabulated(self) -> int:

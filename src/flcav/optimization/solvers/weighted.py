@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import islice
 
 import numpy as np
-from scipy.optimize import linprog
+from scipy.optimize import Bounds, LinearConstraint, milp
 
 from flcav.geometry.arrays import Array
 from flcav.optimization.curves.curves import drift_part, effective_samples
@@ -24,6 +24,7 @@ from flcav.optimization.solvers.separable import newton_step, solve_two_budgets
 
 CORRECTIONS = 6  # Newton steps of the multipliers over integer quantities; dual points tried
 PLANES = 60  # most cutting planes of the dual
+DUAL_GAP = 1e-5  # least gap to which the dual is solved: outer approximation closes what is left
 
 
 @dataclass(frozen=True)
@@ -201,6 +202,7 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
     left = instance.budget - instance.low @ instance.cost
     largest = instance.error(instance.low) / np.maximum(left, 1e-9 * instance.budget)
     aim = np.r_[-1.0, np.zeros(len(largest))]
+    within = Bounds(np.r_[-np.inf, np.zeros(len(largest))], np.r_[np.inf, np.ones(len(largest))])  # pyright: ignore
     rows, values, proven = [], [], []
     multipliers = [0.01 * largest]
     for _ in range(PLANES):
@@ -208,9 +210,9 @@ def _planes(instance: Instance, gap: float) -> Iterator[tuple[Array, float]]:
         proven.append(bound)
         rows.append(np.r_[1.0, (instance.budget - x @ instance.cost) * largest])
         values.append(instance.error(x))
-        model = linprog(aim, A_ub=np.array(rows), b_ub=values, bounds=[(None, None), *[(0, 1)] * len(largest)])
+        model = milp(aim, bounds=within, constraints=LinearConstraint(np.array(rows), ub=np.array(values)))  # pyright: ignore
         weights = require_optimum(model)[1:]
-        if -model.fun - max(proven) <= 0.02 * gap * (max(proven) + instance.floor):
+        if -model.fun - max(proven) <= 0.02 * max(gap, DUAL_GAP) * (max(proven) + instance.floor):
             break
         multipliers.append(weights * largest)
     order = np.argsort(-np.array(proven))

@@ -2,12 +2,12 @@
 import type { Kind, Placing, Stand } from "./types";
 
 export type Tab = "place" | "plan" | "replay";
-export type Shared = { town: string; tab: Tab | null; placing: Partial<Placing>; budgets: number[] };
+export type Shared = { town: string; tab: Tab | null; placing: Partial<Placing>; budgets: number[]; solid: boolean };
 
 const enc = encodeURIComponent;
 const short = (value: number) => String(Math.round(value * 100) / 100);
 
-export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: number[]): string {
+export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: number[], solid: boolean): string {
   const parts = [];
   if (town) parts.push(`t=${enc(town)}`);
   if (tab !== "place") parts.push(`tab=${tab}`);
@@ -21,6 +21,7 @@ export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: 
           .join(";")}`,
       );
     if (!placing.sight) parts.push("sight=0");
+    if (solid) parts.push("v=3d");
     if (placing.without.length) parts.push(`w=${placing.without.map(enc).join(";")}`);
   }
   if (budgets.length) parts.push(`b=${budgets.map(short).join(",")}`);
@@ -59,5 +60,5 @@ export function readAddress(hash: string): Shared {
   if (without) placing.without = without.split(";").map(text);
   const tab = fields.get("tab");
   const budgets = (fields.get("b") ?? "").split(",").map(Number).filter((each) => each > 0);
-  return { town: text(fields.get("t") ?? ""), tab: tab === "place" || tab === "plan" || tab === "replay" ? tab : null, placing, budgets };
+  return { town: text(fields.get("t") ?? ""), tab: tab === "place" || tab === "plan" || tab === "replay" ? tab : null, placing, budgets, solid: fields.get("v") === "3d" };
 }

@@ -1,5 +1,6 @@
 /** What the page asks: a server, or in a saved page what was computed before. */
-import type { Best, Look, NewPole, Placing, Plan, Saving, Stand, Start, Workspace } from "./types";
+import type { SweepData } from "./scene/sweep";
+import type { Best, Look, NewPole, Picture, Placing, Plan, RegionDrive, Saving, Stand, Start, Workspace } from "./types";
 
 export interface Api {
   saved: boolean;
@@ -7,6 +8,7 @@ export interface Api {
   open(town: string): Promise<Workspace>;
   workspace(key: string): Promise<Workspace>;
   drop(file: File, workspace: string): Promise<Workspace>;
+  dropRun(name: string, files: Record<string, string>): Promise<Start>;
   look(key: string, stand: Stand, range_m: number, sight: boolean): Promise<Look>;
   best(key: string, asked: Placing, limit: { count?: number; budget?: number }): Promise<Best>;
   curve(key: string, asked: Placing): Promise<Best[]>;
@@ -14,6 +16,9 @@ export interface Api {
   files(key: string, asked: Placing): Promise<{ csv: string; geojson: string; yaml: string; command: string }>;
   plan(budgets: Budgets): Promise<Plan>;
   more(budgets: Budgets): Promise<{ savings?: Saving[] }>;
+  drive(region: string): Promise<RegionDrive>;
+  sweep(): Promise<SweepData>;
+  picture(task: string): Promise<Picture>;
 }
 export type Budgets = { wireless_mb: number; wireline_mb: number; horizon_s: number | null };
 
@@ -70,6 +75,7 @@ export function makeLive(poles: () => number): Api {
     workspace: (key) => ask("workspace", { town: key }),
     drop: (file, workspace) =>
       send(`/api/drop?name=${encodeURIComponent(file.name)}&workspace=${encodeURIComponent(workspace)}`, file),
+    dropRun: (name, files) => ask("drop-run", { name, files }),
     look: (key, stand, range_m, sight) =>
       ask("look", {
         workspace: key,
@@ -90,6 +96,9 @@ export function makeLive(poles: () => number): Api {
       }),
     plan: (budgets) => ask("plan", budgets),
     more: (budgets) => ask("plan-more", budgets),
+    drive: (name) => ask("drive", { name }),
+    sweep: () => ask("sweep", {}),
+    picture: (name) => ask("picture", { name }),
   };
 }
 
@@ -104,6 +113,7 @@ export function makeSaved(saved: Saved): Api {
     open: async () => saved.workspace,
     workspace: async () => saved.workspace,
     drop: none,
+    dropRun: none,
     look: async (_key, stand, range_m) => {
       const kind = saved.start.kinds.findIndex((each) => each.range_m === range_m);
       return saved.looks[`${stand.pole} ${kind}`] ?? { area: "", covered: [], z: 0 };
@@ -118,5 +128,8 @@ export function makeSaved(saved: Saved): Api {
     files: async () => ({ csv: "", geojson: "", yaml: "", command: saved.command }),
     plan: none,
     more: none,
+    drive: none,
+    sweep: none,
+    picture: none,
   };
 }

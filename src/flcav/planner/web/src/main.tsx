@@ -2,6 +2,7 @@ import { render } from "preact";
 import { useCallback, useEffect, useMemo, useRef, useState } from "preact/hooks";
 import { readAddress, writeAddress, type Tab } from "./address";
 import { makeLive, makeSaved, Unreachable, type Budgets, type Saved } from "./api";
+import { chosenFolder, packFolder, readFolder, type Folder } from "./folder";
 import { Place } from "./place";
 import { PlanTab } from "./plan";
 import { Replay } from "./replay";
@@ -23,9 +24,11 @@ function App() {
     past: [],
   });
   const [tab, setTab] = useState<Tab>(shared.tab ?? "place");
+  const [solid, setSolid] = useState(shared.solid);
   const [budgets, setBudgets] = useState<Budgets | null>(null);
   const [busy, setBusy] = useState("");
   const [problem, setProblem] = useState("");
+  const [notice, setNotice] = useState("");
   const [lost, setLost] = useState(false);
   const [said, say] = useState("");
 
@@ -77,9 +80,9 @@ function App() {
   useEffect(() => {
     if (!start || api.saved) return;
     const numbers = budgets && tab === "plan" ? [budgets.wireless_mb, budgets.wireline_mb, ...(budgets.horizon_s ? [budgets.horizon_s] : [])] : [];
-    const address = writeAddress(space?.key ?? "", tab, placing, numbers);
+    const address = writeAddress(space?.key ?? "", tab, placing, numbers, solid);
     if (address.length < 2000) history.replaceState(null, "", `${location.pathname}#${address}`);
-  }, [space, tab, placing, budgets, start]);
+  }, [space, tab, placing, budgets, start, solid]);
 
   const open = (name: string) => {
     setBusy(`Opening ${name} …`);
@@ -95,11 +98,28 @@ function App() {
       say(`${file.name}: ${found.errors.length} ${found.noun}s`);
     }).catch(fail).finally(() => setBusy(""));
   };
+  const dropRun = (folder: Promise<Folder>) => {
+    if (api.saved) return;
+    setProblem("");
+    setBusy("Reading the run …");
+    folder
+      .then(async (found) => api.dropRun(found.name, await packFolder(found)))
+      .then((found) => {
+        setStart(found);
+        setTab("replay");
+        setNotice(`Rounds and errors of ${found.run!.name} were read. Its drives, sweeps and pictures are shown by: flcav planner ${found.run!.name}`);
+        if (!space && found.first) return api.workspace(found.first).then((at) => take(at, found.kinds));
+      })
+      .catch(fail)
+      .finally(() => setBusy(""));
+  };
   useEffect(() => {
     const over = (event: DragEvent) => event.preventDefault();
     const dropped = (event: DragEvent) => {
       event.preventDefault();
-      drop(event.dataTransfer?.files[0]);
+      const entry = event.dataTransfer?.items[0]?.webkitGetAsEntry();
+      if (entry?.isDirectory) dropRun(readFolder(entry as FileSystemDirectoryEntry));
+      else drop(event.dataTransfer?.files[0]);
     };
     window.addEventListener("dragover", over);
     window.addEventListener("drop", dropped);
@@ -132,22 +152,31 @@ function App() {
           {lost ? <button type="button" onClick={() => location.reload()}>Try again</button> : <button type="button" aria-label="Close the message" onClick={() => setProblem("")}>×</button>}
         </div>
       )}
+      {notice && tab === "replay" && (
+        <div class="alert bar-alert" role="status"><span>{notice}</span><button type="button" aria-label="Close the message" onClick={() => setNotice("")}>×</button></div>
+      )}
       {busy && <div class="busy" role="status"><i aria-hidden="true" />{busy}</div>}
-      {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, say, fail }} />}
+      {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }} />}
       {tab === "plan" && start?.problem && budgets && <PlanTab {...{ api, problem: start.problem, budgets, setBudgets, say, fail }} />}
-      {tab === "replay" && start?.run && <Replay run={start.run} say={say} />}
-      {start && !space && !start.problem && !start.run && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} />}
+      {tab === "replay" && start?.run && <Replay api={api} run={start.run} say={say} fail={fail} />}
+      {start && !space && !start.problem && !start.run && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} onFolder={dropRun} />}
       <p class="said" role="status" aria-live="polite">{said}</p>
     </>
   );
 }
 
-function Welcome({ cards, onOpen, onFile }: { cards: Card[]; onOpen: (name: string) => void; onFile: (file: File | undefined) => void }) {
+type WelcomeProps = { cards: Card[]; onOpen: (name: string) => void; onFile: (file: File | undefined) => void; onFolder: (folder: Promise<Folder>) => void };
+
+function Welcome({ cards, onOpen, onFile, onFolder }: WelcomeProps) {
   const path = (points: Point[]) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}Z`;
   return (
     <main class="welcome">
       <h1>Where should sensors stand?</h1>
-      <p>Choose a town, or <label class="file inline"><input type="file" accept=".xodr" onChange={(event) => onFile(event.currentTarget.files?.[0])} /><span>open a map of your own (.xodr)</span></label>. Then drop a table of errors or accidents on its map.</p>
+      <p>Choose a town, then drop a table of errors or accidents on its map. Or bring your own: an OpenDRIVE map, or the folder of a finished run, which is replayed.</p>
+      <div class="row">
+        <label class="file inline"><input type="file" accept=".xodr" onChange={(event) => onFile(event.currentTarget.files?.[0])} /><span>Open a map (.xodr) …</span></label>
+        <label class="file inline"><input type="file" {...{ webkitdirectory: "" }} onChange={(event) => event.currentTarget.files?.length && onFolder(Promise.resolve(chosenFolder(event.currentTarget.files)))} /><span>Open a run's folder …</span></label>
+      </div>
       <div class="towns">
         {cards.map((card) => {
           const [x0, y0, x1, y1] = card.bounds;

@@ -1,9 +1,9 @@
 /** The map: a town in metres, its errors, poles and sensors, with pointer and keyboard. */
 import { memo } from "preact/compat";
 import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
-import type { Kind, Look, NewPole, Point, Pole, Stand, TownMap, Wrong, Workspace } from "./types";
+import { placeOf, pressKey, settleAt, useCarried, type MapProps } from "./standing";
+import type { Look, Point, Pole, Stand, TownMap, Wrong } from "./types";
 
-export const SNAP_M = 8;
 const path = (points: Point[]) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}Z`;
 
 const Ground = memo(({ map }: { map: TownMap }) => (
@@ -17,33 +17,6 @@ const Ground = memo(({ map }: { map: TownMap }) => (
 
 type Box = { x: number; y: number; w: number; h: number };
 type Drag = { stand: Stand; fresh: boolean; moved: boolean };
-
-export type MapProps = {
-  space: Workspace;
-  stands: Stand[];
-  kinds: Kind[];
-  looks: Map<number, Look>;
-  covered: Set<number>;
-  shown: boolean[];
-  kind: number;
-  sight: boolean;
-  onlyPoles: boolean;
-  news: NewPole[];
-  moving: boolean;
-  carried: number | null; // the kind of sensor that is dragged from the panel
-  onCarried: () => void;
-  onDrag: (stand: Stand | null) => void; // while it is dragged; null: it was dropped nowhere
-  onPut: (stand: Stand, fresh: boolean) => void;
-  onToggle: (pole: number) => void;
-  onRemove: (stand: Stand) => void;
-  onRange: (kind: number, by: number) => void;
-  selected: number | null;
-  onSelect: (id: number | null) => void;
-};
-
-export function placeOf(stand: Stand, poles: Pole[]): Point {
-  return stand.pole === null ? [stand.x, stand.y] : [poles[stand.pole].at[0], poles[stand.pole].at[1]];
-}
 
 export function TownView(props: MapProps) {
   const { space, stands, kinds, looks, covered, shown } = props;
@@ -91,18 +64,7 @@ export function TownView(props: MapProps) {
     return () => element?.removeEventListener("wheel", turn);
   });
 
-  /** The place under a pointer: the nearest pole within SNAP_M, or in a live planner any place. */
-  const settle = (at: Point, stand: Stand): Stand | null => {
-    let near: number | null = null;
-    let least = props.onlyPoles ? Infinity : SNAP_M;
-    poles.forEach((pole, number) => {
-      const far = Math.hypot(pole.at[0] - at[0], pole.at[1] - at[1]);
-      const taken = stands.some((each) => each.pole === number && each.id !== stand.id);
-      if (far <= least && !taken) [near, least] = [number, far];
-    });
-    if (near === null && props.onlyPoles) return null;
-    return { ...stand, pole: near, x: Math.round(at[0] * 10) / 10, y: Math.round(at[1] * 10) / 10 };
-  };
+  const settle = (at: Point, stand: Stand) => settleAt(at, stand, props);
 
   const pressed = (event: PointerEvent, stand?: Stand) => {
     if (event.button > 0) return;
@@ -140,41 +102,8 @@ export function TownView(props: MapProps) {
     else props.onSelect(done.stand.id);
   };
 
-  // A sensor that comes from the panel is carried by the pointer wherever that is over the map.
-  useLayoutEffect(() => {
-    if (props.carried === null) return;
-    const stand: Stand = { id: 0, pole: null, x: 0, y: 0, kind: props.carried };
-    const over = (event: PointerEvent) => {
-      const frame = svg.current!.getBoundingClientRect();
-      return event.clientX >= frame.left && event.clientX <= frame.right && event.clientY >= frame.top && event.clientY <= frame.bottom;
-    };
-    const carry = (event: PointerEvent) => props.onDrag(over(event) ? settle(toWorld(event), stand) : null);
-    const drop = (event: PointerEvent) => {
-      const put = over(event) ? settle(toWorld(event), stand) : null;
-      props.onCarried();
-      if (put) props.onPut(put, true);
-      else props.onDrag(null);
-    };
-    window.addEventListener("pointermove", carry);
-    window.addEventListener("pointerup", drop, { once: true });
-    return () => {
-      window.removeEventListener("pointermove", carry);
-      window.removeEventListener("pointerup", drop);
-    };
-  });
-
-  const keyed = (event: KeyboardEvent, stand: Stand) => {
-    const step = event.shiftKey ? 10 : 1;
-    const by = { ArrowLeft: [-step, 0], ArrowRight: [step, 0], ArrowUp: [0, step], ArrowDown: [0, -step] }[event.key];
-    if (event.key === "Enter" || event.key === "Delete" || event.key === "Backspace") props.onRemove(stand);
-    else if (event.key === "[" || event.key === "]") props.onRange(stand.kind, event.key === "]" ? step : -step);
-    else if (by && !props.onlyPoles) {
-      const [x, y] = placeOf(stand, poles);
-      props.onPut({ ...stand, pole: null, x: Math.round((x + by[0]) * 10) / 10, y: Math.round((y + by[1]) * 10) / 10 }, false);
-    } else return;
-    event.preventDefault();
-    event.stopPropagation();
-  };
+  useCarried(props, svg, toWorld);
+  const keyed = (event: KeyboardEvent, stand: Stand) => pressKey(event, stand, props);
 
   const occupied = new Set(stands.map((each) => each.pole));
   const told = hover && errors[hover.error];
@@ -295,7 +224,7 @@ const Sign = memo(
     const r = px(many ? 2.6 : 4);
     const at = (event: PointerEvent) => {
       const frame = (event.currentTarget as Element).closest(".map")!.getBoundingClientRect();
-      onHover({ error: row, x: Math.min(event.clientX - frame.left, frame.width - 230), y: event.clientY - frame.top });
+      onHover({ error: row, x: Math.min(event.clientX - frame.left, frame.width - 272), y: Math.min(event.clientY - frame.top, frame.height - 170) });
     };
     const common = { class: `e ${error.kind}${seen ? " seen" : ""}`, onPointerEnter: at, onPointerLeave: () => onHover(null) };
     if (error.kind === "false_positive")
@@ -310,7 +239,7 @@ const Sign = memo(
 const NAMES: Record<string, string> = { miss: "missed", false_positive: "false positive", final_error: "final error", point: "point" };
 export const wordOf = (kind: string) => NAMES[kind] ?? kind;
 
-function Told({ error, row, stands, poles, looks }: { error: Wrong; row: number; stands: Stand[]; poles: Pole[]; looks: Map<number, Look> }) {
+export function Told({ error, row, stands, poles, looks }: { error: Wrong; row: number; stands: Stand[]; poles: Pole[]; looks: Map<number, Look> }) {
   const by = stands.filter((each) => looks.get(each.id)?.covered.includes(row));
   const far = (stand: Stand) => {
     const [x, y] = placeOf(stand, poles);
@@ -325,7 +254,7 @@ function Told({ error, row, stands, poles, looks }: { error: Wrong; row: number;
         <dt>seen by</dt><dd>{by.length ? by.map((each) => (each.pole === null ? "own place" : `pole ${poles[each.pole].id}`)).join(", ") : "none"}</dd>
         {error.occlusion != null && <><dt>hidden from the vehicle</dt><dd>{Math.round(error.occlusion * 100)} %</dd></>}
         {error.returns != null && <><dt>LiDAR returns</dt><dd>{error.returns}</dd></>}
-        {error.scene && <><dt>scene</dt><dd>{error.scene}</dd></>}
+        {error.scene && <><dt>sweep of</dt><dd>{error.scene}{error.track ? `, ${error.track}` : ""}</dd></>}
         {error.weight !== 1 && <><dt>weight</dt><dd>{error.weight}</dd></>}
       </dl>
     </>

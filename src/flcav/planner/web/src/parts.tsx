@@ -31,15 +31,20 @@ export function Bar({ total, covered, best, beyond }: { total: number; covered: 
   );
 }
 
-export function Legend({ space, covered }: { space: Workspace; covered: boolean }) {
-  const kinds = [...new Set(space.errors.map((each) => each.kind))];
-  const mark = (kind: string) => (kind === "false_positive" ? "M-4 -4l8 8m0 -8l-8 8" : kind === "final_error" ? "M0 -5l5 8h-10Z" : "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0");
+export function Legend({ space, covered, solid }: { space: Workspace; covered: boolean; solid: boolean }) {
+  const kinds = [...new Set(space.errors.map((each) => each.kind))].sort((one, other) => Number(one === "false_positive") - Number(other === "false_positive"));
+  const crossed = (kind: string) => kind === "false_positive" && !solid;
+  const mark = (kind: string) => {
+    if (kind === "false_positive") return solid ? "M-4 -4h8v8h-8Z" : "M-4 -4l8 8m0 -8l-8 8";
+    return kind === "final_error" && !solid ? "M0 -5l5 8h-10Z" : "M-4 0a4 4 0 1 0 8 0a4 4 0 1 0 -8 0";
+  };
+  const Mark = ({ kind, seen }: { kind: string; seen?: boolean }) => (
+    <svg viewBox="-7 -7 14 14" aria-hidden="true"><path class={`e ${kind}${seen ? " seen" : ""}${solid ? " solid" : ""}`} d={mark(kind)} stroke-width={crossed(kind) ? 2 : 1} /></svg>
+  );
   return (
     <ul class="legend" aria-label="Legend">
-      {kinds.map((kind) => (
-        <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><path class={`e ${kind}`} d={mark(kind)} stroke-width={kind === "false_positive" ? 2 : 1} /></svg>{wordOf(kind)}</li>
-      ))}
-      {kinds.length > 0 && covered && <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><path class={`e ${kinds[0]} seen`} d={mark(kinds[0])} stroke-width={kinds[0] === "false_positive" ? 2 : 1} /></svg>covered</li>}
+      {kinds.map((kind) => <li><Mark kind={kind} />{wordOf(kind)}</li>)}
+      {kinds.length > 0 && covered && <li><Mark kind={kinds[0]} seen />covered</li>}
       <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><g class="pole"><circle r="5" /></g></svg>candidate pole</li>
       {covered && <li><svg viewBox="-7 -7 14 14" aria-hidden="true"><g class="stand k0"><circle r="5.5" /></g></svg>sensor, and what it sees</li>}
     </ul>

@@ -1,11 +1,15 @@
 /** The tab Place: a map with sensors, and beside it what they cover, what could be covered, and what that costs. */
-import { useEffect, useLayoutEffect, useMemo, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
 import type { Api } from "./api";
 import { Curve } from "./curve";
-import { saveMap, saveText } from "./saving";
+import { saveBlob, saveMap, saveText } from "./saving";
+import type { TownScene } from "./scene/town";
+import { KindsSection, number } from "./kinds";
 import { useLooks } from "./looks";
-import { placeOf, TownView, wordOf } from "./map";
+import { TownView, wordOf } from "./map";
+import { Town3D } from "./map3d";
 import { Bar, Command, Legend } from "./parts";
+import { placeOf } from "./standing";
 import type { Best, NewPole, Placing, Stand, Workspace } from "./types";
 
 type Props = {
@@ -14,14 +18,16 @@ type Props = {
   placing: Placing;
   setPlacing: (next: Placing, forget?: boolean) => void;
   undo: (() => void) | null;
+  solid: boolean; // whether the map is shown in three dimensions
+  setSolid: (solid: boolean) => void;
   say: (text: string) => void;
   fail: (error: unknown) => void;
 };
 
 const plural = (count: number, noun: string) => `${count} ${noun}${count === 1 ? "" : "s"}`;
-const number = (value: number) => String(Math.round(value * 100) / 100);
 
-export function Place({ api, space, placing, setPlacing, undo, say, fail }: Props) {
+export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }: Props) {
+  const scene = useRef<TownScene | null>(null);
   const [drag, setDrag] = useState<Stand | null>(null);
   const [kind, setKind] = useState(0);
   const [selected, setSelected] = useState<number | null>(null);
@@ -161,7 +167,10 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
   });
 
   const noun = space.noun;
+  const fair = !api.saved || without.length === 0;
   const current = best && bestFor === bestAsked && !drag && placing.stands.length ? best : null;
+  const after = same === "count" && !priced && current ? curve?.find((each) => each.pairs.length === placing.stands.length + 1) : null;
+  const more = after && current && fair ? { ...after, gain: Math.max(even ? after.covered - current.covered : after.weight - current.weight, 0) } : null;
   const limited = same === "cost" ? `for ${number(cost)}` : `with ${plural(placing.stands.length, "sensor")}`;
   const beyond = current?.beyond ?? curve?.[0]?.beyond ?? null;
   useEffect(() => {
@@ -177,24 +186,28 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
     return [...found];
   };
   const filters = api.saved ? [] : [...counts((row) => space.errors[row].kind), ...counts((row) => space.errors[row].class)];
-  const fair = !api.saved || without.length === 0;
 
+  const shownOn = {
+    ...{ space, stands, kinds, looks, covered, shown, kind, sight, news, moving, carried, selected },
+    onlyPoles: api.saved,
+    onCarried: () => setCarried(null),
+    onDrag: setDrag,
+    onPut: put,
+    onToggle: toggle,
+    onRemove: remove,
+    onRange: range,
+    onSelect: setSelected,
+  };
   return (
     <div class="place">
       <main class="stage">
       <h1 class="said">Sensors in {space.map.name}</h1>
-      <TownView
-        {...{ space, stands, kinds, looks, covered, shown, kind, sight, news, moving, carried, selected }}
-        onlyPoles={api.saved}
-        onCarried={() => setCarried(null)}
-        onDrag={setDrag}
-        onPut={put}
-        onToggle={toggle}
-        onRemove={remove}
-        onRange={range}
-        onSelect={setSelected}
-      />
-      <Legend space={space} covered={placing.stands.length > 0} />
+      {solid ? <Town3D {...shownOn} fail={fail} keep={(made) => (scene.current = made)} /> : <TownView {...shownOn} />}
+      <div class="views" role="group" aria-label="View">
+        <button type="button" aria-pressed={!solid} onClick={() => setSolid(false)}>Above</button>
+        <button type="button" aria-pressed={solid} onClick={() => setSolid(true)}>3D</button>
+      </div>
+      <Legend space={space} covered={placing.stands.length > 0} solid={solid} />
       </main>
       <aside class="panel" aria-label="Sensors and what they cover">
         {space.errors.length > 0 ? (
@@ -215,6 +228,7 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
               )}
               {!current && placing.stands.length > 0 && <li class="wait">{refused || (drag ? "Best possible: when you let go" : "Computing the best possible …")}</li>}
               {!placing.stands.length && <li>Drag a sensor onto the map, or press a pole. O shows the optimum.</li>}
+              {more && <li id="next">With one more: <b>{even ? more.covered : number(more.weight)}</b> at best, {more.gain > 0 ? `+${number(more.gain)}` : "nothing more"}</li>}
               {beyond !== null && <li id="beyond"><b>{beyond}</b> out of reach of every {placing.stands.some((each) => each.pole === null) ? "pole and place of yours" : "pole"}</li>}
               {priced && placing.stands.length > 0 && <li>Cost: <b id="cost">{number(cost)}</b></li>}
             </ul>
@@ -257,55 +271,7 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
           </section>
         )}
 
-        <section>
-          <h2>Kinds of sensors</h2>
-          <div class="kinds">
-            {kinds.map((each, n) => (
-              <div class={`kind${n === kind ? " on" : ""}`} key={n}>
-                <button
-                  type="button"
-                  class={`chip k${n % 6}`}
-                  aria-pressed={n === kind}
-                  title="Drag it onto the map, or choose it for the poles you press"
-                  onClick={() => setKind(n)}
-                  onPointerDown={(event) => {
-                    if (event.pointerType === "touch") return;
-                    setKind(n);
-                    const start = [event.clientX, event.clientY];
-                    const away = (moved: PointerEvent) => {
-                      if (Math.hypot(moved.clientX - start[0], moved.clientY - start[1]) < 5) return;
-                      end();
-                      setCarried(n);
-                    };
-                    const end = () => [window.removeEventListener("pointermove", away), window.removeEventListener("pointerup", end)];
-                    window.addEventListener("pointermove", away);
-                    window.addEventListener("pointerup", end);
-                  }}
-                >
-                  <i aria-hidden="true" /> {each.name}
-                </button>
-                {api.saved ? (
-                  <span class="fixed">{each.range_m} m{priced ? ` · ${number(each.cost)}` : ""}</span>
-                ) : (
-                  <>
-                    <label>
-                      <span>range</span>
-                      <input type="number" min={1} max={2000} step={1} value={each.range_m} aria-label={`Range of ${each.name} in metres`} onChange={(event) => range(n, Number(event.currentTarget.value || each.range_m) - each.range_m)} />
-                      <span>m</span>
-                    </label>
-                    <label>
-                      <span>price</span>
-                      <input type="number" min={0} step="any" value={each.cost} aria-label={`Price of ${each.name}`} onChange={(event) => setKindField(n, { cost: Math.max(0, Number(event.currentTarget.value) || 0) })} />
-                    </label>
-                  </>
-                )}
-              </div>
-            ))}
-            {!api.saved && kinds.length < 6 && (
-              <button type="button" class="quiet" onClick={() => setPlacing({ ...placing, kinds: [...kinds, { name: `kind ${kinds.length + 1}`, range_m: kinds[kinds.length - 1].range_m * 2, cost: kinds[kinds.length - 1].cost * 2 }] })}>+ another kind</button>
-            )}
-          </div>
-        </section>
+        <KindsSection {...{ placing, setPlacing, kind, setKind, priced, range, setKindField, setCarried }} fixed={api.saved} />
 
         {placing.stands.length > 0 && (
           <section>
@@ -395,8 +361,8 @@ export function Place({ api, space, placing, setPlacing, undo, say, fail }: Prop
                 {{ csv: "CSV", geojson: "GeoJSON", yaml: "Recipe" }[ending]}
               </button>
             ))}
-            <button type="button" onClick={() => saveMap("svg", space.map.name)}>SVG</button>
-            <button type="button" onClick={() => saveMap("png", space.map.name)}>PNG</button>
+            {!solid && <button type="button" onClick={() => saveMap("svg", space.map.name)}>SVG</button>}
+            <button type="button" onClick={() => (solid ? scene.current?.picture((png) => png && saveBlob(png, `${space.map.name}.png`)) : saveMap("png", space.map.name))}>PNG</button>
             {!api.saved && <button type="button" onClick={() => navigator.clipboard.writeText(location.href).then(() => say("The link is copied"), fail)}>Copy link</button>}
           </div>
           <Command api={api} space={space} placing={placing} say={say} fail={fail} />

@@ -5,10 +5,13 @@ import type { Plan, ProblemInfo, Saving, TaskPlan } from "./types";
 
 type Props = { api: Api; problem: ProblemInfo; budgets: Budgets; setBudgets: (next: Budgets) => void; say: (text: string) => void; fail: (error: unknown) => void };
 const digits = (value: number) => value.toPrecision(2);
+/** As many digits, from two on, as tell two numbers apart; four at most. */
+const apart = (one: number, other: number | undefined) => [2, 3].find((each) => other === undefined || one.toPrecision(each) !== other.toPrecision(each)) ?? 4;
 const percent = (value: number) => `${Math.round(value * 1000) / 10} %`;
 
 export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props) {
   const [plan, setPlan] = useState<Plan | null>(null);
+  const [planFor, setPlanFor] = useState("");
   const [savings, setSavings] = useState<Saving[] | null>(null);
   const asked = JSON.stringify(budgets);
   useEffect(() => {
@@ -19,6 +22,7 @@ export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props)
         performance.measure("plan", "plan-asked");
         if (!current) return;
         setPlan(found);
+        setPlanFor(asked);
         say(found.infeasible ? found.infeasible : `${problem.measure} ${digits(found.objective)}`);
       }).catch(fail);
     }, 60);
@@ -32,6 +36,7 @@ export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props)
   ];
   if (problem.horizon_s !== null) sliders.push(["Time of each vehicle", "horizon_s", "s", problem.horizon_s]);
   const feasible = plan && !plan.infeasible ? plan : null;
+  const told = apart(feasible?.objective ?? 0, feasible?.equal?.objective);
   return (
     <div class="plan">
       <aside class="panel" aria-label="Budgets">
@@ -56,14 +61,14 @@ export function PlanTab({ api, problem, budgets, setBudgets, say, fail }: Props)
           )}
         </section>
       </aside>
-      <main class="sheet">
+      <main class="sheet" aria-busy={planFor !== asked}>
         {!plan && <p class="wait">Planning …</p>}
         {plan?.infeasible && <div class="alert"><h2>No plan fits</h2><p>{plan.infeasible}</p></div>}
         {feasible && (
           <>
-            <p class="big"><strong id="objective">{digits(feasible.objective)}</strong> {problem.measure}</p>
+            <p class="big"><strong id="objective">{feasible.objective.toPrecision(told)}</strong> {problem.measure}</p>
             <p class="note">{problem.measure[0].toUpperCase() + problem.measure.slice(1)}: {feasible.said} {feasible.gap === null ? "There is no certificate." : `Proven within ${percent(feasible.gap)} for the fitted curves.`}
-              {feasible.equal && ` Equal shares of the stages: ${digits(feasible.equal.objective)}.`}</p>
+              {feasible.equal && ` Equal shares of the stages: ${feasible.equal.objective.toPrecision(told)}.`}</p>
             <div class="cards">
               {feasible.tasks.map((task, n) => <TaskCard task={task} equal={feasible.equal?.tasks[n] ?? null} warnings={feasible.warnings.filter((each) => each.includes(`'${task.name}'`))} />)}
             </div>

@@ -1,9 +1,13 @@
 /** The tab Replay: a finished run, played moment by moment: scores, messages of every server, the ledger that fills. */
-import { useEffect, useLayoutEffect, useState } from "preact/hooks";
+import { useEffect, useLayoutEffect, useRef, useState } from "preact/hooks";
+import type { Api } from "./api";
+import type { Clock } from "./drive";
+import { Drives, Shot, Sweep } from "./footage";
 import type { Moment, RunInfo } from "./types";
 
 const LINKS = ["wireless", "wireline"] as const;
-const STEP_MS = 700;
+const STEP_MS = 700; // that a moment lasts
+const [DRIVE_MS, ROUND_MS] = [6000, 1600]; // where drives are shown: of pretraining, and of a round
 const mean = (moment: Moment) => {
   const scores = Object.values(moment.scores);
   return scores.reduce((sum, each) => sum + each, 0) / Math.max(scores.length, 1);
@@ -21,21 +25,37 @@ export function findBestRound(moments: Moment[]): { at: number; gain: number } |
   return best;
 }
 
-export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void }) {
-  const { moments } = run;
-  const [at, setAt] = useState(0);
+export function Replay({ api, run, say, fail }: { api: Api; run: RunInfo; say: (text: string) => void; fail: (error: unknown) => void }) {
+  const { moments, footage } = run;
+  const [at, setMoment] = useState(0);
+  const clock = useRef<Clock>({ at: 0, part: 1 });
   const [playing, setPlaying] = useState(false);
   const moment = moments[at];
   const best = findBestRound(moments);
-  const go = (to: number) => setAt(Math.min(Math.max(to, 0), moments.length - 1));
+  const setAt = (to: number, part: number) => {
+    clock.current = { at: to, part };
+    setMoment(to);
+  };
+  const go = (to: number) => setAt(Math.min(Math.max(to, 0), moments.length - 1), playing ? 0 : 1);
   const play = () => {
-    if (!playing && at === moments.length - 1) setAt(0);
+    if (!playing) setAt(at === moments.length - 1 ? 0 : at, 0);
     setPlaying(!playing);
   };
   useEffect(() => {
     if (!playing) return;
-    const next = setTimeout(() => (at < moments.length - 1 ? setAt(at + 1) : setPlaying(false)), STEP_MS);
-    return () => clearTimeout(next);
+    const drives = footage.regions.length > 0;
+    const lasts = drives ? (moment.stage === "pretrain" ? DRIVE_MS : ROUND_MS) : STEP_MS;
+    let asked = 0;
+    let before = performance.now();
+    const turn = (now: number) => {
+      clock.current!.part += (now - before) / lasts;
+      before = now;
+      if (clock.current!.part < 1) asked = requestAnimationFrame(turn);
+      else if (at < moments.length - 1) setAt(at + 1, 0);
+      else [setAt(at, 1), setPlaying(false)];
+    };
+    asked = requestAnimationFrame(turn);
+    return () => cancelAnimationFrame(asked);
   }, [playing, at]);
   useLayoutEffect(() => {
     const keyed = (event: KeyboardEvent) => {
@@ -61,8 +81,10 @@ export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void
           <input type="range" min={0} max={moments.length - 1} value={at} aria-label="Moment of the run" aria-valuetext={moment.told} onInput={(event) => go(Number(event.currentTarget.value))} />
           <output id="moment">{moment.told}</output>
         </div>
-        <Scores run={run} at={at} best={best?.at ?? -1} onPick={go} />
-        {best && (
+        {footage.regions.length > 0 && <Drives {...{ api, run, fail, clock, playing }} />}
+        <Scores run={run} at={at} best={best && best.gain > 0 ? best.at : -1} onPick={go} />
+        {best && best.gain <= 0 && <p id="gained">No round gained: the mean of the regions' scores never rose, on {run.frames} validation frames each.</p>}
+        {best && best.gain > 0 && (
           <p id="gained">
             <b>{moments[best.at].told}</b> gained most: <b>{signed(best.gain)}</b> in the mean of {Object.keys(moments[best.at].scores).length} regions, on {run.frames} validation frames each.{" "}
             <button type="button" class="quiet" onClick={() => go(best.at)}>Go there</button>
@@ -73,15 +95,17 @@ export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void
             <article class="task" key={`${each.server} ${each.task}`}>
               <h2>{each.server} <small>{each.task}</small></h2>
               <div class="pulses" aria-hidden="true" key={at}>
-                {Array.from({ length: Math.min(each.clients, 24) }, (_, n) => <i style={{ animationDelay: `${n * 40}ms` }} />)}
+                {Array.from({ length: Math.min(each.clients.length, 24) }, (_, n) => <i style={{ animationDelay: `${n * 40}ms` }} />)}
               </div>
               <p class="note">
-                {each.clients} {each.server === "cloud" ? "servers" : "vehicles"}{each.failed ? `, ${each.failed} failed` : ""} · {each.up_mb.toFixed(2)} MB up{each.loss === null ? "" : ` · loss ${each.loss.toFixed(3)}`}
+                {each.clients.length} {each.server === "cloud" ? "server" : "vehicle"}{each.clients.length === 1 ? "" : "s"}{each.failed ? `, ${each.failed} failed` : ""} · {each.up_mb.toFixed(2)} MB up{each.loss === null ? "" : ` · loss ${each.loss.toFixed(3)}`}
               </p>
             </article>
           ))}
           {!moment.servers.length && <p class="note">The cloud trains on what vehicles uploaded; nothing goes back and forth.</p>}
         </div>
+        {footage.sweep && <Sweep api={api} fail={fail} />}
+        {footage.pictures.map((task) => <Shot key={task} api={api} task={task} fail={fail} />)}
       </main>
       <aside class="panel" aria-label="Ledger" tabindex={0}>
         <section>
@@ -99,7 +123,7 @@ export function Replay({ run, say }: { run: RunInfo; say: (text: string) => void
         </section>
         <section>
           <h2>Road sensors</h2>
-          <ul class="facts">{run.placed.map((each) => <li>{each.region}: pole {each.poles.join(", ")} covers {each.covered} of {each.errors} errors</li>)}</ul>
+          <ul class="facts">{run.placed.map((each) => <li>{each.region}: {each.poles.length ? `pole ${each.poles.join(", ")} covers ${each.covered} of ${each.errors} errors` : `no sensor; ${each.errors} errors`}</li>)}</ul>
         </section>
         <section>
           <h2>Findings</h2>
@@ -117,11 +141,13 @@ function Scores({ run, at, best, onPick }: { run: RunInfo; at: number; best: num
   const narrow = matchMedia("(max-width: 820px)").matches;
   const [width, height, left, right, top, bottom] = narrow ? [400, 300, 38, 16, 18, 30] : [860, 300, 44, 130, 18, 30];
   const low = Math.floor(Math.min(...values) * 20) / 20;
-  const high = Math.ceil(Math.max(...values) * 20) / 20 || 1;
+  const high = Math.max(Math.ceil(Math.max(...values) * 20) / 20, low + 0.05);
   const x = (n: number) => left + ((width - left - right) * n) / Math.max(moments.length - 1, 1);
   const y = (score: number) => height - bottom - ((height - top - bottom) * (score - low)) / Math.max(high - low, 1e-9);
   const ends = names.map((name) => ({ name, y: y(moments[moments.length - 1].scores[name]) })).sort((a, b) => a.y - b.y);
   ends.forEach((end, n) => n && (end.y = Math.max(end.y, ends[n - 1].y + 16)));
+  const below = Math.max((ends[ends.length - 1]?.y ?? 0) - (height - bottom - 8), 0);
+  ends.forEach((end) => (end.y -= below));
   return (
     <svg class="curve scores" viewBox={`0 0 ${width} ${height}`} role="img" aria-label={`Validation scores by round: ${names.map((name) => `${name} from ${moments[0].scores[name]?.toFixed(3) ?? "?"} to ${moments[moments.length - 1].scores[name].toFixed(3)}`).join("; ")}`}>
       {Array.from({ length: Math.round((high - low) / 0.05) + 1 }, (_, n) => low + n * 0.05).map((score) => (

@@ -18,7 +18,9 @@ export type TownMap = {
   roads: Point[][];
   sidewalks: Point[][];
   houses: Point[][];
-  trees: [number, number, number][];
+  heights: number[]; // of the houses [m]
+  trees: [number, number, number, number][]; // x, y, radius, height [m]
+  relief: { columns: number; rows: number; z: number[] } | null; // heights of the ground over the bounds, rows from the south [m]
   streets: { name: string; line: Point[] }[];
 };
 export type Workspace = {
@@ -85,7 +87,7 @@ export type Moment = {
   stage: string;
   round: number;
   told: string;
-  servers: { server: string; task: string; clients: number; failed: number; loss: number | null; up_mb: number; down_mb: number }[];
+  servers: { server: string; task: string; clients: string[]; failed: number; loss: number | null; up_mb: number; down_mb: number }[];
   sent: Record<"wireless" | "wireline", number>;
   scores: Record<string, number>;
 };
@@ -98,6 +100,26 @@ export type RunInfo = {
   frames: number;
   findings: { verdict: string; sentence: string }[];
   placed: { region: string; poles: number[]; covered: number; errors: number }[];
+  footage: { regions: string[]; sweep: boolean; pictures: string[] };
+};
+export type Pose = [number, number, number, number]; // x, y [m], yaw [rad], speed [m/s]
+export type Drive = { times: number[]; users: { name: string; walks: boolean; size: [number, number]; path: (Pose | null)[] }[] };
+export type RegionDrive = {
+  map: TownMap;
+  poles: [number, number, number][];
+  range_m: number;
+  errors: { at: Point; kind: string; scene: number; when: number }[];
+  all: number; // errors that were registered, in scenes that are not played as well
+  registry: Drive[];
+  edge: Drive[];
+};
+export type Picture = {
+  picture: string;
+  width: number;
+  height: number;
+  region: string;
+  labels: [number, number, number, number, string][];
+  found: { title: string; said: string; boxes: [number, number, number, number, string, number][] }[];
 };
 export type Start = {
   first: string | null;

@@ -1,0 +1,67 @@
+"""The folder of a run with recordings: the rounds of the committed demo, and a short drive in its first town."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+from flcav.dataset.store import Dataset
+from flcav.perception.errors import PerceptionError, save_errors
+from flcav.runs.frames import Recorded
+from flcav.runs.results.tests import SweepComparison, SweepDetections
+
+FLCAV = Path(sys.executable).with_name("flcav")
+DEMO = Path(__file__).parents[2] / "reproductions" / "runs" / "demo"
+RECIPE = """\
+town: grid
+seed: 4
+scenes: 1
+warmup_s: 10.0
+spins_per_scene: 3
+every_s: 2.0
+cavs: 4
+poles: []
+vehicle_rig: car
+"""
+
+
+def make_run(folder: Path) -> Path:
+    """Return the folder of a run whose first region has its drives, two misses, a compared sweep and pictures."""
+    run = folder / "recorded"
+    work = run / "work"
+    work.mkdir(parents=True)
+    shutil.copy(DEMO / "results.json", run)
+    (folder / "drive.yaml").write_text(RECIPE)
+    data = work / "grid-registry-objects" / "data"
+    subprocess.run([FLCAV, "record", folder / "drive.yaml", "--out", data], check=True, capture_output=True)
+    recorded = Dataset.open(data)
+    frames = Recorded("data", tuple(range(len(recorded))), {}, 1)
+    frames.save(data.parent)
+    for name in ("grid-edge-objects", "grid-test-objects"):
+        shutil.copytree(data.parent, work / name)
+    _save_errors(recorded, work / "grid-errors-objects")
+    _save_sweep(recorded, work / "look")
+    return run
+
+
+def _save_errors(data: Dataset, folder: Path) -> None:
+    """Register as missed the first two cars that are seen in the last frame."""
+    folder.mkdir()
+    frame = data.frame(len(data) - 1)
+    truth = frame.annotations
+    cars = [row for row, label in enumerate(truth.boxes.label.tolist()) if label == "car"][:2]
+    at, names = truth.boxes.center[cars].tolist(), truth.track[cars].tolist()
+    missed = [
+        PerceptionError(x, y, z, 1.0, "miss", "Car", 9, 0.2, frame.scene, name)
+        for (x, y, z), name in zip(at, names, strict=True)
+    ]
+    save_errors(missed, folder / "errors.parquet")
+
+
+def _save_sweep(data: Dataset, folder: Path) -> None:
+    """Compare nothing found with one of two targets found and one false box."""
+    folder.mkdir()
+    targets = ((12.0, 2.0, -1.0, 4.5, 1.9, 1.6, 0.1), (25.0, -3.0, -1.0, 4.5, 1.9, 1.6, 3.1))
+    before = SweepDetections((), (), (False, False))
+    after = SweepDetections((targets[0], (30.0, 6.0, -1.0, 4.0, 1.8, 1.5, 0.0)), (True, False), (True, False))
+    SweepComparison(0, targets, before, after).save(folder)
