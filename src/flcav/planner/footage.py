@@ -16,7 +16,7 @@ from PIL import Image
 from flcav.config import InputError, Json, shorten
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.perception.errors import PerceptionError, load_errors
+from flcav.perception.errors import THRESHOLD, PerceptionError, load_errors
 from flcav.perception.marks import PictureBoxes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.task import SIGNS
@@ -29,7 +29,7 @@ from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import ERRORS, WEIGHTS
 from flcav.runs.results.tests import SweepComparison, SweepDetections
-from flcav.runs.stages.testing import LOOK, SHOWN_SCORE
+from flcav.runs.stages.testing import LOOK
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
@@ -162,7 +162,7 @@ class Footage:
                 network = load_network(task, folder / WEIGHTS)
             except InputError:
                 continue
-            for finding in task.infer(network, data.folder, SHOWN_SCORE, [frame]):
+            for finding in task.infer(network, data.folder, THRESHOLD, [frame]):
                 boxes = [mark for mark in finding.marks if isinstance(mark, PictureBoxes)]
                 rows = [
                     [*map(_tenth, box), str(label), round(float(score), 2)]
