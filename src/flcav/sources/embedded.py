@@ -160,7 +160,7 @@ class EmbeddedSource(DividedSource):
         rig = self.recipe.vehicle_rig
         if self.recipe.randomise is None:
             return rig
-        return randomise_rig(rig, stream(self.recipe.seed, "rig", f"cav{number}"))
+        return randomise_rig(rig, stream(self.recipe.seed, "rig", f"cav{number}"), self.recipe.randomise)
 
     def _files(self) -> Mapping[str, bytes]:
         """Return the contents of the files of the town, as drawn, by name."""

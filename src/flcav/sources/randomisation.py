@@ -7,6 +7,7 @@ randomization for transferring deep neural networks from simulation to the real 
 import io
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 import pyarrow.parquet as pq
@@ -15,7 +16,8 @@ import yaml
 from shapely.geometry import Polygon
 
 from flcav.geometry import Array
-from flcav.sensors.lidar.lidar import BEAMS, Lidar
+from flcav.sensors.lidar.beams import BEAMS
+from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.rig import MountedLidar, Rig
 from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, StreetParameters, TownParameters
 from flcav.world.map.relief import Relief
@@ -26,6 +28,7 @@ from flcav.world.static import LAND_M
 from flcav.world.trace import Trace
 
 Draw = np.random.Generator
+Drawing = Literal["streets", "lidars"]  # LiDARs of 40 beams and more, or of 16 and more; streets are drawn in both
 
 CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them
 STEEPEST = 0.035  # slope of one of three long waves of the terrain
@@ -38,9 +41,19 @@ FACTORS: Mapping[str, Spans] = {  # of length, width and height, by category; ot
     **dict.fromkeys(("bicycle", "motorcycle"), ((0.92, 1.08), (0.85, 1.1), (0.95, 1.06))),
     "pedestrian": ((0.75, 1.7), (0.7, 1.15), (0.9, 1.08)),
 }
-PATTERNS = ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even")  # of beams; "twice": two LiDARs, one on the other
-EVEN_BEAMS = (40, 96)  # fewest and most of the pattern "even"
-DRAWN_BEAMS = (40, 128)  # fewest and most of all `PATTERNS`
+PATTERNS: Mapping[Drawing, tuple[str, ...]] = {  # of beams; "twice": two LiDARs, one on the other
+    "streets": ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even"),
+    "lidars": (
+        *("vlp16", "vlp16", "vlp16", "hdl32e", "vlp32c", "os1_32", "os2_32", "pandar40"),
+        *("hdl64e", "hdl64e", "pandar64", "waymo64", "os0_64", "os1_64", "os2_64", "vlp32c twice"),
+        *("vls128", "pandar128", "at128", "os0_128", "os1_128", "os2_128", "even"),
+    ),
+}
+EVEN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 96), "lidars": (16, 96)}  # of the pattern "even"
+DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 128), "lidars": (16, 128)}  # fewest and most of all
+HEIGHTS_M = (1.2, 2.3)  # of the drawn LiDARs of "lidars" above the ground
+FAILING, FAILED = 0.25, 0.15  # share of these LiDARs of which beams fail, and the largest share of their beams
+FASTER = 0.25  # share of these LiDARs that spin twice as fast, with half the firings in a spin
 DROPPING = 0.4  # fraction of the LiDARs that lose many returns
 
 
@@ -141,20 +154,24 @@ def _grid(bounds: tuple[float, float, float, float], cell_m: float) -> Array:
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
-def randomise_rig(rig: Rig, draw: Draw) -> Rig:
+def randomise_rig(rig: Rig, draw: Draw, drawing: Drawing = "streets") -> Rig:
     """Return the rig with mount, beams, range and losses of every LiDAR randomised; other sensors stay as they are."""
-    return rig.model_copy(update={"lidars": {name: _draw_lidar(one, draw) for name, one in rig.lidars.items()}})
+    drawn = {name: _draw_lidar(one, draw, drawing) for name, one in rig.lidars.items()}
+    return rig.model_copy(update={"lidars": drawn})
 
 
-def _draw_lidar(lidar: MountedLidar, draw: Draw) -> MountedLidar:
+def _draw_lidar(lidar: MountedLidar, draw: Draw, drawing: Drawing) -> MountedLidar:
+    height = lidar.mount.z + draw.uniform(-0.2, 0.4) if drawing == "streets" else draw.uniform(*HEIGHTS_M)
     mount = lidar.mount.model_copy(
         update={
-            "z": lidar.mount.z + draw.uniform(-0.2, 0.4),
+            "z": height,
             "pitch_deg": lidar.mount.pitch_deg + draw.normal(0, 0.7),
             "roll_deg": lidar.mount.roll_deg + draw.normal(0, 0.7),
         }
     )
-    elevations, steps = _draw_beams(str(draw.choice(PATTERNS)), draw)
+    elevations, steps = _draw_beams(str(draw.choice(PATTERNS[drawing])), draw, EVEN_BEAMS[drawing])
+    if drawing == "lidars":
+        elevations, steps = _wear_out(elevations, draw), steps // 2 if draw.random() < FASTER else steps
     fixed = lidar.settings.model_dump(exclude={"beams", "channels", "elevations_deg", "azimuth_steps"})
     settings = Lidar.model_validate(
         fixed
@@ -174,12 +191,13 @@ def _draw_lidar(lidar: MountedLidar, draw: Draw) -> MountedLidar:
     return MountedLidar(mount=mount, settings=settings)
 
 
-def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
-    """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`, with small errors per beam."""
+def _draw_beams(pattern: str, draw: Draw, even: tuple[int, int]) -> tuple[tuple[float, ...], int]:
+    """Return the elevations [deg] and the azimuth steps of one of `PATTERNS`, with small errors per beam.
+
+    `even` are the fewest and the most beams of the pattern of that name.
+    """
     if pattern == "even":
-        elevations = np.linspace(
-            draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(EVEN_BEAMS[0], EVEN_BEAMS[1] + 1))
-        )
+        elevations = np.linspace(draw.uniform(2, 15), draw.uniform(-25, -16), int(draw.integers(even[0], even[1] + 1)))
         steps = int(draw.integers(1000, 2001))
     else:
         known = BEAMS[pattern.removesuffix(" twice")]
@@ -188,6 +206,12 @@ def _draw_beams(pattern: str, draw: Draw) -> tuple[tuple[float, ...], int]:
             elevations = np.concatenate((elevations, elevations + draw.uniform(-0.3, 0.3)))
     off = elevations + draw.normal(0, 0.04, len(elevations))
     return tuple(float(elevation) for elevation in off.round(3)), steps
+
+
+def _wear_out(elevations: tuple[float, ...], draw: Draw) -> tuple[float, ...]:
+    """Return the elevations of the beams that work: of some LiDARs up to `FAILED` of them do not."""
+    failed = draw.random(len(elevations)) < (draw.uniform(0, FAILED) if draw.random() < FAILING else 0.0)
+    return tuple(elevation for elevation, fails in zip(elevations, failed) if not fails)
 
 
 def randomise_bodies(trace: Trace, draw: Draw) -> Trace:

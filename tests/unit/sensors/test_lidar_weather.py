@@ -8,7 +8,8 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.geometry import pose, transform_points
-from flcav.sensors.lidar.lidar import BEAMS, CarlaReturns, Lidar, build_ray_pattern, point_times_s, scan
+from flcav.sensors.lidar.beams import BEAMS
+from flcav.sensors.lidar.lidar import CarlaReturns, Lidar, build_ray_pattern, point_times_s, scan
 from flcav.sensors.lidar.rolling import Motion
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
