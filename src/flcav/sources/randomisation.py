@@ -52,7 +52,7 @@ PATTERNS: Mapping[Drawing, tuple[str, ...]] = {  # of beams; "twice": two LiDARs
 EVEN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 96), "lidars": (16, 96)}  # of the pattern "even"
 DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 128), "lidars": (16, 128)}  # fewest and most of all
 HEIGHTS_M = (1.2, 2.3)  # of the drawn LiDARs of "lidars" above the ground
-FAILING, FAILED = 0.25, 0.15  # share of these LiDARs of which beams fail, and the largest share of their beams
+FAILING, FAILED = 0.25, 0.15  # share of these LiDARs of which beams fail, and the most of the probability that one does
 FASTER = 0.25  # share of these LiDARs that spin twice as fast, with half the firings in a spin
 DROPPING = 0.4  # fraction of the LiDARs that lose many returns
 
@@ -209,7 +209,7 @@ def _draw_beams(pattern: str, draw: Draw, even: tuple[int, int]) -> tuple[tuple[
 
 
 def _wear_out(elevations: tuple[float, ...], draw: Draw) -> tuple[float, ...]:
-    """Return the elevations of the beams that work: of some LiDARs up to `FAILED` of them do not."""
+    """Return the elevations of the beams that work: of some LiDARs each fails with a probability of up to `FAILED`."""
     failed = draw.random(len(elevations)) < (draw.uniform(0, FAILED) if draw.random() < FAILING else 0.0)
     return tuple(elevation for elevation, fails in zip(elevations, failed) if not fails)
 

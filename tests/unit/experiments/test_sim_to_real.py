@@ -55,6 +55,13 @@ def test_what_the_image_does_not_show_does_not_count():
     np.testing.assert_array_equal(select_shown(everything, frame(boxes())).center[:, 0], [20])
 
 
+def test_a_detection_outside_the_image_counts_where_it_overlaps_a_labelled_object():
+    labelled = frame(boxes((10, 12.5)))
+    np.testing.assert_array_equal(select_shown(boxes((20, 0), (10, 12), (10, -12)), labelled).center[:, 1], [0, 12])
+    nothing = Boxes.from_array(np.zeros((0, 7)), "Car")
+    assert len(select_shown(nothing, labelled)) == 0
+
+
 def test_similar_classes_are_neutral_for_the_one_that_they_resemble():
     places = boxes((20, 0), (30, 0), (40, 0))
     objects = Boxes.from_array(places.array(), np.array(["Car", "Truck", "Person_sitting"]))

@@ -9,6 +9,7 @@ from flcav.config import InputError
 from flcav.geometry import inverse
 from flcav.perception.task import KnownLidar
 from flcav.perception.weights import find_recorded_lidar
+from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (
@@ -103,10 +104,28 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
     assert 2.05 < heights.max() <= 2.13
     assert {lidar.settings.range_m for lidar in drawn} == {120.0}
     assert len({lidar.settings.channels for lidar in drawn}) > 8  # even patterns differ in it
-    assert find_recorded_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS, 120)
+    assert find_recorded_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS["streets"], 120)
     beams = [lidar.settings.channels for lidar in drawn]
-    assert min(beams) >= DRAWN_BEAMS[0]
-    assert max(beams) == DRAWN_BEAMS[1]
+    assert min(beams) >= DRAWN_BEAMS["streets"][0]
+    assert max(beams) == DRAWN_BEAMS["streets"][1]
+
+
+def test_lidars_on_the_market_are_drawn_with_beams_that_fail():
+    nominal = RIGS["kitti_lidar"]
+    drawn = [randomise_rig(nominal, stream(seed, "rig"), "lidars").lidars["velodyne"] for seed in range(200)]
+    heights = np.array([lidar.mount.z for lidar in drawn])
+    assert 1.2 <= heights.min() < 1.25
+    assert 2.25 < heights.max() <= 2.3
+    beams = np.array([lidar.settings.channels for lidar in drawn])
+    whole = np.isin(beams, [len(known.elevations_deg) for known in BEAMS.values()])
+    assert 0.1 < (~whole).mean() < 0.4
+    assert 8 <= beams.min() < 16
+    assert beams.max() == DRAWN_BEAMS["lidars"][1] == 128
+    assert 0.1 < (beams <= 16).mean() < 0.25  # a VLP-16 in three of 23 patterns
+    known = {known.azimuth_steps for known in BEAMS.values()}
+    steps = {lidar.settings.azimuth_steps for lidar in drawn if lidar.settings.channels == 16}
+    assert steps <= known | {step // 2 for step in known}
+    assert any(step not in known for step in steps)
 
 
 def test_sizes_are_drawn_by_category_and_the_ends_of_cars_are_bowed(source: EmbeddedSource):
