@@ -36,7 +36,7 @@ from flcav.storage.records import Record
 Fields = Mapping[str, Json]
 SEED, EPOCHS, LEARNING_RATE = 1, 5, 1e-3
 THIN, ALIKE = 0.25, 1.6  # of `Augmentation`
-DRAWN, STREETS, AUTHORED = "lidars", "streets", "objects"  # names of the recipes
+DRAWN, STREETS, AUTHORED = "wide_streets", "streets", "objects"  # names of the recipes
 FEW_BEAMS = 40  # most beams of a LiDAR with few
 SHOWN = (("3d", 0.5), ("3d", 0.7))  # kinds of overlap and IoU of the tables
 CAR = "Car AP 3d at 0.5"
@@ -49,17 +49,17 @@ TRAINING: tuple[Fields, ...] = (
 )
 HELD = {"town": "suburb", "split": "validation", "scenes": 2}
 VALIDATION: Mapping[str, Fields] = {
-    "validation-lidars": {**read_recipe(DRAWN), **HELD, "seed": 143},
+    "validation-wide": {**read_recipe(DRAWN), **HELD, "seed": 143},
     "validation-streets": {**read_recipe(STREETS), **HELD, "seed": 145},
 }
 TESTED = {"split": "test", "scenes": 6}
 TESTS: Mapping[str, Fields] = {
     **{town: {**read_recipe(AUTHORED), **TESTED, "town": town, "seed": 471, "spins_per_scene": 4} for town in TOWNS},
     "streets": {**read_recipe(STREETS), **TESTED, "town": "suburb", "seed": 473},
-    "lidars": {**read_recipe(DRAWN), **TESTED, "town": "suburb", "seed": 475},
-    "lidars-arterial": {**read_recipe(DRAWN), **TESTED, "town": "arterial", "seed": 477},
+    "wide": {**read_recipe(DRAWN), **TESTED, "town": "suburb", "seed": 475},
+    "wide-arterial": {**read_recipe(DRAWN), **TESTED, "town": "arterial", "seed": 477},
 }
-FEW = {f"{name}, {FEW_BEAMS} beams and fewer": name for name in TESTS if name.startswith(DRAWN)}
+FEW = {f"{name}, {FEW_BEAMS} beams and fewer": name for name in TESTS if name.startswith("wide")}
 BEFORE, NOW = "before", "now"
 
 

@@ -15,20 +15,29 @@ import shapely
 import yaml
 from shapely.geometry import Polygon
 
-from flcav.geometry import Array
+from flcav.geometry import Array, wrap_angle
 from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.lidar.lidar import Lidar
 from flcav.sensors.rig import MountedLidar, Rig
-from flcav.world.map.parameters import BOUNDARIES, CLUTTER, KERBSIDE, MOST, StreetParameters, TownParameters
+from flcav.world.map.parameters import (
+    BOUNDARIES,
+    CLUTTER,
+    KERBSIDE,
+    MOST,
+    ParkingParameters,
+    StreetParameters,
+    TownParameters,
+)
 from flcav.world.map.relief import Relief
-from flcav.world.map.roads import read_net
+from flcav.world.map.roads import RoadNet, read_net
+from flcav.world.map.street_furniture import list_verges, outline_space
 from flcav.world.map.town import HEIGHTS, Town, furnish_town, lift_town
 from flcav.world.shapes import RARE, SHAPES
 from flcav.world.static import LAND_M
 from flcav.world.trace import Trace
 
 Draw = np.random.Generator
-Drawing = Literal["streets", "lidars"]  # LiDARs of 40 beams and more, or of 16 and more; streets are drawn in both
+Drawing = Literal["streets", "wide"]  # "wide": with cars parked across the street, and LiDARs of 16 beams and more, too
 
 CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them
 STEEPEST = 0.035  # slope of one of three long waves of the terrain
@@ -43,24 +52,30 @@ FACTORS: Mapping[str, Spans] = {  # of length, width and height, by category; ot
 }
 PATTERNS: Mapping[Drawing, tuple[str, ...]] = {  # of beams; "twice": two LiDARs, one on the other
     "streets": ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even"),
-    "lidars": (
+    "wide": (
         *("vlp16", "vlp16", "vlp16", "hdl32e", "vlp32c", "os1_32", "os2_32", "pandar40"),
         *("hdl64e", "hdl64e", "pandar64", "waymo64", "os0_64", "os1_64", "os2_64", "vlp32c twice"),
         *("vls128", "pandar128", "at128", "os0_128", "os1_128", "os2_128", "even"),
     ),
 }
-EVEN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 96), "lidars": (16, 96)}  # of the pattern "even"
-DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 128), "lidars": (16, 128)}  # fewest and most of all
-HEIGHTS_M = (1.2, 2.3)  # of the drawn LiDARs of "lidars" above the ground
+EVEN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 96), "wide": (16, 96)}  # of the pattern "even"
+DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 128), "wide": (16, 128)}  # fewest and most of all
+HEIGHTS_M = (1.2, 2.3)  # of the drawn LiDARs of "wide" above the ground
+BAY_ROWS, BAY_ROW = (0.2, 0.7), (3, 12)  # share of the sidewalks with a row of bays, and bays in a row
+BAY_ANGLES_DEG, BAY_M, BAY_WIDTH_M = (90.0, 90.0, 70.0, 55.0), 5.2, (2.4, 2.8)  # to the street; length and width
+BAYS_TAKEN = (0.4, 0.95)  # share of the bays with a vehicle
 FAILING, FAILED = 0.25, 0.15  # share of these LiDARs of which beams fail, and the most of the probability that one does
 FASTER = 0.25  # share of these LiDARs that spin twice as fast, with half the firings in a spin
 DROPPING = 0.4  # fraction of the LiDARs that lose many returns
 
 
-def randomise_town(town: Town, draw: Draw) -> Town:
+def randomise_town(town: Town, draw: Draw, drawing: Drawing = "streets") -> Town:
     """Return a town on the same net with randomised streets and traffic, and terrain unless the town has heights."""
-    parameters = _draw_parameters(town.parameters, draw)
-    drawn = furnish_town(town.name, town.net, read_net(town.net), parameters)
+    parameters, net = _draw_parameters(town.parameters, draw), read_net(town.net)
+    if drawing == "wide":
+        more = {"parking": tuple(_draw_bays(town, net, draw)), "parking_taken": draw.uniform(*BAYS_TAKEN)}
+        parameters = parameters.model_copy(update=more)
+    drawn = furnish_town(town.name, town.net, net, parameters)
     return lift_town(drawn, town.relief or draw_terrain(drawn, draw))
 
 
@@ -123,6 +138,28 @@ def _draw_street(street: StreetParameters, draw: Draw) -> StreetParameters:
     return StreetParameters.model_validate(street.model_dump() | drawn)
 
 
+def _draw_bays(town: Town, net: RoadNet, draw: Draw) -> list[ParkingParameters]:
+    """Return rows of parking spaces across the street or at an angle to it, behind the sidewalks of a town's net."""
+    share, bays = draw.uniform(*BAY_ROWS), []
+    closed = shapely.union_all([Polygon(outline) for outline in (*town.roads, *town.sidewalks)])
+    shapely.prepare(closed)
+    for verge in list_verges(net, town.parameters):
+        angle, width = np.radians(draw.choice(BAY_ANGLES_DEG)), draw.uniform(*BAY_WIDTH_M)
+        along, rows = draw.uniform(2.0, 10.0), int(draw.integers(BAY_ROW[0], BAY_ROW[1] + 1))
+        turn, into = float(draw.choice((-1, 1)) * angle), (BAY_M * np.sin(angle) + width * np.cos(angle)) / 2
+        if draw.random() >= share:
+            continue
+        for number in range(rows):
+            at = along + number * width / np.sin(angle)
+            x, y, heading = verge.at(at, verge.half_width + 0.1 + into)
+            yaw_deg = float(np.degrees(wrap_angle(heading + turn)))
+            bay = ParkingParameters(x=x, y=y, yaw_deg=yaw_deg, length_m=BAY_M, width_m=width)
+            if at < verge.line.length - 2.0 and not closed.intersects(outline_space(bay)):
+                bays.append(bay)
+                closed = closed.union(outline_space(bay).buffer(-0.05))
+    return bays
+
+
 def _mix(names: list[str], draw: Draw) -> dict[str, float]:
     """Return weights of `names` that sum to 1, from a flat Dirichlet distribution."""
     return dict(zip(names, draw.dirichlet(np.ones(len(names))).round(4).clip(1e-4).tolist()))
@@ -157,7 +194,7 @@ def _grid(bounds: tuple[float, float, float, float], cell_m: float) -> Array:
 def randomise_rig(rig: Rig, draw: Draw, drawing: Drawing = "streets") -> Rig:
     """Return the rig with mount, beams, range and losses of every LiDAR randomised; other sensors stay as they are."""
     drawn = {name: _draw_lidar(one, draw, drawing) for name, one in rig.lidars.items()}
-    return rig.model_copy(update={"lidars": drawn})
+    return rig.model_copy(update={"wide": drawn})
 
 
 def _draw_lidar(lidar: MountedLidar, draw: Draw, drawing: Drawing) -> MountedLidar:
@@ -170,7 +207,7 @@ def _draw_lidar(lidar: MountedLidar, draw: Draw, drawing: Drawing) -> MountedLid
         }
     )
     elevations, steps = _draw_beams(str(draw.choice(PATTERNS[drawing])), draw, EVEN_BEAMS[drawing])
-    if drawing == "lidars":
+    if drawing == "wide":
         elevations, steps = _wear_out(elevations, draw), steps // 2 if draw.random() < FASTER else steps
     fixed = lidar.settings.model_dump(exclude={"beams", "channels", "elevations_deg", "azimuth_steps"})
     settings = Lidar.model_validate(

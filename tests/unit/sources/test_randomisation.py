@@ -112,7 +112,7 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
 
 def test_lidars_on_the_market_are_drawn_with_beams_that_fail():
     nominal = RIGS["kitti_lidar"]
-    drawn = [randomise_rig(nominal, stream(seed, "rig"), "lidars").lidars["velodyne"] for seed in range(200)]
+    drawn = [randomise_rig(nominal, stream(seed, "rig"), "wide").lidars["velodyne"] for seed in range(200)]
     heights = np.array([lidar.mount.z for lidar in drawn])
     assert 1.2 <= heights.min() < 1.25
     assert 2.25 < heights.max() <= 2.3
@@ -120,7 +120,7 @@ def test_lidars_on_the_market_are_drawn_with_beams_that_fail():
     whole = np.isin(beams, [len(known.elevations_deg) for known in BEAMS.values()])
     assert 0.1 < (~whole).mean() < 0.4
     assert 8 <= beams.min() < 16
-    assert beams.max() == DRAWN_BEAMS["lidars"][1] == 128
+    assert beams.max() == DRAWN_BEAMS["wide"][1] == 128
     assert 0.1 < (beams <= 16).mean() < 0.25  # a VLP-16 in three of 23 patterns
     known = {known.azimuth_steps for known in BEAMS.values()}
     steps = {lidar.settings.azimuth_steps for lidar in drawn if lidar.settings.channels == 16}
@@ -161,7 +161,7 @@ def test_returns_of_a_resized_car_lie_in_its_box(source: EmbeddedSource):
 
 
 def test_a_lidar_that_is_drawn_into_the_ground_is_refused():
-    rig = {"lidars": {"low": {"mount": {"z": 0.05}}}}
+    rig = {"wide": {"low": {"mount": {"z": 0.05}}}}
     with pytest.raises(InputError, match="not above the ground"):
         EmbeddedSource(Recipe.model_validate(FIELDS | {"randomise": "streets", "vehicle_rig": rig, "cavs": 9}))
 
