@@ -13,6 +13,7 @@ from flcav.perception.objects.augment import (
     DENSE,
     augment,
     cut_out_objects,
+    fade_objects,
     in_bands,
     in_view,
     keep_returns,
@@ -115,6 +116,13 @@ def test_bands_are_as_far_apart_and_as_high_as_asked_for():
     assert kept.mean() == pytest.approx(0.125, abs=0.01)
     begins = np.degrees(elevation)[1:][kept[1:] & ~kept[:-1]]
     np.testing.assert_allclose(np.diff(begins), 2.0, atol=0.01)
+
+
+def test_objects_lose_their_own_share_of_returns():
+    sample = scene(5, objects=3, per_object=2000)
+    faded = fade_objects(sample, np.array([0.0, 0.5, 0.9]), np.random.default_rng(0))
+    np.testing.assert_allclose(points_in_boxes(faded.points, sample.boxes).sum(1), [2000, 1000, 200], atol=70)
+    assert len(faded.points) == points_in_boxes(faded.points, sample.boxes).sum() + 200  # all of the clutter
 
 
 def test_sparse_sweeps_are_not_thinned():

@@ -2,8 +2,8 @@
 
 Global mirroring, rotation and scaling, and ground-truth sampling are those of SECOND (Yan et al. 2018, sec. 3.2.1). The
 others vary what differs between LiDARs, cars and countries: sizes of objects (random object scaling of Yang et al.,
-"ST3D", CVPR 2021), pose of the sensor, number of beams, lost returns, field of view. Boxes drawn by annotators have a
-margin: they begin before the first return, and leave out mirrors.
+"ST3D", CVPR 2021), pose of the sensor, number of beams, lost returns, paint of objects, field of view. Boxes drawn by
+annotators have a margin: they begin before the first return, and leave out mirrors.
 
 Ground-truth sampling pastes an object with its returns at the position where it was recorded, so that their density
 fits its distance. It is skipped where its footprint overlaps another; returns of the scene inside its box are removed.
@@ -30,9 +30,12 @@ VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, do
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
     """Return the sample augmented by random amounts drawn from `rng`, within the limits of `how`.
 
-    The order is: a dense sweep is thinned; cars are resized, and boxes get their margin; the whole sweep is mirrored,
-    rotated and scaled; shifted; tilted and lifted; returns are dropped; the sweep is cut to a camera's field of view.
+    The order is: objects lose returns; a dense sweep is thinned; cars are resized, and boxes get their margin; the
+    whole sweep is mirrored, rotated and scaled; shifted; tilted and lifted; returns are dropped; the sweep is cut to a
+    camera's field of view.
     """
+    if how.fade:
+        sample = fade_objects(sample, rng.uniform(0, how.fade, len(sample.boxes)), rng)
     if how.thin and rng.random() < how.thin and len(sample.points) > DENSE:
         sample = keep_returns(sample, in_bands(sample.points, rng.uniform(*BETWEEN_DEG), rng.uniform(*BAND_DEG), rng))
     mirror = -1.0 if how.flip and rng.random() < 0.5 else 1.0
@@ -129,6 +132,12 @@ def in_view(points: Array32) -> Mask:
     side, down, up = VIEW
     x, y, z = points[:, 0], points[:, 1], points[:, 2]
     return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
+
+
+def fade_objects(sample: Sample, lost: Array, rng: np.random.Generator) -> Sample:
+    """Return the sample without a share lost[n] of the returns inside box n, drawn by `rng`, as of dark, glossy paint."""
+    share = (points_in_boxes(sample.points, sample.boxes) * lost[:, None]).max(axis=0, initial=0.0)
+    return keep_returns(sample, rng.random(len(sample.points)) >= share)
 
 
 def in_bands(points: Array32, between_deg: float, band_deg: float, rng: np.random.Generator) -> Mask:
