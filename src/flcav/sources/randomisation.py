@@ -61,9 +61,9 @@ PATTERNS: Mapping[Drawing, tuple[str, ...]] = {  # of beams; "twice": two LiDARs
 EVEN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 96), "wide": (16, 96)}  # of the pattern "even"
 DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 128), "wide": (16, 128)}  # fewest and most of all
 HEIGHTS_M = (1.2, 2.3)  # of the drawn LiDARs of "wide" above the ground
-BAY_ROWS, BAY_ROW = (0.2, 0.7), (3, 12)  # share of the sidewalks with a row of bays, and bays in a row
+BAY_ROWS, BAY_ROW = (0.3, 0.9), (3, 12)  # share of the sidewalks with a row of bays, and bays in a row
 BAY_ANGLES_DEG, BAY_M, BAY_WIDTH_M = (90.0, 90.0, 70.0, 55.0), 5.2, (2.4, 2.8)  # to the street; length and width
-BAYS_TAKEN = (0.4, 0.95)  # share of the bays with a vehicle
+BAYS_TAKEN, CLEAR = (0.4, 0.95), 0.5  # share of the bays with a vehicle, and of the streets without a parking lane
 FAILING, FAILED = 0.25, 0.15  # share of these LiDARs of which beams fail, and the most of the probability that one does
 FASTER = 0.25  # share of these LiDARs that spin twice as fast, with half the firings in a spin
 DROPPING = 0.4  # fraction of the LiDARs that lose many returns
@@ -73,8 +73,13 @@ def randomise_town(town: Town, draw: Draw, drawing: Drawing = "streets") -> Town
     """Return a town on the same net with randomised streets and traffic, and terrain unless the town has heights."""
     parameters, net = _draw_parameters(town.parameters, draw), read_net(town.net)
     if drawing == "wide":
-        more = {"parking": tuple(_draw_bays(town, net, draw)), "parking_taken": draw.uniform(*BAYS_TAKEN)}
-        parameters = parameters.model_copy(update=more)
+        parameters = parameters.model_copy(
+            update={
+                "parking": tuple(_draw_bays(town, net, draw)),
+                "parking_taken": draw.uniform(*BAYS_TAKEN),
+                "streets": {kind: _clear_lane(street, draw) for kind, street in parameters.streets.items()},
+            }
+        )
     drawn = furnish_town(town.name, town.net, net, parameters)
     return lift_town(drawn, town.relief or draw_terrain(drawn, draw))
 
@@ -138,6 +143,11 @@ def _draw_street(street: StreetParameters, draw: Draw) -> StreetParameters:
     return StreetParameters.model_validate(street.model_dump() | drawn)
 
 
+def _clear_lane(street: StreetParameters, draw: Draw) -> StreetParameters:
+    """Return the street, in `CLEAR` of all cases without vehicles in its parking lane, so that the bays are in view."""
+    return street.model_copy(update={"parked": 0.0}) if draw.random() < CLEAR else street
+
+
 def _draw_bays(town: Town, net: RoadNet, draw: Draw) -> list[ParkingParameters]:
     """Return rows of parking spaces across the street or at an angle to it, behind the sidewalks of a town's net."""
     share, bays = draw.uniform(*BAY_ROWS), []
@@ -194,7 +204,7 @@ def _grid(bounds: tuple[float, float, float, float], cell_m: float) -> Array:
 def randomise_rig(rig: Rig, draw: Draw, drawing: Drawing = "streets") -> Rig:
     """Return the rig with mount, beams, range and losses of every LiDAR randomised; other sensors stay as they are."""
     drawn = {name: _draw_lidar(one, draw, drawing) for name, one in rig.lidars.items()}
-    return rig.model_copy(update={"wide": drawn})
+    return rig.model_copy(update={"lidars": drawn})
 
 
 def _draw_lidar(lidar: MountedLidar, draw: Draw, drawing: Drawing) -> MountedLidar:

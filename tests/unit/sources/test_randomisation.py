@@ -25,6 +25,7 @@ from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream
 from flcav.world.map.parameters import BOUNDARIES
 from flcav.world.map.relief import Relief
+from flcav.world.map.street_furniture import outline_space
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.shapes import SHAPES
@@ -172,3 +173,20 @@ def test_without_the_field_nothing_is_drawn():
     assert source.town is load_town("suburb")
     assert source.vehicle_rigs == [source.recipe.vehicle_rig] * 2
     assert not source.town_files()
+
+
+def test_bays_lie_behind_the_sidewalks_in_rows_and_apart():
+    town = load_town("suburb")
+    drawn = randomise_town(town, stream(3, "streets", "suburb"), "wide")
+    bays = [outline_space(space) for space in drawn.parameters.parking]
+    assert len(bays) > 20
+    closed = shapely.union_all([Polygon(outline) for outline in (*town.roads, *town.sidewalks)])
+    assert not shapely.intersects(bays, closed).any()
+    assert shapely.union_all(bays).area == pytest.approx(sum(bay.area for bay in bays), rel=0.02)
+    near = shapely.distance(bays, closed)
+    assert (near < 0.7).mean() > 0.9
+    houses = [make_footprint(*row[:5]) for row in drawn.buildings.tolist()]
+    assert not shapely.STRtree(houses).query(bays, predicate="intersects").size
+    assert not randomise_town(town, stream(3, "streets", "suburb")).parameters.parking
+    towns = [randomise_town(town, stream(seed, "streets"), "wide").parameters for seed in range(2)]
+    assert {street.parked == 0 for streets in towns for street in streets.streets.values()} == {True, False}

@@ -135,7 +135,7 @@ def in_view(points: Array32) -> Mask:
 
 
 def fade_objects(sample: Sample, lost: Array, rng: np.random.Generator) -> Sample:
-    """Return the sample without a share lost[n] of the returns inside box n, drawn by `rng`, as of dark, glossy paint."""
+    """Return the sample without a share lost[n] of the returns inside box n, drawn by `rng`, as of dark paint."""
     share = (points_in_boxes(sample.points, sample.boxes) * lost[:, None]).max(axis=0, initial=0.0)
     return keep_returns(sample, rng.random(len(sample.points)) >= share)
 
