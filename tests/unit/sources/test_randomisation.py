@@ -162,7 +162,7 @@ def test_returns_of_a_resized_car_lie_in_its_box(source: EmbeddedSource):
 
 
 def test_a_lidar_that_is_drawn_into_the_ground_is_refused():
-    rig = {"wide": {"low": {"mount": {"z": 0.05}}}}
+    rig = {"lidars": {"low": {"mount": {"z": 0.05}}}}
     with pytest.raises(InputError, match="not above the ground"):
         EmbeddedSource(Recipe.model_validate(FIELDS | {"randomise": "streets", "vehicle_rig": rig, "cavs": 9}))
 
