@@ -37,7 +37,8 @@ from flcav.world.static import LAND_M
 from flcav.world.trace import Trace
 
 Draw = np.random.Generator
-Drawing = Literal["streets", "wide"]  # "wide": with cars parked across the street, and LiDARs of 16 beams and more, too
+# What a recipe draws: LiDARs of 40 beams and more; of 16 beams and more; these, and cars parked across the street.
+Drawing = Literal["streets", "lidars", "wide"]
 
 CELL_M, FAR_CELL_M = 5.0, 50.0  # of the terrain within the town's bounds, and beyond them
 STEEPEST = 0.035  # slope of one of three long waves of the terrain
@@ -50,17 +51,19 @@ FACTORS: Mapping[str, Spans] = {  # of length, width and height, by category; ot
     **dict.fromkeys(("bicycle", "motorcycle"), ((0.92, 1.08), (0.85, 1.1), (0.95, 1.06))),
     "pedestrian": ((0.75, 1.7), (0.7, 1.15), (0.9, 1.08)),
 }
-PATTERNS: Mapping[Drawing, tuple[str, ...]] = {  # of beams; "twice": two LiDARs, one on the other
-    "streets": ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even"),
-    "wide": (
-        *("vlp16", "vlp16", "vlp16", "hdl32e", "vlp32c", "os1_32", "os2_32", "pandar40"),
-        *("hdl64e", "hdl64e", "pandar64", "waymo64", "os0_64", "os1_64", "os2_64", "vlp32c twice"),
-        *("vls128", "pandar128", "at128", "os0_128", "os1_128", "os2_128", "even"),
-    ),
+PATTERNS = ("hdl64e", "vlp32c twice", "vls128", "os1_128", "even")  # of beams; "twice": two LiDARs, one on the other
+MORE_PATTERNS = (  # of 16 beams and more
+    *("vlp16", "vlp16", "vlp16", "hdl32e", "vlp32c", "os1_32", "os2_32", "pandar40"),
+    *("hdl64e", "hdl64e", "pandar64", "waymo64", "os0_64", "os1_64", "os2_64", "vlp32c twice"),
+    *("vls128", "pandar128", "at128", "os0_128", "os1_128", "os2_128", "even"),
+)
+EVEN_BEAMS, MORE_EVEN_BEAMS = (40, 96), (16, 96)  # fewest and most of the pattern "even"
+DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {  # fewest and most of all patterns
+    "streets": (40, 128),
+    "lidars": (16, 128),
+    "wide": (16, 128),
 }
-EVEN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 96), "wide": (16, 96)}  # of the pattern "even"
-DRAWN_BEAMS: Mapping[Drawing, tuple[int, int]] = {"streets": (40, 128), "wide": (16, 128)}  # fewest and most of all
-HEIGHTS_M = (1.2, 2.3)  # of the drawn LiDARs of "wide" above the ground
+HEIGHTS_M = (1.2, 2.3)  # above the ground, of LiDARs of `MORE_PATTERNS`
 BAY_ROWS, BAY_ROW = (0.3, 0.9), (3, 12)  # share of the sidewalks with a row of bays, and bays in a row
 BAY_ANGLES_DEG, BAY_M, BAY_WIDTH_M = (90.0, 90.0, 70.0, 55.0), 5.2, (2.4, 2.8)  # to the street; length and width
 BAYS_TAKEN, CLEAR = (0.4, 0.95), 0.5  # share of the bays with a vehicle, and of the streets without a parking lane
@@ -216,8 +219,9 @@ def _draw_lidar(lidar: MountedLidar, draw: Draw, drawing: Drawing) -> MountedLid
             "roll_deg": lidar.mount.roll_deg + draw.normal(0, 0.7),
         }
     )
-    elevations, steps = _draw_beams(str(draw.choice(PATTERNS[drawing])), draw, EVEN_BEAMS[drawing])
-    if drawing == "wide":
+    patterns, even = (PATTERNS, EVEN_BEAMS) if drawing == "streets" else (MORE_PATTERNS, MORE_EVEN_BEAMS)
+    elevations, steps = _draw_beams(str(draw.choice(patterns)), draw, even)
+    if drawing != "streets":
         elevations, steps = _wear_out(elevations, draw), steps // 2 if draw.random() < FASTER else steps
     fixed = lidar.settings.model_dump(exclude={"beams", "channels", "elevations_deg", "azimuth_steps"})
     settings = Lidar.model_validate(

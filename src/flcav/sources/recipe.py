@@ -113,7 +113,7 @@ class Recipe(Displayed, Config):
     scenarios: tuple[Scenario, ...] = ()  # corner cases, in every scene
     rare: RareKinds = Field(default={})  # shares of rare kinds of objects among the vehicles of their category
     randomise: Drawing | None = (
-        None  # streets, sizes of cars and LiDARs drawn by `seed`; wide: bays, and LiDARs of 16 beams and more, too
+        None  # streets, sizes of cars and LiDARs drawn by `seed`; lidars: from 16 beams on; wide: with bays, too
     )
 
     @model_validator(mode="after")
