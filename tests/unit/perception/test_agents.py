@@ -177,7 +177,7 @@ def test_the_lidar_of_a_training_is_that_of_its_rig():
     for drawing, beams in (("streets", (40, 128)), ("lidars", (16, 128)), ("wide", (16, 128))):
         assert find_recorded_lidar({"vehicle_rig": "kitti_lidar", "randomise": drawing}) == KnownLidar(beams, 120)
     # that of the package is of many, drawn ones
-    assert find_trained_lidar(OBJECTS, None) == KnownLidar(DRAWN_BEAMS["streets"], 120)
+    assert find_trained_lidar(OBJECTS, None) == KnownLidar(DRAWN_BEAMS["wide"], 120)
 
 
 def test_the_lidar_of_a_road_detector_s_training_is_the_poles():
