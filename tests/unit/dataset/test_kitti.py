@@ -259,6 +259,6 @@ def test_a_missing_image_is_as_large_as_the_camera_s_calibration_and_labels_say(
         return assume_size(KittiCalibration(np.eye(4), projection), replace(Objects.none(), unlabelled=regions))
 
     assert size((609.6, 172.9)) == size((600, 180), (1241, 374)) == (375, 1242)
-    assert size((1040.3, 319.5)) == (639, 2081)
-    assert size((1040.3, 319.5), (2090, 617)) == (639, 2091)
-    assert size((609.6, 319.5), (900, 700)) == (701, 1220)
+    assert size((1040.3, 319.5)) == (640, 2082)
+    assert size((1040.3, 319.5), (2090, 617)) == (640, 2091)
+    assert size((609.6, 319.5), (900, 700)) == (701, 1221)

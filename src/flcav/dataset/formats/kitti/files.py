@@ -265,10 +265,10 @@ class KittiFolder:
 def assume_size(calibration: KittiCalibration, objects: Objects) -> tuple[int, int]:
     """Return the height and width [px] of a missing image: `ASSUMED_SIZE`, unless the camera's is another.
 
-    Another camera has its principal point elsewhere than at about half of that size; its image is taken to be twice as
-    large as the principal point lies from the corner, and as large as the rectangles of the labels.
+    Another camera has its principal point elsewhere than at about half of that size; the point is taken to be the
+    middle of its image, which is as large as the rectangles of the labels at least.
     """
-    assumed, centred = np.array(ASSUMED_SIZE), 2 * calibration.image_from_camera[[1, 0], 2]
+    assumed, centred = np.array(ASSUMED_SIZE), 2 * calibration.image_from_camera[[1, 0], 2] + 1
     if (np.abs(centred - assumed) <= OFF_CENTRE * assumed).all():
         return ASSUMED_SIZE
     corners = np.concatenate((objects.rectangle, objects.unlabelled))[:, [3, 2]]
