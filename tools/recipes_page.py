@@ -15,7 +15,8 @@ from flcav.interface.fields import written_fields
 from flcav.sensors.camera import Camera
 from flcav.sensors.infrared import Infrared
 from flcav.sensors.lens import Lens
-from flcav.sensors.lidar.lidar import BEAMS, CarlaReturns, Lidar
+from flcav.sensors.lidar.beams import BEAMS
+from flcav.sensors.lidar.lidar import CarlaReturns, Lidar
 from flcav.sensors.navigation import Gnss, Imu
 from flcav.sensors.radar import Radar
 from flcav.sensors.rig import (

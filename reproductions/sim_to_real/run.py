@@ -21,7 +21,7 @@ from flcav.experiments.study import open_split, record_split
 from flcav.geometry import Boxes, inverse
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.images import kitti_view
-from flcav.perception.kitti_benchmark import in_image, is_kitti, truth_of
+from flcav.perception.kitti_benchmark import is_kitti, select_shown, truth_of
 from flcav.perception.metrics import interval_words, match
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.metrics.operating_point import FoundAtDistance, describe_counts
@@ -168,7 +168,7 @@ def read_sweeps(network: Second, real: Path, around: bool = False) -> Iterator[R
         folder = KittiFolder.open(real, pictures=False)
         for number in range(len(folder)):
             frame = folder.frame(number)
-            found = in_image(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame)
+            found = select_shown(detect(network, frame.points, score_threshold=LOWEST_SCORE), frame)
             yield RealSweep(frame.name, frame.points, found, truth_of(frame))
         return
     data = Dataset.open(real)

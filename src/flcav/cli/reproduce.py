@@ -39,7 +39,9 @@ def reproduce(
     ),
     around: bool = typer.Option(False, "--around", help="sim-to-real, with --data: look in all directions."),
     weights: Path | None = typer.Option(
-        None, "--weights", help="sim-to-real: the detector's; by default those of the package."
+        None,
+        "--weights",
+        help="sim-to-real: the detector's; by default those of the package. beams: those to begin with.",
     ),
 ) -> None:
     """Run what a figure of the article claims, or draw it; write result.json and a picture."""

@@ -20,7 +20,7 @@ import torch
 from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import InputError
 from flcav.dataset.formats.kitti import KittiCalibration, KittiFolder, KittiFrame
-from flcav.dataset.formats.kitti.files import ASSUMED_SIZE, is_drive
+from flcav.dataset.formats.kitti.files import is_drive
 from flcav.dataset.formats.kitti.write import FRAMES
 from flcav.dataset.formats.rig import LOOKED, RANGE_M, LidarRig
 from flcav.dataset.layout import MANIFEST
@@ -218,7 +218,8 @@ class BenchmarkEvaluation(Evaluated):
     benchmark: tuple[BenchmarkScore, ...]  # class by class, at the benchmark's limit of IoU and at `LOOSE`
     false_positives: Mapping[str, int]  # class -> unmatched detections, in space at `LOOSE` and the level hard
     threshold: float  # lowest score of those detections
-    bare: int  # frames without an image: the usual size is assumed
+    bare: int  # frames without an image: a size is assumed
+    bare_px: Annotated[tuple[str, ...] | None, LEFT_OUT] = None  # that size, "1242 x 375"; None where all have images
     labelled: Annotated[tuple[Score, ...] | None, LEFT_OUT] = None  # of all labelled objects, whatever their height
     counts: Annotated[tuple[FoundAtDistance, ...] | None, LEFT_OUT] = None  # of the same; None in earlier results
 
@@ -237,7 +238,8 @@ class BenchmarkEvaluation(Evaluated):
         which = f"of ImageSets/{self.split}.txt" if self.split else "with labels"
         lines = [f"{plural(self.frames, 'frame')} {which}, AP R40 as KITTI's benchmark counts it: easy, moderate, hard"]
         if self.bare:
-            lines.append(f"{self.bare} of them without an image, taken as {ASSUMED_SIZE[1]} x {ASSUMED_SIZE[0]} pixels")
+            sizes = " or ".join(self.bare_px or ())
+            lines.append(f"{self.bare} of them without an image, taken as {sizes} pixels")
         for row in self.benchmark:
             precisions = "  ".join("    -" if ap is None else f"{ap:.3f}" for ap in (row.easy, row.moderate, row.hard))
             counted = ", ".join(str(number) for number in self.targets[row.label].values())
@@ -303,8 +305,9 @@ def evaluate_kitti(
         raise InputError(f"{path}: no frames to evaluate")
     _check_labels(folder)
     found = list(_detect(network, folder, rig, progress))
+    bare = [one.frame.size for one in found if not folder.has_image(one.frame.name)]
     classes = [name for name in network.config.classes if name in LIMITS]
-    inside = [in_image(one.boxes, one.frame) for one in found]
+    inside = [select_shown(one.boxes, one.frame) for one in found]
     truths = [truth_of(one.frame) for one in found]
     return BenchmarkEvaluation(
         frames=len(found),
@@ -313,7 +316,8 @@ def evaluate_kitti(
         benchmark=tuple(_score(found, name, kind, limits[name]) for name, (limits, kind) in product(classes, COMPARED)),
         false_positives={name: _count_wrong(found, name) for name in classes},
         threshold=THRESHOLD,
-        bare=folder.count_bare(),
+        bare=len(bare),
+        bare_px=tuple(sorted({f"{width} x {height}" for height, width in bare})) or None,
         labelled=score_detections(inside, truths, tuple(classes)),
         counts=count_objects(inside, truths, classes),
     )
@@ -339,10 +343,15 @@ def _detect(network: Second, folder: KittiFolder, rig: LidarRig, progress: Repor
         progress(number + 1, len(folder), "")
 
 
-def in_image(boxes: Boxes, frame: KittiFrame) -> Boxes:
-    """Return the boxes whose centre is inside the frame's image: outside it, objects have no labels."""
+def select_shown(boxes: Boxes, frame: KittiFrame) -> Boxes:
+    """Return the boxes whose centre is inside the frame's image, or that overlap a labelled object.
+
+    Objects outside the image have no labels; of those that reach into it, the centre may lie outside.
+    """
     blank = np.broadcast_to(np.uint8(0), (*frame.size, 3))
-    return boxes[kitti_view(blank, frame.calibration).shows(boxes.center)]
+    shown = kitti_view(blank, frame.calibration).shows(boxes.center)
+    on_one = iou(torch.from_numpy(boxes.array()), torch.from_numpy(frame.objects.boxes.array()), "bev") > 0
+    return boxes[shown | on_one.any(dim=1).numpy()]
 
 
 def truth_of(frame: KittiFrame) -> FrameTruth:

@@ -149,8 +149,9 @@ def find_recorded_lidar(recipe: Mapping[str, Json], agents: Iterable[str] | None
     except (TypeError, KeyError, AttributeError, StopIteration):
         beams, range_m = recipe.get("beams"), recipe.get("range_m")
     span = (beams, beams) if isinstance(beams, int) else None
-    if recipe.get("randomise") is not None and kinds != {POLE}:
-        span = DRAWN_BEAMS
+    drawing: Any = recipe.get("randomise")
+    if drawing is not None and kinds != {POLE}:
+        span = DRAWN_BEAMS[drawing]
     return KnownLidar(span, float(range_m) if isinstance(range_m, int | float) else None)
 
 

@@ -38,7 +38,7 @@ class EmbeddedSource(DividedSource):
         self.recipe = recipe
         self.town = load_town(recipe.town, beside)
         if recipe.randomise is not None:
-            self.town = randomise_town(self.town, stream(recipe.seed, "streets", self.town.name))
+            self.town = randomise_town(self.town, stream(recipe.seed, "streets", self.town.name), recipe.randomise)
         if recipe.rare:
             drawn = self.town.parameters.model_copy(update={"rare": recipe.rare})
             self.town = replace(self.town, parameters=drawn)
@@ -160,7 +160,7 @@ class EmbeddedSource(DividedSource):
         rig = self.recipe.vehicle_rig
         if self.recipe.randomise is None:
             return rig
-        return randomise_rig(rig, stream(self.recipe.seed, "rig", f"cav{number}"))
+        return randomise_rig(rig, stream(self.recipe.seed, "rig", f"cav{number}"), self.recipe.randomise)
 
     def _files(self) -> Mapping[str, bytes]:
         """Return the contents of the files of the town, as drawn, by name."""

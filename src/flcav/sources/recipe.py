@@ -16,6 +16,7 @@ from flcav.interface.wording import suggest
 from flcav.sensors.frame import LONGEST_NAME, format_key
 from flcav.sensors.lens import Lens
 from flcav.sensors.rig import RIGS, CalibrationError, Mounted, MountedInfrared, MountedRadar, Rig
+from flcav.sources.randomisation import Drawing
 from flcav.world.map.parameters import RareKinds
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
@@ -111,7 +112,9 @@ class Recipe(Displayed, Config):
     calibration_error: CalibrationError = CalibrationError()  # errors of the calibration that agents assume
     scenarios: tuple[Scenario, ...] = ()  # corner cases, in every scene
     rare: RareKinds = Field(default={})  # shares of rare kinds of objects among the vehicles of their category
-    randomise: Literal["streets"] | None = None  # streets, sizes of cars and vehicles' LiDARs drawn by `seed`
+    randomise: Drawing | None = (
+        None  # streets, sizes of cars and LiDARs drawn by `seed`; lidars: from 16 beams on; wide: with bays, too
+    )
 
     @model_validator(mode="after")
     def _ends(self) -> "Recipe":

@@ -152,8 +152,12 @@ def test_the_first_line_says_what_is_corrected(tmp_path: Path, capsys: pytest.Ca
     lines = capsys.readouterr().out.splitlines()
     assert not end.value.code
     assert lines[0].startswith(f"{low}: the ground of 1 sweep lies 1.30 m (+- 0.0")
-    assert lines[0].endswith("unlike in the network's training the LiDAR has 16 beams, not 40 to 128")
+    assert lines[0].endswith("not the network's 1.73 m (corrected)")
     assert lines[1] == f"{bare}: no ground near the LiDAR in 1 sweep, so it is taken to be 1.73 m above it"
+    with pytest.raises(SystemExit):
+        run(["infer", "objects", str(low), "--threshold", "0.99", "--beams", "8"])
+    few = capsys.readouterr().out.splitlines()[0]
+    assert few.endswith("unlike in the network's training the LiDAR has 8 beams, not 16 to 128")
 
 
 def test_height_and_beams_are_of_files_alone(tmp_path: Path) -> None:

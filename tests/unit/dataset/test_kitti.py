@@ -1,6 +1,7 @@
 import os
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from flcav.dataset.formats.kitti import (
     read_objects,
     read_points,
 )
+from flcav.dataset.formats.kitti.files import Objects, assume_size
 from flcav.dataset.store import Dataset
 from flcav.dataset.validation import validate
 from flcav.geometry import inverse, points_in_boxes, transform_points
@@ -248,3 +250,15 @@ def test_the_real_frame_is_imported_with_its_boxes_in_the_picture(tmp_path: Path
     assert ((pixels > rectangle[:, :2]) & (pixels < rectangle[:, 2:]))[whole].all()
     assert np.isnan(truth.velocity).all()
     assert np.isnan(truth.views["image_2"].occlusion).tolist() == [True, False, True, False, False, False]
+
+
+def test_a_missing_image_is_as_large_as_the_camera_s_calibration_and_labels_say():
+    def size(center: tuple[float, float], *corners: tuple[float, float]) -> tuple[int, int]:
+        projection = np.array([[700, 0, center[0], 0], [0, 700, center[1], 0], [0, 0, 1, 0]], dtype=float)
+        regions = np.array([(0, 0, *corner) for corner in corners], dtype=float).reshape(-1, 4)
+        return assume_size(KittiCalibration(np.eye(4), projection), replace(Objects.none(), unlabelled=regions))
+
+    assert size((609.6, 172.9)) == size((600, 180), (1241, 374)) == (375, 1242)
+    assert size((1040.3, 319.5)) == (640, 2082)
+    assert size((1040.3, 319.5), (2090, 617)) == (640, 2091)
+    assert size((609.6, 319.5), (900, 700)) == (701, 1221)

@@ -9,7 +9,7 @@ from flcav.config import InputError
 from flcav.dataset.formats.kitti.files import KittiCalibration, KittiFrame, Objects
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import Boxes
-from flcav.perception.kitti_benchmark import in_image, truth_of
+from flcav.perception.kitti_benchmark import select_shown, truth_of
 from flcav.perception.objects.model import second, small_config
 from flcav.reproductions.sim_to_real import run as sim_to_real
 from flcav.reproductions.sim_to_real.clouds import summarise_clouds
@@ -52,7 +52,14 @@ def test_numbers_of_a_cloud_are_counts():
 
 def test_what_the_image_does_not_show_does_not_count():
     everything = boxes((20, 0), (-20, 0), (10, 12))
-    np.testing.assert_array_equal(in_image(everything, frame(boxes())).center[:, 0], [20])
+    np.testing.assert_array_equal(select_shown(everything, frame(boxes())).center[:, 0], [20])
+
+
+def test_a_detection_outside_the_image_counts_where_it_overlaps_a_labelled_object():
+    labelled = frame(boxes((10, 12.5)))
+    np.testing.assert_array_equal(select_shown(boxes((20, 0), (10, 12), (10, -12)), labelled).center[:, 1], [0, 12])
+    nothing = Boxes.from_array(np.zeros((0, 7)), "Car")
+    assert len(select_shown(nothing, labelled)) == 0
 
 
 def test_similar_classes_are_neutral_for_the_one_that_they_resemble():

@@ -152,9 +152,9 @@ def test_a_rig_unlike_the_network_s_is_said_and_its_height_corrected(recorded):
     assert choose_frames(OBJECTS, tiny_config(), taller, "poles").rig == ""
     beams = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar((64, 64)))
     assert beams.rig == "unlike in the network's training the LiDAR has 32 beams, not 64"
-    drawn = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar(DRAWN_BEAMS))
+    drawn = choose_frames(OBJECTS, tiny_config(), recorded(beams=32), trained=KnownLidar(DRAWN_BEAMS["streets"]))
     assert drawn.rig == "unlike in the network's training the LiDAR has 32 beams, not 40 to 128"
-    for trained in (KnownLidar((64, 64), 120), KnownLidar(DRAWN_BEAMS)):
+    for trained in (KnownLidar((64, 64), 120), KnownLidar(DRAWN_BEAMS["streets"])):
         assert choose_frames(OBJECTS, tiny_config(), recorded(beams=64), trained=trained).rig == ""
 
 
@@ -174,8 +174,10 @@ def test_the_lidar_of_a_training_is_that_of_its_rig():
     assert known == KnownLidar((64, 64), 120)
     assert find_recorded_lidar({"vehicle_rig": "kitti_lidar"}) == known
     assert find_recorded_lidar({"vehicle_rig": RIGS["kitti_lidar"].model_dump(mode="json")}) == known
-    assert find_recorded_lidar({"vehicle_rig": "kitti_lidar", "randomise": "streets"}) == KnownLidar(DRAWN_BEAMS, 120)
-    assert find_trained_lidar(OBJECTS, None) == KnownLidar(DRAWN_BEAMS, 120)  # the package's knows many, drawn ones
+    for drawing, beams in (("streets", (40, 128)), ("lidars", (16, 128)), ("wide", (16, 128))):
+        assert find_recorded_lidar({"vehicle_rig": "kitti_lidar", "randomise": drawing}) == KnownLidar(beams, 120)
+    # that of the package is of many, drawn ones
+    assert find_trained_lidar(OBJECTS, None) == KnownLidar(DRAWN_BEAMS["wide"], 120)
 
 
 def test_the_lidar_of_a_road_detector_s_training_is_the_poles():
@@ -186,7 +188,7 @@ def test_the_lidar_of_a_road_detector_s_training_is_the_poles():
 
 
 def test_the_lidars_of_several_recordings_are_one_by_what_all_of_them_say():
-    few, many = KnownLidar((32, 32), 100), KnownLidar(DRAWN_BEAMS, 120)
+    few, many = KnownLidar((32, 32), 100), KnownLidar(DRAWN_BEAMS["streets"], 120)
     assert join_lidars([few, many]) == KnownLidar((32, 128))
     assert join_lidars([many, KnownLidar(None, 120)]) == KnownLidar(None, 120)
     assert join_lidars([]) == KnownLidar()

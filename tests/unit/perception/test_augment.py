@@ -10,8 +10,11 @@ from shapely.geometry import Polygon
 
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects.augment import (
+    DENSE,
     augment,
     cut_out_objects,
+    fade_objects,
+    in_bands,
     in_view,
     keep_returns,
     paste_objects,
@@ -104,6 +107,40 @@ def test_thinning_leaves_out_objects_without_returns_and_ignores_those_with_few(
 def test_a_view_ahead_ends_where_the_camera_does():
     directions = np.array([[1, 0.84, 0], [1, -0.84, 0], [1, 0.86, 0], [1, 0, 0.25], [1, 0, -0.27], [-1, 0, 0]])
     np.testing.assert_array_equal(in_view(directions.astype(np.float32)), [True, True, False, False, True, False])
+
+
+def test_bands_are_as_far_apart_and_as_high_as_asked_for():
+    elevation = np.radians(np.linspace(-25, 5, 30_001))
+    points = np.column_stack((9 * np.cos(elevation), np.zeros_like(elevation), 9 * np.sin(elevation)))
+    kept = in_bands(points.astype(np.float32), 2.0, 0.25, np.random.default_rng(1))
+    assert kept.mean() == pytest.approx(0.125, abs=0.01)
+    begins = np.degrees(elevation)[1:][kept[1:] & ~kept[:-1]]
+    np.testing.assert_allclose(np.diff(begins), 2.0, atol=0.01)
+
+
+def test_objects_lose_their_own_share_of_returns():
+    sample = scene(5, objects=3, per_object=2000)
+    faded = fade_objects(sample, np.array([0.0, 0.5, 0.9]), np.random.default_rng(0))
+    np.testing.assert_allclose(points_in_boxes(faded.points, sample.boxes).sum(1), [2000, 1000, 200], atol=70)
+    assert len(faded.points) == points_in_boxes(faded.points, sample.boxes).sum() + 200  # all of the clutter
+
+
+def test_sparse_sweeps_are_not_thinned():
+    how = Augmentation(turn_rad=0.0, scale=0.0, thin=1.0)
+    dense = Sample(np.tile(scene(3).points, (60, 1)), Boxes.empty())
+    assert len(dense.points) > DENSE > len(scene(3).points)
+    assert len(augment(dense, how, np.random.default_rng(0)).points) < 0.6 * len(dense.points)
+    assert len(augment(scene(3), how, np.random.default_rng(0)).points) == len(scene(3).points)
+
+
+def test_pasted_objects_are_of_sweeps_that_are_as_dense():
+    donors = [scene(7), replace(scene(11), points=np.tile(scene(11).points, (4, 1)))]
+    known, rng = cut_out_objects(donors, CONFIG), np.random.default_rng
+    empty = Sample(donors[0].points[-200:], Boxes.empty())
+    assert len(known.swept) == len(known.boxes) == 24
+    assert len(paste_objects(empty, known, 50, rng(0), 1.5).boxes) == 0
+    assert len(paste_objects(empty, known, 50, rng(0), 2.5).boxes) == 12
+    assert len(paste_objects(empty, known, 50, rng(0)).boxes) > 12
 
 
 def footprint(box: Boxes) -> Polygon:

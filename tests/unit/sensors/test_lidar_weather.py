@@ -8,7 +8,8 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.geometry import pose, transform_points
-from flcav.sensors.lidar.lidar import BEAMS, CarlaReturns, Lidar, build_ray_pattern, point_times_s, scan
+from flcav.sensors.lidar.beams import BEAMS
+from flcav.sensors.lidar.lidar import CarlaReturns, Lidar, build_ray_pattern, point_times_s, scan
 from flcav.sensors.lidar.rolling import Motion
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig
@@ -90,6 +91,13 @@ def test_a_wet_road_is_darker_and_only_the_road(walled: Scene):
     ("hdl64e", 64, 2.0, -24.33),
     ("os1_128", 128, 22.5, -22.5),
     ("vls128", 128, 15.0, -25.0),
+    ("os0_32", 32, 45.0, -45.0),
+    ("os2_64", 64, 11.25, -11.25),
+    ("pandar40", 40, 15.0, -25.0),
+    ("pandar64", 64, 15.0, -25.0),
+    ("pandar128", 128, 15.0, -25.0),
+    ("at128", 128, 12.9, -12.5),
+    ("waymo64", 64, 2.4, -17.6),
 ])  # fmt: skip
 def test_known_beams_by_name(name: str, channels: int, high: float, low: float):
     lidar = parse_config(Lidar, {"beams": name}, "rig.yaml")
@@ -104,6 +112,29 @@ def test_kittis_lidar_has_two_blocks():
     elevation = np.array(BEAMS["hdl64e"].elevations_deg)
     np.testing.assert_allclose(np.diff(elevation[:32]), -1 / 3, atol=1e-3)
     np.testing.assert_allclose(np.diff(elevation[32:]), -0.5, atol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "high", "low"),
+    [
+        ("pandar40", 1 / 3, 2.0, -6.0),
+        ("pandar64", 1 / 6, 2.0, -6.0),
+        ("pandar128", 1 / 8, 2.0, -6.0),
+        ("pandar128", 1 / 2, -6.0, -24.5),
+        ("at128", 1 / 5, 12.9, -12.5),
+    ],
+)
+def test_beams_are_closest_where_the_manual_says(name: str, step: float, high: float, low: float):
+    elevation = np.array(BEAMS[name].elevations_deg)
+    within = elevation[(elevation <= high + 1e-6) & (elevation >= low - 1e-6)]
+    assert len(within) == round((high - low) / step) + 1
+    np.testing.assert_allclose(np.diff(within), -step, atol=1.1e-3)
+
+
+def test_waymo_s_beams_are_three_times_as_far_apart_at_the_bottom():
+    apart = -np.diff(BEAMS["waymo64"].elevations_deg)
+    assert (np.diff(apart) > -2e-3).all()
+    assert apart[-1] / apart[0] == pytest.approx(3, rel=0.05)
 
 
 def test_beams_leave_the_rest_to_the_user():

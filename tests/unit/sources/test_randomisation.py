@@ -9,6 +9,7 @@ from flcav.config import InputError
 from flcav.geometry import inverse
 from flcav.perception.task import KnownLidar
 from flcav.perception.weights import find_recorded_lidar
+from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.randomisation import (
@@ -24,6 +25,7 @@ from flcav.sources.recipe import Recipe
 from flcav.statistics.streams import stream
 from flcav.world.map.parameters import BOUNDARIES
 from flcav.world.map.relief import Relief
+from flcav.world.map.street_furniture import outline_space
 from flcav.world.map.surfaces import make_footprint
 from flcav.world.map.town import Town, load_town
 from flcav.world.shapes import SHAPES
@@ -103,10 +105,28 @@ def test_every_car_has_a_lidar_of_its_own(source: EmbeddedSource):
     assert 2.05 < heights.max() <= 2.13
     assert {lidar.settings.range_m for lidar in drawn} == {120.0}
     assert len({lidar.settings.channels for lidar in drawn}) > 8  # even patterns differ in it
-    assert find_recorded_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS, 120)
+    assert find_recorded_lidar(source.describe()) == KnownLidar(DRAWN_BEAMS["streets"], 120)
     beams = [lidar.settings.channels for lidar in drawn]
-    assert min(beams) >= DRAWN_BEAMS[0]
-    assert max(beams) == DRAWN_BEAMS[1]
+    assert min(beams) >= DRAWN_BEAMS["streets"][0]
+    assert max(beams) == DRAWN_BEAMS["streets"][1]
+
+
+def test_lidars_on_the_market_are_drawn_with_beams_that_fail():
+    nominal = RIGS["kitti_lidar"]
+    drawn = [randomise_rig(nominal, stream(seed, "rig"), "wide").lidars["velodyne"] for seed in range(200)]
+    heights = np.array([lidar.mount.z for lidar in drawn])
+    assert 1.2 <= heights.min() < 1.25
+    assert 2.25 < heights.max() <= 2.3
+    beams = np.array([lidar.settings.channels for lidar in drawn])
+    whole = np.isin(beams, [len(known.elevations_deg) for known in BEAMS.values()])
+    assert 0.1 < (~whole).mean() < 0.4
+    assert 8 <= beams.min() < 16
+    assert beams.max() == DRAWN_BEAMS["wide"][1] == 128
+    assert 0.1 < (beams <= 16).mean() < 0.25  # a VLP-16 in three of 23 patterns
+    known = {known.azimuth_steps for known in BEAMS.values()}
+    steps = {lidar.settings.azimuth_steps for lidar in drawn if lidar.settings.channels == 16}
+    assert steps <= known | {step // 2 for step in known}
+    assert any(step not in known for step in steps)
 
 
 def test_sizes_are_drawn_by_category_and_the_ends_of_cars_are_bowed(source: EmbeddedSource):
@@ -153,3 +173,20 @@ def test_without_the_field_nothing_is_drawn():
     assert source.town is load_town("suburb")
     assert source.vehicle_rigs == [source.recipe.vehicle_rig] * 2
     assert not source.town_files()
+
+
+def test_bays_lie_behind_the_sidewalks_in_rows_and_apart():
+    town = load_town("suburb")
+    drawn = randomise_town(town, stream(3, "streets", "suburb"), "wide")
+    bays = [outline_space(space) for space in drawn.parameters.parking]
+    assert len(bays) > 20
+    closed = shapely.union_all([Polygon(outline) for outline in (*town.roads, *town.sidewalks)])
+    assert not shapely.intersects(bays, closed).any()
+    assert shapely.union_all(bays).area == pytest.approx(sum(bay.area for bay in bays), rel=0.02)
+    near = shapely.distance(bays, closed)
+    assert (near < 0.7).mean() > 0.9
+    houses = [make_footprint(*row[:5]) for row in drawn.buildings.tolist()]
+    assert not shapely.STRtree(houses).query(bays, predicate="intersects").size
+    assert not randomise_town(town, stream(3, "streets", "suburb")).parameters.parking
+    towns = [randomise_town(town, stream(seed, "streets"), "wide").parameters for seed in range(2)]
+    assert {street.parked == 0 for streets in towns for street in streets.streets.values()} == {True, False}

@@ -9,7 +9,7 @@ import yaml
 from pydantic import BaseModel
 
 from flcav.config import Config, _models_in, parse_config
-from flcav.sensors.lidar.lidar import BEAMS
+from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.rig import RIGS
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import CarlaRecipe, Recipe

@@ -2,8 +2,8 @@
 
 Global mirroring, rotation and scaling, and ground-truth sampling are those of SECOND (Yan et al. 2018, sec. 3.2.1). The
 others vary what differs between LiDARs, cars and countries: sizes of objects (random object scaling of Yang et al.,
-"ST3D", CVPR 2021), pose of the sensor, lost returns, field of view. Boxes drawn by annotators have a margin: they begin
-before the first return, and leave out mirrors.
+"ST3D", CVPR 2021), pose of the sensor, number of beams, lost returns, paint of objects, field of view. Boxes drawn by
+annotators have a margin: they begin before the first return, and leave out mirrors.
 
 Ground-truth sampling pastes an object with its returns at the position where it was recorded, so that their density
 fits its distance. It is skipped where its footprint overlaps another; returns of the scene inside its box are removed.
@@ -22,15 +22,22 @@ from flcav.perception.objects.samples import Sample, map_sample
 from flcav.perception.objects.truth import MIN_RETURNS, in_range
 from flcav.perception.ops.boxes import iou
 
+DENSE = 20_000  # returns ahead of a LiDAR of some 40 beams or more
+BETWEEN_DEG, BAND_DEG = (0.8, 2.6), (0.15, 0.35)  # least and most of the angle between bands that are kept, of a band
 VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, down and up: KITTI's left colour camera
 
 
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
     """Return the sample augmented by random amounts drawn from `rng`, within the limits of `how`.
 
-    The order is: cars are resized, and boxes get their margin; the whole sweep is mirrored, rotated and scaled;
-    shifted; tilted and lifted; returns are dropped; the sweep is cut to a camera's field of view.
+    The order is: objects lose returns; a dense sweep is thinned; cars are resized, and boxes get their margin; the
+    whole sweep is mirrored, rotated and scaled; shifted; tilted and lifted; returns are dropped; the sweep is cut to a
+    camera's field of view.
     """
+    if how.fade:
+        sample = fade_objects(sample, rng.uniform(0, how.fade, len(sample.boxes)), rng)
+    if how.thin and rng.random() < how.thin and len(sample.points) > DENSE:
+        sample = keep_returns(sample, in_bands(sample.points, rng.uniform(*BETWEEN_DEG), rng.uniform(*BAND_DEG), rng))
     mirror = -1.0 if how.flip and rng.random() < 0.5 else 1.0
     turn = rng.uniform(-how.turn_rad, how.turn_rad)
     scale = rng.uniform(1 - how.scale, 1 + how.scale)
@@ -127,6 +134,21 @@ def in_view(points: Array32) -> Mask:
     return (x > 0) & (np.abs(y) < side * x) & (z > -down * x) & (z < up * x)
 
 
+def fade_objects(sample: Sample, lost: Array, rng: np.random.Generator) -> Sample:
+    """Return the sample without a share lost[n] of the returns inside box n, drawn by `rng`, as of dark paint."""
+    share = (points_in_boxes(sample.points, sample.boxes) * lost[:, None]).max(axis=0, initial=0.0)
+    return keep_returns(sample, rng.random(len(sample.points)) >= share)
+
+
+def in_bands(points: Array32, between_deg: float, band_deg: float, rng: np.random.Generator) -> Mask:
+    """Return the mask (N,) of points (N, >= 3) in bands of elevation, as of a LiDAR with a beam in each band.
+
+    The bands are `band_deg` high and begin `between_deg` apart; `rng` draws the elevation of the first.
+    """
+    elevation = np.degrees(np.arctan2(points[:, 2], np.hypot(points[:, 0], points[:, 1])))
+    return np.mod(elevation - rng.uniform(0, between_deg), between_deg) < band_deg
+
+
 def keep_returns(sample: Sample, kept: Mask) -> Sample:
     """Return the sample with only the returns in the mask `kept` (N,).
 
@@ -150,13 +172,14 @@ def _count_returns(points: Array32, boxes: Boxes) -> Ints:
 class Cutouts:
     """Ground-truth database: objects with the returns inside their boxes, LiDAR frame."""
 
-    boxes: Boxes  # label = detection class
+    boxes: Boxes  # (B,) label = detection class
     points: tuple[Array32, ...]  # per box (N, 4) x, y, z [m], intensity [0, 1]
+    swept: Ints  # (B,) returns of the sweep that the object is from
 
 
 def cut_out_objects(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
     """Return the ground-truth database of samples: objects in range, of known pose, with enough returns."""
-    boxes, points = [Boxes.empty()], []
+    boxes, points, swept = [Boxes.empty()], [], []
     for sample in samples:
         known = np.ones(len(sample.boxes), dtype=bool) if sample.exact is None else sample.exact
         known_boxes = sample.boxes[known & in_range(sample.boxes, config)]
@@ -164,17 +187,23 @@ def cut_out_objects(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
         enough = inside.sum(1) >= MIN_RETURNS
         boxes.append(known_boxes[enough])
         points += [sample.points[row] for row in inside[enough]]
-    return Cutouts(concatenate(boxes), tuple(points))
+        swept += [len(sample.points)] * int(enough.sum())
+    return Cutouts(concatenate(boxes), tuple(points), np.array(swept, dtype=np.int64))
 
 
-def paste_objects(sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator) -> Sample:
+def paste_objects(
+    sample: Sample, cutouts: Cutouts, most: int, rng: np.random.Generator, alike: float | None = None
+) -> Sample:
     """Return the sample with objects of the ground-truth database pasted in, up to `most` of each class in total.
 
-    Candidates are drawn by `rng` without replacement; those whose footprints overlap another object's are left out.
+    Candidates are drawn by `rng` without replacement; those whose footprints overlap another object's are left out, and
+    so are those of sweeps with more than `alike` times more or fewer returns than the sample (None: of no sweep).
     """
+    ratio = cutouts.swept / max(len(sample.points), 1)
+    fits = np.ones(len(ratio), dtype=bool) if alike is None else (ratio <= alike) & (ratio * alike >= 1)
     drawn = []
     for label in np.unique(cutouts.boxes.label):
-        known = np.flatnonzero(cutouts.boxes.label == label)
+        known = np.flatnonzero((cutouts.boxes.label == label) & fits)
         missing = max(most - np.count_nonzero(sample.boxes.label == label), 0)
         drawn.append(rng.permutation(known)[:missing])
     numbers = np.concatenate([np.zeros(0, dtype=np.int64), *drawn])

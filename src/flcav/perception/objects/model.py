@@ -58,7 +58,10 @@ class Augmentation:
     tilt_rad: Portion = 0.0  # of the sensor, about any horizontal axis
     lift_m: Portion = 0.0  # of the sensor, up or down
     drop: Portion = 0.0  # share of the returns that are dropped
+    fade: Portion = 0.0  # share of an object's returns that are dropped besides, by object
+    thin: Annotated[float, Field(ge=0, le=1)] = 0.0  # probability that a dense sweep is thinned to few beams
     paste: Annotated[int, Field(ge=0)] = 0  # ground-truth sampling: objects per class up to which a sample is filled
+    alike: Annotated[float, Field(ge=1)] | None = None  # their sweeps have up to so many times more or fewer returns
     view: Annotated[float, Field(ge=0, le=1)] = 0.0  # probability of a cut to the field of view of a forward camera
 
 

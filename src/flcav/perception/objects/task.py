@@ -202,7 +202,7 @@ class ObjectsTask(ObjectsOutcomes):
         how = config.augmentation
         sample = samples[index]
         if how.paste:
-            sample = paste_objects(sample, self._cutouts(samples, config), how.paste, rng)
+            sample = paste_objects(sample, self._cutouts(samples, config), how.paste, rng, how.alike)
         return augment(sample, how, rng)
 
     def _cutouts(self, samples: Sequence[Sample], config: SecondConfig) -> Cutouts:

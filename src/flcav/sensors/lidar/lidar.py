@@ -4,10 +4,6 @@ The power received from a surface, relative to that of a white one at normal inc
 P = reflectivity * cos(incidence) / R^2; it is detected above P_min = 0.9 / R_max^2 (LISA, arXiv 2107.07004, section 3).
 Rain, fog and wet roads change P; clear weather needs no computation for them and draws no random numbers.
 
-Beam patterns for `beams: <name>` in a rig are from the makers' data sheets: Velodyne VLP-16 (63-9229), HDL-32E
-(97-0038), VLP-32C (63-9378), HDL-64E (63-HDL64E), VLS-128 "Alpha Prime" (63-9679) at 10 spins per second, and Ouster
-OS1-128 in its mode 1024x10. Elevations are nominal: those of a unit differ by some hundredths of a degree.
-
 CARLA's `sensor.lidar.ray_cast` (its documentation, core sensors, "Lidar sensor") gives a return at range d the
 intensity exp(-a d), independent of the surface. A share of all rays is lost; of the rest, returns with an intensity
 below a limit are lost with a probability that rises linearly from 0 at the limit to its value at intensity 0. Weather
@@ -24,6 +20,7 @@ from flcav.arrays import Array, Array32, Ints, Ints32, Mask
 from flcav.config import Config
 from flcav.geometry import unit_vectors
 from flcav.sensors.lidar.air import add_air_returns, compute_air
+from flcav.sensors.lidar.beams import BEAMS
 from flcav.sensors.lidar.returns import (
     LEVELS,
     QUANTILES,
@@ -36,40 +33,6 @@ from flcav.sensors.lidar.rolling import step_sectors, time_in_spin_s
 from flcav.world.rays.packets import Hits
 from flcav.world.scene import OFFSET_S, Scene
 from flcav.world.weather import Weather
-
-
-class Beams(NamedTuple):
-    """The beam pattern and range of a LiDAR model."""
-
-    elevations_deg: tuple[float, ...]  # per channel, from the highest
-    azimuth_steps: int  # firings per spin
-    range_m: float  # maximum range [m]
-
-
-def _even(high: float, low: float, count: int) -> tuple[float, ...]:
-    return tuple(float(elevation) for elevation in np.linspace(high, low, count).round(3))
-
-
-_HDL64E = (*_even(2.0, 2.0 - 31 / 3, 32), *_even(-8.83, -24.33, 32))  # an upper and a lower block of lasers
-_VLP32C = (
-    *(15.0, 10.333, 7.0, 4.667, 3.333, 2.333),
-    *(1.667, 1.333, 1.0, 0.667, 0.333, 0.0, -0.333, -0.667, -1.0, -1.333, -1.667, -2.0, -2.333, -2.667, -3.0, -3.333),
-    *(-3.667, -4.0, -4.667, -5.333, -6.148, -7.254, -8.843, -11.31, -15.639, -25.0),
-)
-_VLS128 = (
-    *(15.0, 11.75, 9.7, 8.43, 7.58, 6.98, 6.48, 6.08, 5.73, 5.43, 5.18, 4.98),
-    *_even(4.83, -6.5, 104),
-    *(-6.65, -6.85, -7.15, -7.65, -8.352, -9.244, -10.346, -11.742, -13.565, -16.042, -19.582, -25.0),
-)
-
-BEAMS: dict[str, Beams] = {
-    "vlp16": Beams(_even(15.0, -15.0, 16), 1800, 100.0),
-    "hdl32e": Beams(_even(10.67, -30.67, 32), 2170, 100.0),
-    "vlp32c": Beams(_VLP32C, 1800, 200.0),
-    "hdl64e": Beams(_HDL64E, 2083, 120.0),  # as on KITTI's car
-    "os1_128": Beams(_even(22.5, -22.5, 128), 1024, 120.0),
-    "vls128": Beams(_VLS128, 1800, 245.0),
-}
 
 
 class CarlaReturns(Config):

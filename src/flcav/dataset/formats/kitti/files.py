@@ -32,6 +32,7 @@ FOLDERS = ("training", "testing")
 TRUNCATION = np.array([0.0, 0.25, 0.75])  # shares outside the image for the tracking benchmark's levels
 LEVELS = (0, 1, 2, 3)  # of occlusion
 ASSUMED_SIZE = (375, 1242)  # height, width [px] of a missing image: those of most of KITTI's images
+OFF_CENTRE = 0.1  # share of that size by which twice KITTI's principal points differ from it, at most
 MARGIN_PX = 1.0  # KITTI's labels extend up to a pixel beyond the image
 
 
@@ -205,7 +206,7 @@ class KittiFrame:
     calibration: KittiCalibration
     objects: Objects
     image: NDArray[np.uint8]  # (H, W, 3) red, green, blue; (0, 0, 3) where there is none
-    size: tuple[int, int]  # height, width of the image [px]; `ASSUMED_SIZE` where there is none
+    size: tuple[int, int]  # height, width of the image [px]; by `assume_size` where there is none
 
 
 class KittiFolder:
@@ -245,9 +246,9 @@ class KittiFolder:
         """Return the files of the frames' point clouds."""
         return [find_part(self.folder, "velodyne", name) for name in self.names]
 
-    def count_bare(self) -> int:
-        """Return the number of frames without an image."""
-        return sum(not (self.folder / PICTURES / f"{name}.{SUFFIXES[PICTURES]}").is_file() for name in self.names)
+    def has_image(self, name: str) -> bool:
+        """Return whether the frame `name` has an image."""
+        return find_part(self.folder, PICTURES, name).is_file()
 
     def frame(self, i: int) -> KittiFrame:
         """Return frame `i`; raises `InputError` for a malformed file, or a label that does not fit the image."""
@@ -257,8 +258,22 @@ class KittiFolder:
         objects = read_objects(paths["label_2"], calibration, levels=is_drive(self.folder))
         height, width = image.shape[:2] if image.size else (None, None)
         check_objects(objects, width, height, paths["label_2"])
-        size = ASSUMED_SIZE if height is None or width is None else (height, width)
+        size = assume_size(calibration, objects) if height is None or width is None else (height, width)
         return KittiFrame(self.names[i], read_points(paths["velodyne"]), calibration, objects, image, size)
+
+
+def assume_size(calibration: KittiCalibration, objects: Objects) -> tuple[int, int]:
+    """Return the height and width [px] of a missing image: `ASSUMED_SIZE`, unless the camera's is another.
+
+    Another camera has its principal point elsewhere than at about half of that size; the point is taken to be the
+    middle of its image, which is as large as the rectangles of the labels at least.
+    """
+    assumed, centred = np.array(ASSUMED_SIZE), 2 * calibration.image_from_camera[[1, 0], 2] + 1
+    if (np.abs(centred - assumed) <= OFF_CENTRE * assumed).all():
+        return ASSUMED_SIZE
+    corners = np.concatenate((objects.rectangle, objects.unlabelled))[:, [3, 2]]
+    height, width = np.ceil(np.maximum(centred, corners.max(axis=0, initial=0.0) + 1)).astype(int).tolist()
+    return height, width
 
 
 def check_objects(objects: Objects, width: int | None, height: int | None, path: Path) -> None:
