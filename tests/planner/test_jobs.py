@@ -83,7 +83,16 @@ def number(page: Any, selector: str) -> int:
 
 def show_best_three(page: Any, hand: Hand) -> None:
     hand.fill(page.get_by_label("The best with"), "3")
-    wait_for(page, "#best", "with 3 sensors")
+    wait_for_optimum(page, 3)
+
+
+def wait_for_optimum(page: Any, sensors: int) -> None:
+    """Wait until so many sensors stand, and as much is covered as they can."""
+    wait_for(page, "#best", f"with {sensors} sensors")
+    page.wait_for_function(
+        """() => document.querySelector("#best").innerText.split(":")[1].match(/\\d+/)[0]
+            === document.querySelector("#covered").innerText"""
+    )
 
 
 def three_sensors_within_a_price(page: Any, hand: Hand) -> str:
@@ -101,7 +110,7 @@ def the_value_of_a_fourth(page: Any, hand: Hand) -> str:
     wait_for(page, "#next", "With one more")
     told = page.locator("#next").inner_text()
     hand.press(page.locator(".step").nth(3))
-    wait_for(page, "#best", "with 4 sensors")
+    wait_for_optimum(page, 4)
     assert f"+{number(page, '#covered') - three}" in told
     return told
 
