@@ -13,16 +13,15 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import Json
-from flcav.experiments.comparison import average_arms, compare_arms
+from flcav.experiments.comparison import average_arms, close_gap, compare_arms
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.runs.analysis.histories import gap_closed
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import EDGE, MAIN, PRETRAIN, RunRecipe
 from flcav.runs.results.run import Run
 from flcav.runs.results.training import LabelQuality
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record, select
@@ -89,12 +88,11 @@ def compare_labels(recipe: RunRecipe, runs: Sequence[Run]) -> DistillationResult
     """Return the results of the arms of `recipe`, from a run of each seed."""
     seeds = {str(run.recipe.seed): {name: _reached(run, *arm) for name, arm in ARMS.items()} for run in runs}
     ap50 = attrgetter("ap50")
-    shares = [gap_closed(*(seed[name].ap50 for name in (PRETRAINED, TRACKS, JOINED))) for seed in seeds.values()]
     return DistillationResult(
         seeds=seeds,
         ap50=average_arms(seeds, ARMS, ap50),
         differences=compare_arms(seeds, COMPARED, ap50),
-        closed=mean_over_seeds(shares),
+        closed=close_gap(seeds, PRETRAINED, TRACKS, JOINED, ap50),
         recipe=recipe.model_dump(mode="json", exclude={"seed"}),
         provenance=provenance(),
     )

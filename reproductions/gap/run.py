@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from flcav.config import Json
-from flcav.experiments.comparison import average_arms, compare_arms, mean_difference, tabulate_seeds
+from flcav.experiments.comparison import average_arms, close_gap, compare_arms, mean_difference, tabulate_seeds
 from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
 from flcav.experiments.megabytes import (
     AtBytes,
@@ -31,12 +31,11 @@ from flcav.interface.wording import plural
 from flcav.network.ledger import Ledger
 from flcav.report import style
 from flcav.report.charts import figures
-from flcav.runs.analysis.histories import gap_closed
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import LEDGER
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.statistics.verdicts import describe_means, tabulate_means
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record, select
@@ -209,12 +208,8 @@ class GapResult(Record):
 
 def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]) -> GapResult:
     """Return the results of the arms of `recipe`, from a run of each seed and its `curves` of accuracy by bytes."""
-    seeds = {str(run.recipe.seed): {name: _reached(run, name, TOWN) for name in ARMS} for run in runs}
-    home = {str(run.recipe.seed): {name: _reached(run, name, HOME) for name in AT_HOME} for run in runs}
-
-    def closed(arm: str, field: str) -> MeanOverSeeds:
-        scores = [[getattr(seed[name], field) for name in (PRETRAINED, arm, TRUTH)] for seed in seeds.values()]
-        return mean_over_seeds([gap_closed(*values) for values in scores])
+    seeds = {str(run.recipe.seed): {name: read_arm(run, *ARMS[name], TOWN) for name in ARMS} for run in runs}
+    home = {str(run.recipe.seed): {name: read_arm(run, *ARMS[name], HOME) for name in AT_HOME} for run in runs}
 
     ap50, ap70 = attrgetter("ap50"), attrgetter("ap70")
     return GapResult(
@@ -222,8 +217,8 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]
         home=home,
         ap50=average_arms(seeds, ARMS, ap50),
         ap70=average_arms(seeds, ARMS, ap70),
-        closed50={arm: closed(arm, "ap50") for arm in ARMS},
-        closed70={arm: closed(arm, "ap70") for arm in ARMS},
+        closed50={arm: close_gap(seeds, PRETRAINED, arm, TRUTH, ap50) for arm in ARMS},
+        closed70={arm: close_gap(seeds, PRETRAINED, arm, TRUTH, ap70) for arm in ARMS},
         differences=compare_arms(seeds, COMPARED, ap50),
         home50={arm: mean_difference(home, arm, PRETRAINED, ap50) for arm in AT_HOME[1:]},
         home70={arm: mean_difference(home, arm, PRETRAINED, ap70) for arm in AT_HOME[1:]},
@@ -233,8 +228,8 @@ def compare_gap(recipe: RunRecipe, runs: Sequence[Run], curves: Sequence[Curves]
     )
 
 
-def _reached(run: Run, name: str, town: str) -> GapArm:
-    arm, stage = ARMS[name]
+def read_arm(run: Run, arm: str, stage: str, town: str) -> GapArm:
+    """Return AP of an arm of a run after a stage, on the test frames of a town, and the quality of its labels."""
     test = run.test(arm=arm, stage=stage, region=town, task=TASK)
     ap70 = test.numbers["AP70"]
     assert ap70 is not None  # the town has targets

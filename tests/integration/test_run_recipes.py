@@ -22,6 +22,7 @@ from flcav.perception.weights import load_network
 from flcav.report.pages.run_page import page, write_report
 from flcav.reproductions.gap.run import IN_BYTES, UPLOADED, trace_bytes
 from flcav.reproductions.megabytes.run import FEDERATED, MORE, SWEEPS, compare_megabytes, trace_seed
+from flcav.reproductions.radio_labels.run import ARMS, compare_labels
 from flcav.runs.analysis.histories import ORIGIN, HistoryOrigin
 from flcav.runs.engine import Step, ignore_steps, run_side_by_side
 from flcav.runs.forecast import forecast_run
@@ -134,6 +135,19 @@ def test_compressed_sweeps_are_in_the_ledger_as_they_are_sent(tmp_path: Path) ->
     assert 1 < seed.bytes_per_return < 3
     assert seed.curves[SWEEPS][1].boxes == seed.boxes  # the one frame that there is
     assert compare_megabytes(recipe, {"31": seed}).curves[SWEEPS][1].mb == pytest.approx(sum(up) / 1e6)
+
+
+def test_labels_by_radio_are_compared_with_ground_truth(tmp_path: Path) -> None:
+    recipe = shrunk("radio_labels")
+    results = compare_labels(recipe, [run(recipe, tmp_path)])
+    (arms,) = results.seeds.values()
+    assert [*arms] == [*ARMS]
+    start, end = arms["pretrained"].ap50, arms["ground truth"].ap50
+    for name, closed in results.closed50.items():
+        assert closed.mean == pytest.approx((arms[name].ap50 - start) / (end - start) if end != start else 0)
+    added = results.differences["road labels, tracks and messages - tracks and messages"].mean
+    assert added == pytest.approx(arms["road labels, tracks and messages"].ap50 - arms["tracks and messages"].ap50)
+    assert len(results.sentences()) == 3 + 2 * ("tracks and messages" in results.recall)
 
 
 def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:

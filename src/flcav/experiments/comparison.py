@@ -3,6 +3,7 @@
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TypeVar
 
+from flcav.runs.analysis.histories import gap_closed
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.statistics.verdicts import Claim, judge, judge_means
 from flcav.storage.markdown import format_table
@@ -22,6 +23,11 @@ def average_arms(
 def mean_difference(seeds: Seeds[ArmT], after: str, before: str, value: Callable[[ArmT], float]) -> MeanOverSeeds:
     """Return the mean over seeds of the paired difference of a value between two arms, `after` - `before`."""
     return mean_over_seeds([value(seed[after]) - value(seed[before]) for seed in seeds.values()])
+
+
+def close_gap(seeds: Seeds[ArmT], start: str, arm: str, end: str, value: Callable[[ArmT], float]) -> MeanOverSeeds:
+    """Return the mean over seeds of the share of the gap between the arms `start` and `end` that an arm closes."""
+    return mean_over_seeds([gap_closed(*(value(seed[name]) for name in (start, arm, end))) for seed in seeds.values()])
 
 
 def compare_arms(
