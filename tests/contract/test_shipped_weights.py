@@ -1,5 +1,6 @@
 """Weights that come with the package: small, loadable, and their cards say how they came about."""
 
+import shutil
 from pathlib import Path
 from typing import get_type_hints
 
@@ -10,7 +11,7 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.perception.networks import resolve_network
 from flcav.perception.tasks import TASKS, task_named
-from flcav.perception.training.checkpoint import settings_of
+from flcav.perception.training.checkpoint import find_finished_card, settings_of
 from flcav.perception.weights import LICENCE, SHIPPED, find_shipped, read_card, to_arrays
 
 EACH_MB, ALL_MB = 4.0, 12.0
@@ -62,3 +63,11 @@ def test_where_there_are_none_one_sentence_says_so(task, tmp_path, capsys):
     with pytest.raises(SystemExit, match="2"):
         run(["infer", task.name, str(tmp_path)])
     assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_mean_of_networks_is_not_overwritten(tmp_path):
+    shipped = find_shipped(task_named("objects"))
+    for path in (shipped, shipped.with_name("card.md")):
+        shutil.copy(path, tmp_path)
+    with pytest.raises(InputError, match="a mean of the weights of several trainings; choose another folder"):
+        find_finished_card(tmp_path / shipped.name, None)

@@ -135,11 +135,14 @@ def part_of(entry: DataEntry) -> DataIdentity:
 def find_finished_card(path: Path, asked: TrainingSettings) -> Card | None:
     """Return the card of the weights at `path`; None if there is no such file.
 
-    Raises `InputError` if they were trained with other settings than `asked`, so that they are not overwritten.
+    Raises `InputError` if they were trained with other settings than `asked`, or are a mean of several trainings'
+    weights, so that they are not overwritten.
     """
     if not path.exists():
         return None
     card = read_card(path)
+    if "averaged" in card.training:
+        raise InputError(f"{path}: a mean of the weights of several trainings; choose another folder")
     if different := asked.differences(settings_of(card)):
         anew = ", where it begins anew: the learning rate's schedule spans all epochs" if "epochs" in different else ""
         raise InputError(
