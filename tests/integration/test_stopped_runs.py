@@ -128,7 +128,11 @@ def test_runs_are_compared_on_the_same_frames(finished: Path, tmp_path: Path, mo
 
     def again(name: str) -> bool:
         return (
-            "-fl-" in name or name == "look" or name.startswith(("test-", "rounds-", "plan-", "grid-edge", "ring-edge"))
+            "-fl-" in name
+            or name == "look"
+            or name.startswith(
+                ("test-", "rounds-", "plan-", "grid-edge", "ring-edge", "grid-errors-after", "ring-errors-after")
+            )
         )
 
     work = without(finished, tmp_path / "own", again)

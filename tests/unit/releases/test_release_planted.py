@@ -30,7 +30,7 @@ RECIPE = {
     "town": "suburb",
     "weather": {"classes": ["clear", "heavy_rain", "fog"]},
     "seed": 9431,
-    "scenes": 40,
+    "scenes": 60,
     "spins_per_scene": 1,
     "cavs": 3,
     "warmup_s": 45.0,
