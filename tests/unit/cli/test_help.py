@@ -30,7 +30,7 @@ def commands(command: click.Command, path: tuple[str, ...] = ()) -> Commands:
         yield from commands(each, (*path, name))
 
 
-WIDE = 700  # [columns] of a terminal in which no text is wrapped
+WIDE = 900  # [columns] of a terminal in which no text is wrapped
 EVERY = dict(commands(typer.main.get_command(app)))
 each_command = pytest.mark.parametrize("path", EVERY, ids=lambda path: " ".join(path) or "flcav")
 
