@@ -130,7 +130,7 @@ class MeasuresMore(Protocol):
 
 @dataclass(frozen=True)
 class Counted:
-    """What a network found of a test's targets, as numbers of objects."""
+    """Numbers of a test's objects that a network found, missed and made up."""
 
     noun: str  # of several targets, such as "cars"
     targets: int

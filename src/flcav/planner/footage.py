@@ -1,4 +1,4 @@
-"""What a finished run recorded, for the page: drives, a sweep before and after training, a camera picture.
+"""Recordings of a finished run, for the page: drives, a sweep before and after training, a camera picture.
 
 Everything is read from the run's folder when it is asked for, and is empty where the folder no longer has it.
 """

@@ -1,4 +1,4 @@
-"""What the planner's page asks, as typed bodies of requests: none names a path outside what was opened."""
+"""Typed bodies of the requests of the planner's page: none names a path outside what was opened."""
 
 from typing import Annotated
 
