@@ -47,7 +47,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
         **dict.fromkeys(("--dry", "--jobs", "--seeds", "--engine", "--runtime", "--stale"), ALWAYS),
         "--fleet": ("flower",),
     },
-    "demo": dict.fromkeys(("--seed", "--recipe", "--seeds", "--jobs", "--engine", "--stale"), ALWAYS),
+    "demo": dict.fromkeys(("--seed", "--recipe", "--seeds", "--retrainings", "--jobs", "--engine", "--stale"), ALWAYS),
     "compare": dict.fromkeys(("--data", "--task", "--agents"), ALWAYS),
     "federate": {**dict.fromkeys(("--arm", "--jobs", "--runtime", "--stale"), ALWAYS), "--fleet": ("flower",)},
     "fleet init": {"--host": ALWAYS},

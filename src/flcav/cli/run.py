@@ -1,7 +1,7 @@
 """`flcav run`, `flcav demo`, `flcav compare`: run a recipe through the three stages, and compare two runs."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -48,7 +48,7 @@ def run(
         raise InputError("--out is missing: the folder of the run; --dry says what it would take")
     options: RunOptions = {"jobs": jobs, "stale": stale.value, "engine": engine.value}
     options |= {"runtime": runtime.value, "fleet": fleet}
-    return _run(recipe, None, out, seeds, "run", options)
+    return _run(recipe, {}, out, seeds, "run", options)
 
 
 def _forecast(path: Path) -> Answer:
@@ -74,17 +74,23 @@ def demo(
     seed: int | None = typer.Option(None, "--seed", min=0, help="Seed of traffic, sensors and training, if not 1."),
     recipe: Path = typer.Option(Path("recipes/runs/demo.yaml"), "--recipe", help="Another run recipe."),
     seeds: int = SEEDS,
+    retrainings: int | None = typer.Option(
+        None, "--retrainings", min=0, help="Further trainings of each seed on the same frames, if not the recipe's."
+    ),
     jobs: int = JOBS,
     engine: EngineName = ENGINE,
     stale: Stale = STALE,
 ) -> None:
     """Run recipes/runs/demo.yaml: pretraining, roadside sensors, edge FL and cloud FL on three towns."""
-    answer = _run(recipe, seed, out, seeds, "demo", {"jobs": jobs, "stale": stale.value, "engine": engine.value})
+    options: RunOptions = {"jobs": jobs, "stale": stale.value, "engine": engine.value}
+    answer = _run(recipe, {"seed": seed, "retrainings": retrainings}, out, seeds, "demo", options)
     for line in [*answer][1:]:
         echo(line)
 
 
-def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, options: "RunOptions") -> Answer:
+def _run(
+    path: Path, changes: Mapping[str, int | None], out: Path, seeds: int, title: str, options: "RunOptions"
+) -> Answer:
     use_threads(1)
     from flcav.cli.steps import live_steps
     from flcav.report.pages.run_page import write_report
@@ -97,9 +103,8 @@ def _run(path: Path, seed: int | None, out: Path, seeds: int, title: str, option
 
     check_writable(out)
     found = find_recipe(path)
-    asked = load_run_recipe(found)
-    if seed is not None:
-        asked = asked.model_copy(update={"seed": seed})
+    given = {name: value for name, value in changes.items() if value is not None}
+    asked = load_run_recipe(found).model_copy(update=given)
     with live_steps(title) as notify:
         options = {**options, "beside": found.parent, "notify": notify}
         if seeds == 1:
