@@ -66,7 +66,7 @@ def main() -> None:
         truths.append(asked_of(frame, network.config))
         trace = split.data.trace(scene)
         assert trace is not None
-        able = trace.actor[draw_connected(trace, 1.0, scene)]
+        able = trace.actor[draw_connected(trace, MessageSettings(share=1.0), scene)]
         drives.append(np.isin(frame.annotations.track[ground_truth(frame, network.config).target], able))
         sweeps, world_from_lidar = read_window(network, split, i)
         bare = [replace(sweep, boxes=Boxes.empty()) for sweep in sweeps]

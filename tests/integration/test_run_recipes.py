@@ -22,6 +22,7 @@ from flcav.perception.weights import load_network
 from flcav.report.pages.run_page import page, write_report
 from flcav.reproductions.gap.run import IN_BYTES, UPLOADED, trace_bytes
 from flcav.reproductions.megabytes.run import FEDERATED, MORE, SWEEPS, compare_megabytes, trace_seed
+from flcav.reproductions.people.run import compare_classes
 from flcav.reproductions.radio_labels.run import ARMS, compare_labels
 from flcav.runs.analysis.histories import ORIGIN, HistoryOrigin
 from flcav.runs.engine import Step, ignore_steps, run_side_by_side
@@ -148,6 +149,22 @@ def test_labels_by_radio_are_compared_with_ground_truth(tmp_path: Path) -> None:
     added = results.differences["road labels, tracks and messages - tracks and messages"].mean
     assert added == pytest.approx(arms["road labels, tracks and messages"].ap50 - arms["tracks and messages"].ap50)
     assert len(results.sentences()) == 3 + 2 * ("tracks and messages" in results.recall)
+
+
+def test_classes_are_compared_one_by_one(tmp_path: Path) -> None:
+    recipe = shrunk("people")
+    done = run(recipe, tmp_path)
+    results = compare_classes(recipe, [done])
+    (arms,) = results.seeds.values()
+    numbers = done.test(arm="heard", stage="edge", region="grid", task="objects").numbers
+    for kind, name in (("Car", "cars"), ("Pedestrian", "pedestrians"), ("Cyclist", "cyclists")):
+        assert arms["tracks and messages"].ap50[kind] == (numbers[f"AP50 {kind}"] or 0.0)
+        gained = arms["tracks and messages"].ap50[kind] - arms["tracks"].ap50[kind]
+        assert results.differences[kind]["tracks and messages - tracks"].mean == pytest.approx(gained)
+        assert any(sentence.startswith(f"*{name}, ") for sentence in results.sentences())
+    (labels,) = done.arms["heard"].stages[0].labels or ()
+    assert sum(each.targets for each in labels.by_class or ()) == labels.targets
+    assert sum(each.right for each in labels.by_class or ()) == pytest.approx((labels.recall or 0) * labels.targets)
 
 
 def test_a_forecast_refuses_what_the_run_would(tmp_path: Path) -> None:

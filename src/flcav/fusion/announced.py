@@ -17,8 +17,9 @@ from flcav.network.awareness import ELLIPSE, AwarenessMessages
 
 AGENT = "messages"  # name of the report of announced vehicles
 HEARD_S = 1.0  # time before and after a frame within which messages count
-HEIGHT_M = 1.55  # of an announced vehicle, until returns tell: a message has none
+HEIGHT_M, PERSON_M = 1.55, 1.73  # of an announced vehicle and person, until returns tell: a message has none
 DEVIATION = np.array((0.0, 0.0, 0.2, 0.1, 0.1, 0.2, 0.0))  # of an announced box, beside what is stated
+PERSON_DEVIATION_M = 0.3  # of length and width, which a person's message does not state
 HEADED_RAD = 0.03  # standard deviation of a heading up to which it is kept
 MOTION_M = 0.1  # error of a position that is continued between messages
 SHIFT_M = 0.15  # step of the shifts that are tried
@@ -47,9 +48,11 @@ def place_senders(
     """Return where the senders of messages are at `at_s` [s].
 
     A position is that of the two messages nearest in time, each continued at its velocity and weighted by nearness.
-    ground: heights (N,) [m] at places (N, 2) of the world. label: (N,) classes of senders (N,).
+    ground: heights (N,) [m] at places (N, 2) of the world. label: (N,) classes of senders (N,): cars, or persons.
     """
     senders = np.unique(messages.sender)
+    classes = label(senders)
+    person = classes != "Car"
     rows, variance = np.zeros((len(senders), 7)), np.tile(DEVIATION**2, (len(senders), 1))
     velocity = np.zeros((len(senders), 2))
     for number, sender in enumerate(senders):
@@ -58,15 +61,16 @@ def place_senders(
         near = np.argsort(np.abs(since), kind="stable")[:2]
         weight = 1 / (np.abs(since[near]) + 0.05)
         along = heading_vectors(own.heading[near])
-        size = own.size[near[0]] - 0.05  # the middle of what an announced tenth stands for
+        size = own.size[near[0]] - (0.0 if person[number] else 0.05)  # the middle of what an announced tenth stands for
         center = own.front[near] + along * (own.speed[near] * since[near] - size[0] / 2)[:, None]
         rows[number, :2] = weight @ center / weight.sum()
-        rows[number, 3:] = (*size, HEIGHT_M, own.heading[near[0]])
+        rows[number, 3:] = (*size, PERSON_M if person[number] else HEIGHT_M, own.heading[near[0]])
         variance[number, :2] = own.deviation_m[near[0]] ** 2
         variance[number, 6] = own.turn_rad[near[0]] ** 2
         velocity[number] = along[0] * own.speed[near[0]]
-    rows[:, 2] = ground(rows[:, :2]) + HEIGHT_M / 2
-    boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], label(senders), np.ones(len(senders)), variance)
+    rows[:, 2] = ground(rows[:, :2]) + rows[:, 5] / 2
+    variance[person, 3:5] = PERSON_DEVIATION_M**2
+    boxes = Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], classes, np.ones(len(senders)), variance)
     return Announced(BoxReport(AGENT, at_s, boxes), velocity, senders)
 
 

@@ -84,13 +84,15 @@ def track_objects(
     told = np.full(len(average.boxes), -1)  # row of the announced vehicle
     if announced:
         told[average.member[len(seen_by)]] = np.arange(len(announced.report.boxes))
-        told = told[kept]
+    told = told[kept]
+    if announced:
         velocity[alone & (told >= 0)] = announced.velocity[told[alone & (told >= 0)]]
     lost = np.zeros(len(rows), np.bool_)
     assert boxes.variance is not None
     deviation_m = np.sqrt(boxes.variance[:, 0])
     current = [min(sweeps, key=lambda sweep: abs(sweep.time_s - at_s))]
-    for number in np.flatnonzero(boxes.size[:, 0] >= VEHICLE_M):
+    rigid = boxes.size[:, 0] >= VEHICLE_M
+    for number in np.flatnonzero(rigid | (told >= 0)):
         if alone[number]:
             near, _ = gather_returns(rows[number], velocity[number], sweeps, at_s)
             rows[number, :2] += shift_onto_returns(rows[number], near, deviation_m[number])
@@ -103,7 +105,8 @@ def track_objects(
             rows[number, 3:5] += 2 * deviation_m[number]
             continue
         own = announced.report.boxes[told[[number]]] if announced and told[number] >= 0 else None
-        rows[number] = fit_vehicle(rows[number], returns, origin, own)
+        if rigid[number]:
+            rows[number] = fit_vehicle(rows[number], returns, origin, own)
         if own is not None:
             rows[number, :2] = keep_in_ellipse(rows[number, :2], own)
         if own is not None or alone[number]:

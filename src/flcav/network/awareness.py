@@ -1,6 +1,7 @@
 """Cooperative awareness messages (CAM, ETSI EN 302 637-2): which vehicles of a trace send them, when, and who hears.
 
-The size of a collective perception message (ETSI TS 103 324) is here, too.
+Vulnerable road users' awareness messages (VAM, ETSI TS 103 300-3), which the phones of pedestrians and cyclists send,
+follow the same rules with a longer period; the size of a collective perception message (TS 103 324) is here, too.
 
 A message has the fields of the basic container and of the vehicle's containers, in the units and ranges of ETSI TS
 102 894-2; `CAM_BITS` lists their bits in unaligned PER. The reference position is the middle of the vehicle's front on
@@ -8,7 +9,7 @@ the ground. A message is sent as soon as the vehicle has moved, turned or change
 (clause 6.1.3; without the shorter period that the rule keeps for three more messages).
 
 A trace has the instants of a recording's spins. Motion between neighbouring spins is interpolated; before the first of
-them it continues backwards for a second, so that a message precedes every spin.
+them it continues backwards for the longest period, so that a message precedes every spin.
 """
 
 import math
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.interpolate import CubicHermiteSpline
 
-from flcav.arrays import Array, Ints, Mask
+from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import Config
 from flcav.geometry import heading_vectors
 from flcav.network.radio import budget as laws
@@ -31,8 +32,10 @@ from flcav.world.rays.embree import Assembly
 from flcav.world.trace import Trace
 
 SENDERS = ("car", "van", "truck", "bus", "motorcycle")  # station types 5, 7, 8, 6, 4
+PEOPLE_M = {"pedestrian": (0.8, 0.6), "bicycle": (1.8, 0.6)}  # usual length and width: their messages say none
 DRIVING_MPS = 0.5  # vehicles that never drive faster in a trace are parked, and send nothing
 STEP_S, SHORTEST_S, LONGEST_S = 0.1, 0.1, 1.0  # grid of times; least and greatest time between two messages
+PEOPLE_S = 5.0  # greatest time between two messages of a pedestrian or cyclist
 MOVED_M, TURNED_RAD, SPED_MPS = 4.0, np.radians(4.0), 0.5  # changes since the last message that trigger one
 GAP_S = 0.5  # longest time between spins through which motion is interpolated
 WHITE = 0.2  # share of the position's standard deviation that is drawn for each message; the rest is one draw a drive
@@ -60,6 +63,19 @@ CAM_BITS = {  # of the message without low-frequency container
     "longitudinal acceleration, its confidence": 9 + 7,
     "curvature, its confidence, how it was computed": 11 + 3 + 1 + 2,
     "yaw rate, its confidence": 16 + 4,
+}
+VAM_BITS = {  # of a pedestrian's or cyclist's message; its profile, due every two seconds, is in each
+    "header: version, kind, station": 8 + 8 + 32,
+    "generation time": 16,
+    "optional and extensible parts": 1 + 4 + 1 + 1 + 11 + 1 + 2,
+    "station type": 8,
+    "latitude, longitude": 31 + 32,
+    "confidence ellipse: semi-axes, orientation": 12 + 12 + 12,
+    "altitude, its confidence": 20 + 4,
+    "heading, its confidence": 12 + 7,
+    "speed, its confidence": 14 + 7,
+    "longitudinal acceleration, its confidence": 9 + 7,
+    "profile": 1 + 2 + 3,
 }
 LIGHT_BITS = 1 + 4 + 8 + 6 + PATH_POINTS * (1 + 18 + 18 + 15 + 1 + 16)  # role, lights, path of points with their times
 CPM_BITS = {  # of a collective perception message without objects: TS 103 324, of a vehicle
@@ -95,6 +111,8 @@ class MessageSettings(Config):
         default=0.5, ge=0, le=10
     )  # standard deviation of announced positions, along x and along y; nearly all of it is one draw for each drive
     heading_deg: float = Field(default=0.5, ge=0, le=45)  # standard deviation of announced headings
+    people: float = Field(default=0.0, ge=0, le=1)  # share of pedestrians and cyclists whose phones announce them
+    people_m: float = Field(default=2.0, ge=0, le=10)  # standard deviation of a phone's positions, along x and along y
     perceived: bool = True  # whether those that record also send what they detect (TS 103 324)
     lost: float = Field(default=0.0, ge=0, le=1)  # share of messages lost to others on the air
     radio: Radio = Radio()  # of both ends
@@ -121,15 +139,23 @@ class AwarenessMessages:
         return AwarenessMessages(*(values[rows] for values in vars(self).values()))
 
 
-def draw_connected(trace: Trace, share: float, *names: str) -> Ints:
-    """Return the actors of a trace that send messages: each vehicle that drives, with the probability `share`.
+def draw_connected(trace: Trace, how: MessageSettings, *names: str) -> Ints:
+    """Return the actors of a trace that send messages: vehicles that drive, and pedestrians and cyclists.
 
-    `names` and the actor's name the random stream, so that a larger share adds senders to those of a smaller one.
+    Each does with the probability `share`, or `people`. `names` and the actor's name the random stream, so that a
+    larger share adds senders to those of a smaller one.
     """
     fastest = np.linalg.norm(np.nan_to_num(trace.velocity), axis=2).max(axis=0, initial=0.0)
-    able = np.flatnonzero(np.isin(trace.category, SENDERS) & (fastest > DRIVING_MPS))
-    drawn = [stream(0, "connected", *names, str(trace.actor[row])).random() < share for row in able]
+    drives = np.isin(trace.category, SENDERS) & (fastest > DRIVING_MPS)
+    share = np.where(is_person(trace.category), how.people, np.where(drives, how.share, 0.0))
+    able = np.flatnonzero(share > 0)
+    drawn = [stream(0, "connected", *names, str(trace.actor[row])).random() < share[row] for row in able]
     return able[np.array(drawn, dtype=bool)]
+
+
+def is_person(category: Words) -> Mask:
+    """Return (N,) which actors are pedestrians or cyclists, by their categories."""
+    return np.isin(category, list(PEOPLE_M))
 
 
 def send_messages(trace: Trace, senders: Sequence[int] | Ints, how: MessageSettings, *names: str) -> AwarenessMessages:
@@ -144,44 +170,49 @@ def send_messages(trace: Trace, senders: Sequence[int] | Ints, how: MessageSetti
 
 def _messages_of(trace: Trace, sender: int, how: MessageSettings, names: Sequence[str]) -> Iterator[tuple[float, ...]]:
     """Yield the eleven numbers of each message of a sender, in the order of the fields of `AwarenessMessages`."""
-    name = str(trace.actor[sender])
-    rng, bias, stated_m = stream(0, "announced", *names, name), draw_bias(how, *names, name), state_deviation(how)
+    name, category = str(trace.actor[sender]), str(trace.category[sender])
+    person = category in PEOPLE_M
+    longest_s, off_m = (PEOPLE_S, how.people_m) if person else (LONGEST_S, how.position_m)
+    rng, bias, stated_m = stream(0, "announced", *names, name), draw_bias(off_m, *names, name), state_deviation(off_m)
     turn_rad = np.radians(min(max(math.ceil(10 * WITHIN * how.heading_deg), 1), 125) / 10 / WITHIN)
-    size = np.ceil(trace.size[sender, :2] * 10 - 1e-6) / 10
-    for times_s, place, yaw, speed in _pieces(trace, sender):
-        sent = find_sending_times(times_s, place, yaw, speed, int(rng.integers(round(LONGEST_S / STEP_S))))
+    size = np.array(PEOPLE_M[category]) if person else np.ceil(trace.size[sender, :2] * 10 - 1e-6) / 10
+    for times_s, place, yaw, speed in _pieces(trace, sender, longest_s):
+        first = int(rng.integers(round(longest_s / STEP_S)))
+        sent = find_sending_times(times_s, place, yaw, speed, first, longest_s)
         light_s = certified_s = -np.inf
         for row in sent:
             light, certified = times_s[row] - light_s >= LIGHT_S, times_s[row] - certified_s >= CERTIFICATE_S
             light_s, certified_s = (times_s[row] if light else light_s), (times_s[row] if certified else certified_s)
-            off = bias + how.position_m * WHITE * rng.standard_normal(2)
-            front = place[row] + heading_vectors(yaw[row]) * trace.size[sender, 0] / 2 + off
+            off = bias + off_m * WHITE * rng.standard_normal(2)
+            front = place[row] + heading_vectors(yaw[row]) * (size if person else trace.size[sender])[0] / 2 + off
             told = np.degrees(yaw[row]) + how.heading_deg * rng.standard_normal()
             fast = max(speed[row] + SPEED_MPS * rng.standard_normal(), 0.0)
             yield (
                 *(sender, times_s[row], *np.round(front / POSITION_M) * POSITION_M, stated_m),
                 *(np.radians(round(told * 10) / 10), turn_rad, round(min(fast, 163.82) * 100) / 100, *size),
-                message_bytes(light=bool(light), certified=bool(certified)),
+                message_bytes(light=bool(light), certified=bool(certified), person=person),
             )
 
 
-def draw_bias(how: MessageSettings, *names: str) -> Array:
-    """Return the constant part (2,) [m] of the position error of a vehicle's drive; `names` end with the vehicle's."""
-    return how.position_m * math.sqrt(1 - WHITE**2) * stream(0, "bias", *names).standard_normal(2)
+def draw_bias(position_m: float, *names: str) -> Array:
+    """Return the constant part (2,) [m] of the position error of a drive; `names` end with the sender's."""
+    return position_m * math.sqrt(1 - WHITE**2) * stream(0, "bias", *names).standard_normal(2)
 
 
-def state_deviation(how: MessageSettings) -> float:
+def state_deviation(position_m: float) -> float:
     """Return the standard deviation [m] that the stated confidence ellipse stands for, in centimetres rounded up."""
-    return min(max(math.ceil(100 * ELLIPSE * how.position_m), 1), 4094) / 100 / ELLIPSE
+    return min(max(math.ceil(100 * ELLIPSE * position_m), 1), 4094) / 100 / ELLIPSE
 
 
-def message_bytes(*, light: bool, certified: bool) -> int:
+def message_bytes(*, light: bool, certified: bool, person: bool = False) -> int:
     """Return the bytes of a message on the air, with or without low-frequency container and certificate.
+
+    person: of a pedestrian or cyclist, whose messages have no such container.
 
     >>> message_bytes(light=False, certified=False), message_bytes(light=True, certified=True)
     (180, 356)
     """
-    bits = sum(CAM_BITS.values()) + light * LIGHT_BITS
+    bits = sum(VAM_BITS.values()) if person else sum(CAM_BITS.values()) + light * LIGHT_BITS
     return math.ceil(bits / 8) + TRANSPORT_BYTES + SIGNED_BYTES + certified * CERTIFICATE_BYTES
 
 
@@ -195,15 +226,15 @@ def perception_bytes(objects: int) -> int:
     return math.ceil(bits / 8) + TRANSPORT_BYTES + SIGNED_BYTES
 
 
-def _pieces(trace: Trace, actor: int) -> Iterator[tuple[Array, Array, Array, Array]]:
+def _pieces(trace: Trace, actor: int, lead_s: float) -> Iterator[tuple[Array, Array, Array, Array]]:
     """Yield times (N,) [s], centres (N, 2) [m], headings (N,) [rad] and speeds (N,) [m/s] on the grid of `STEP_S`.
 
-    A piece is of neighbouring spins in which the actor is present.
+    A piece is of neighbouring spins in which the actor is present, and of `lead_s` before them.
     """
     here = np.flatnonzero(trace.present[:, actor])
     for piece in np.split(here, np.flatnonzero(np.diff(trace.time_s[here]) > GAP_S) + 1) if len(here) else ():
         known_s, xy, velocity = trace.time_s[piece], trace.position[piece, actor, :2], trace.velocity[piece, actor, :2]
-        lead = round(LONGEST_S / STEP_S)
+        lead = round(lead_s / STEP_S)
         times_s = known_s[0] + np.arange(-lead, round((known_s[-1] - known_s[0]) / STEP_S) + 1) * STEP_S
         before_s = np.minimum(times_s - known_s[0], 0.0)
         if len(piece) == 1:
@@ -216,8 +247,12 @@ def _pieces(trace: Trace, actor: int) -> Iterator[tuple[Array, Array, Array, Arr
         yield times_s, place, yaw, np.linalg.norm(motion, axis=1)
 
 
-def find_sending_times(times_s: Array, place: Array, yaw: Array, speed: Array, first: int) -> list[int]:
+def find_sending_times(
+    times_s: Array, place: Array, yaw: Array, speed: Array, first: int, longest_s: float = LONGEST_S
+) -> list[int]:
     """Return the rows of a motion at which a message is sent: at `first`, then by the rules of generation.
+
+    Two messages are at most `longest_s` apart.
 
     times_s: (N,) ascending [s]; place: (N, 2) [m]; yaw: (N,) unwrapped [rad]; speed: (N,) [m/s].
     """
@@ -230,7 +265,7 @@ def find_sending_times(times_s: Array, place: Array, yaw: Array, speed: Array, f
             or abs(speed[row] - speed[last]) > SPED_MPS
         )
         since_s = times_s[row] - times_s[last] + 1e-6
-        if since_s >= (SHORTEST_S if changed else LONGEST_S):
+        if since_s >= (SHORTEST_S if changed else longest_s):
             sent.append(row)
     return sent
 

@@ -138,6 +138,23 @@ def test_announced_sizes_correct_a_track_and_its_detections_place_it() -> None:
     assert overlap(both, CAR) > max(0.75, overlap(alone, CAR) - 0.02)
 
 
+def test_an_undetected_person_with_a_phone_is_moved_onto_its_returns_or_neutral_behind_a_wall() -> None:
+    person = np.array((18.0, 3.0, 0.87, 0.6, 0.6, 1.73, 0.0))
+    placed = place_senders(
+        messages((1, 0.0, 18.4, 3.0, 2.0, 0.0, 0.0)), 0.0, flat, lambda rows: np.full(len(rows), "Pedestrian")
+    )
+    assert placed.report.boxes.size[0, 2] == 1.73
+    assert placed.report.boxes.variance is not None
+    assert placed.report.boxes.variance[0, 3] == pytest.approx(0.09)
+    told = announce(moved(person, 1.2, -0.8), deviation_m=2.0)
+    found = track_objects(sweeps(person), 0.0, (), 0.1, told)
+    assert len(found) == 1
+    assert scores(found)[0] > 0.99
+    assert np.hypot(*(found.center[0, :2] - person[:2])) < 0.35
+    wall = np.array((10.0, 2.5, 2.0, 1.0, 16.0, 4.0, 0.0))
+    assert scores(track_objects(sweeps(wall, person), 0.0, (), 0.1, told)) == [0.0]
+
+
 def test_a_truck_that_announces_itself_gives_no_label_and_a_ghost_on_a_car_none_beside_it() -> None:
     truck = np.array((25.0, -4.0, 1.6, 9.0, 2.5, 3.2, 0.0))
     assert scores(track_objects(sweeps(truck), 0.0, (), 0.1, announce(truck, deviation_m=0.05))) == [0.0]

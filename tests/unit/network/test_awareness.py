@@ -11,6 +11,7 @@ from flcav.network.awareness import (
     CAM_BITS,
     ELLIPSE,
     LIGHT_BITS,
+    VAM_BITS,
     MessageSettings,
     draw_connected,
     find_received,
@@ -60,7 +61,7 @@ def test_a_message_follows_a_change_or_a_second(speed: float, turn: float, gain:
 
 def test_exact_senders_say_where_they_are_in_the_units_of_the_standard() -> None:
     trace = drive({"car0": 10.0, "car1": 4.0, "parked": 0.0})
-    senders = draw_connected(trace, 1.0, "1", "a")
+    senders = draw_connected(trace, EXACT, "1", "a")
     assert senders.tolist() == [0, 1]  # parked vehicles send nothing
     messages = send_messages(trace, senders, EXACT, "1", "a")
     for sender, mps in ((0, 10.0), (1, 4.0)):
@@ -78,7 +79,9 @@ def test_exact_senders_say_where_they_are_in_the_units_of_the_standard() -> None
 
 def test_position_errors_are_those_of_the_drive_and_stated() -> None:
     trace = drive({f"car{number}": 20.0 for number in range(150)})
-    messages = send_messages(trace, draw_connected(trace, 1.0, "1", "a"), MessageSettings(share=1, position_m=1.5), "a")
+    messages = send_messages(
+        trace, draw_connected(trace, EXACT, "1", "a"), MessageSettings(share=1, position_m=1.5), "a"
+    )
     off = messages.front - np.c_[20 * messages.time_s + trace.size[0, 0] / 2, 10.0 * messages.sender]
     mean = np.array([off[messages.sender == row].mean(axis=0) for row in range(150)])
     within = np.concatenate([off[messages.sender == row] - mean[row] for row in range(150)])
@@ -91,13 +94,39 @@ def test_position_errors_are_those_of_the_drive_and_stated() -> None:
     assert inside.mean() == pytest.approx(0.95, abs=0.05)
 
 
+def test_phones_of_people_tell_a_place_within_five_seconds_and_no_size() -> None:
+    paths = {
+        "waits": np.zeros((11, 2)),
+        "walks": np.c_[1.5 * TIMES, np.full(11, 4.0)],
+        "rides": np.c_[5 * TIMES, [9] * 11],
+    }
+    trace = make_trace(TIMES, paths, {"waits": ("pedestrian", 0), "walks": ("pedestrian", 0), "rides": ("bicycle", 0)})
+    trace = replace(trace, velocity=trace.velocity + np.array([(0, 0, 0), (1.5, 0, 0), (5.0, 0, 0)]))
+    assert len(draw_connected(trace, EXACT, "1", "a")) == 0
+    how = MessageSettings(share=0, people=1, people_m=1.5, heading_deg=0)
+    senders = draw_connected(trace, how, "1", "a")
+    assert senders.tolist() == [0, 1, 2]
+    messages = send_messages(trace, senders, how, "1", "a")
+    gaps = {sender: np.diff(messages.time_s[messages.sender == sender]) for sender in range(3)}
+    assert len(gaps[0]) <= 1
+    np.testing.assert_allclose(gaps[0], 5.0)
+    np.testing.assert_allclose(gaps[1], 2.7)  # 4.05 m
+    np.testing.assert_allclose(gaps[2], 0.9)  # 4.5 m
+    assert {tuple(size) for size in messages.size.tolist()} == {(0.8, 0.6), (1.8, 0.6)}
+    np.testing.assert_allclose(messages.deviation_m, 1.5, rtol=0.01)
+    assert set(messages.bytes.tolist()) <= {35 + 44 + 95, 35 + 44 + 95 + 131}
+    assert sum(VAM_BITS.values()) == 278  # 35 bytes
+
+
 def test_a_larger_share_adds_senders_to_those_of_a_smaller_one() -> None:
     trace = drive({f"car{number}": 5.0 for number in range(200)})
-    few, half, most, none = (set(draw_connected(trace, share, "1", "a")) for share in (0.1, 0.3, 0.6, 0.0))
+    few, half, most, none = (
+        set(draw_connected(trace, MessageSettings(share=share), "1", "a")) for share in (0.1, 0.3, 0.6, 0.0)
+    )
     assert not none
     assert few < half < most
     assert [len(few), len(half), len(most)] == pytest.approx([20, 60, 120], abs=18)
-    assert few != set(draw_connected(trace, 0.1, "1", "b"))
+    assert few != set(draw_connected(trace, MessageSettings(share=0.1), "1", "b"))
 
 
 def test_sizes_are_those_of_unaligned_per() -> None:
@@ -129,7 +158,9 @@ def test_who_is_near_is_heard_and_who_is_far_behind_houses_is_not() -> None:
     assert 0 < part.sum() < find_received(messages, trace, "me", None, MessageSettings(share=1)).sum()
 
 
-@pytest.mark.parametrize("odd", [{"share": 1.1}, {"share": -0.1}, {"position_m": -0.5}, {"share": float("nan")}])
+@pytest.mark.parametrize(
+    "odd", [{"share": 1.1}, {"share": -0.1}, {"position_m": -0.5}, {"people": 1.5}, {"share": float("nan")}]
+)
 def test_impossible_settings_are_refused(odd: dict[str, float]) -> None:
     with pytest.raises(ValidationError, match=next(iter(odd))):
         MessageSettings.model_validate(odd)

@@ -120,7 +120,7 @@ def scramble_silent(folder: Path) -> None:
     for path in (folder / "data" / "traces").glob("*.parquet"):
         trace = Trace.load(path)
         silent = np.ones(len(trace.actor), np.bool_)
-        silent[draw_connected(trace, CLOSE.share, str(DRIVE["seed"]), path.stem)] = False
+        silent[draw_connected(trace, CLOSE, str(DRIVE["seed"]), path.stem)] = False
         silent &= ~np.char.startswith(trace.actor, "cav")
         assert silent.sum() > 20
         replace(trace, position=trace.position + silent[:, None] * 7.0).save(path)

@@ -344,7 +344,7 @@ class ObjectsOutcomes:
         """Return further metrics by name, means over the classes with targets; None where there are none.
 
         AP in 3D at IoU 0.7 and in bird's-eye view at 0.5, AOS, the share of right headings, and the numbers of targets
-        and hidden objects.
+        and hidden objects. Of several classes also AP in 3D at IoU 0.5 of each.
         """
         once = np.ones((1, len(outcomes.scene)), dtype=np.int64)
         per_class = [read_matches(outcomes, name) for name in outcomes.arrays[CLASSES]]
@@ -357,6 +357,7 @@ class ObjectsOutcomes:
             "right headings": float(np.mean(right)) if right else None,
             "targets": float(sum(int(matches.targets.sum()) for matches in per_class)),
             "hidden": float(outcomes.arrays[HIDDEN].sum()),
+            **(_precision_by_class(outcomes, once) if len(per_class) > 1 else {}),
         }
 
     def count(self, outcomes: Outcomes) -> Counted:
@@ -375,6 +376,12 @@ class ObjectsOutcomes:
         known = ~np.isnan(per_class)
         with np.errstate(invalid="ignore"):
             return np.where(known, per_class, 0.0).sum(axis=0) / known.sum(axis=0)
+
+
+def _precision_by_class(outcomes: Outcomes, times: Times) -> dict[str, float | None]:
+    """Return AP in 3D at IoU 0.5 of each class, as "AP50 NAME"; None where it has no targets."""
+    names = outcomes.arrays[CLASSES].tolist()
+    return {f"AP50 {name}": _number(weighted_precision(read_matches(outcomes, name), times)[0]) for name in names}
 
 
 def read_matches(outcomes: Outcomes, name: str, key: str = MEASURED) -> Matches:

@@ -1,7 +1,8 @@
 """Vehicles that announce themselves by radio, and what they perceive, as another vehicle hears it in a simulated town.
 
-Awareness messages are of the traffic of a recording, with errors; perception messages of the vehicles that record, by
-the network that also labels: no annotation has a part in either.
+Awareness messages are of the traffic of a recording, with errors: of vehicles, and of pedestrians and cyclists with a
+phone. Perception messages are of the vehicles that record, by the network that also labels: no annotation has a part
+in either.
 """
 
 import math
@@ -19,12 +20,14 @@ from flcav.fusion.average import BoxReport, Sighting, report_boxes, state_accura
 from flcav.fusion.tracks import LEAST_SCORE
 from flcav.geometry import Boxes, pose
 from flcav.network.awareness import (
+    PEOPLE_S,
     WHITE,
     AwarenessMessages,
     MessageSettings,
     draw_bias,
     draw_connected,
     find_received,
+    is_person,
     perception_bytes,
     send_messages,
     state_deviation,
@@ -64,7 +67,8 @@ def hear_messages(split: Frames, i: int, how: MessageSettings, network: Second) 
     if key.agent not in trace.actor:
         raise _lacking(data)
     drive = (str(data.manifest.recipe.get("seed")), key.scene)
-    near = messages[np.abs(messages.time_s - key.time_s) <= HEARD_S + SLACK_S]
+    lasts_s = np.where(is_person(trace.category[messages.sender]), PEOPLE_S, HEARD_S)  # the next one comes before
+    near = messages[np.abs(messages.time_s - key.time_s) <= lasts_s + SLACK_S]
     heard = near[find_received(near, trace, key.agent, walls, how, *drive, str(key.index))]
     reports, sizes = list[BoxReport](), list[int]()
     for number in data.select(scenes=[key.scene], spins=[key.index]) if how.perceived else ():
@@ -78,7 +82,7 @@ def hear_messages(split: Frames, i: int, how: MessageSettings, network: Second) 
         if find_received(sent, trace, key.agent, walls, how, *drive, str(key.index), "perceived").all():
             report = _report(data, number, boxes, how, *drive)
             away_m = np.linalg.norm(report.boxes.center[:, :2] - data.world_from_agent(i)[:2, 3], axis=1)
-            others = away_m > ITSELF_M + 2 * state_deviation(how)
+            others = away_m > ITSELF_M + 2 * state_deviation(how.position_m)
             reports.append(replace(report, boxes=report.boxes[others]))
             sizes.append(size)
     category = trace.category
@@ -121,8 +125,8 @@ def _report(data: Dataset, number: int, boxes: Boxes, how: MessageSettings, *dri
     rng = stream(0, "perceived", *drive, str(key.index), key.agent)
     announced = known @ pose(0, 0, 0, float(np.radians(how.heading_deg) * rng.standard_normal()))
     white = how.position_m * WHITE * rng.standard_normal(2)
-    announced[:2, 3] = known[:2, 3] + draw_bias(how, *drive, key.agent) + white
-    stated = state_accuracy(state_deviation(how), float(np.radians(how.heading_deg)))
+    announced[:2, 3] = known[:2, 3] + draw_bias(how.position_m, *drive, key.agent) + white
+    stated = state_accuracy(state_deviation(how.position_m), float(np.radians(how.heading_deg)))
     return report_boxes(Sighting(key.agent, key.time_s, announced, boxes, navigation=stated))
 
 
@@ -133,7 +137,7 @@ def _send(data: Dataset, scene: str, settings: str) -> tuple[Trace, AwarenessMes
     if trace is None:
         raise _lacking(data)
     names = (str(data.manifest.recipe.get("seed")), scene)
-    return trace, send_messages(trace, draw_connected(trace, how.share, *names), how, *names)
+    return trace, send_messages(trace, draw_connected(trace, how, *names), how, *names)
 
 
 @lru_cache(maxsize=4)

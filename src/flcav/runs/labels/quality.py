@@ -14,7 +14,7 @@ from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
 from flcav.runs.frames import Frames
-from flcav.runs.results.training import FoundTargets, LabelHistory, LabelQuality
+from flcav.runs.results.training import ClassLabels, FoundTargets, LabelHistory, LabelQuality
 
 RETURNS = 5, 20, 100  # lower ends of the classes of targets by LiDAR returns, for which recall is stated separately
 TIGHT = 0.7  # IoU in 3D from which on a box is as good as an annotated one
@@ -52,11 +52,14 @@ def measure_labels(
         targets.append(truth.targets)
         neutral.append(truth.neutral)
         returns += [] if truth.returns is None else [truth.returns]
-    matches, tight = (match(found, targets, neutral, overlap) for overlap in (0.5, TIGHT))
-    right = int(matches.hit.sum())
-    there = int(matches.targets.sum())
-    count = len(matches.hit)
-    quality = LabelQuality(round_, count, there, right / count if count else None, right / there if there else None)
+    by_class = [_count_class(name, found, targets, neutral) for name in config.classes]
+    right, there, count = (
+        sum(column) for column in zip(*((e.right, e.targets, e.labels) for e in by_class), strict=True)
+    )
+    quality = LabelQuality(
+        *(round_, count, there, right / count if count else None, right / there if there else None),
+        by_class=tuple(by_class) if len(by_class) > 1 else None,
+    )
     if not right:
         return quality
     paired = [assign_targets(frame_boxes, truth, 0.5) for frame_boxes, truth in zip(found, targets, strict=True)]
@@ -73,11 +76,20 @@ def measure_labels(
     size = np.abs(labels[:, 3:6] - objects[:, 3:6]).max(axis=1)
     return replace(
         quality,
-        tight=int(tight.hit.sum()) / right,
+        tight=sum(_count_class(name, found, targets, neutral, TIGHT).right for name in config.classes) / right,
         offset_m=float(np.median(offset)),
         size_m=float(np.median(size)),
         by_returns=_count_by_returns(np.concatenate(returns), met) if len(returns) == len(targets) else None,
     )
+
+
+def _count_class(
+    name: str, found: Sequence[Boxes], targets: Sequence[Boxes], neutral: Sequence[Boxes], overlap: float = 0.5
+) -> ClassLabels:
+    """Count the labels of a class, those that match a target of it at this IoU in 3D, and its targets."""
+    mine, asked = ([boxes[boxes.label == name] for boxes in sides] for sides in (found, targets))
+    matches = match(mine, asked, neutral, overlap)
+    return ClassLabels(name, len(matches.hit), int(matches.hit.sum()), int(matches.targets.sum()))
 
 
 def _count_by_returns(returns: NDArray[np.int64], met: NDArray[np.bool_]) -> tuple[FoundTargets, ...]:

@@ -93,6 +93,16 @@ class FoundTargets(Record):
 
 
 @dataclass(frozen=True)
+class ClassLabels(Record):
+    """Labels and targets of one class."""
+
+    name: str
+    labels: int
+    right: int
+    targets: int
+
+
+@dataclass(frozen=True)
 class LabelQuality(Record):
     """Precision, recall and box errors of the labels that vehicles train on, against ground truth unknown to them.
 
@@ -108,6 +118,7 @@ class LabelQuality(Record):
     offset_m: Annotated[float | None, LEFT_OUT] = None  # median distance of their centres from the objects', in 3D [m]
     size_m: Annotated[float | None, LEFT_OUT] = None  # median of their largest error in length, width or height [m]
     by_returns: Annotated[tuple[FoundTargets, ...] | None, LEFT_OUT] = None  # classes of targets by LiDAR returns
+    by_class: Annotated[tuple[ClassLabels, ...] | None, LEFT_OUT] = None  # None: the network has one class
 
 
 @dataclass(frozen=True)
