@@ -39,9 +39,8 @@ def test_quarters_of_a_sweep_have_its_returns_and_boxes_in_place(split: Frames) 
         lidar = choose_lidar(frame)
         returns = transform_points(frame.world_from_sensor(lidar), frame.lidar[lidar][:, :3].astype(float))
         boxes = views[key.scene, key.index][3].boxes
-        stands = frame.world_from_agent @ pose(
-            *frame.agent_from_sensor[lidar][:2, 3], -DatasetGround(split.data).height_of(i)
-        )
+        x, y = frame.agent_from_sensor[lidar][:2, 3].tolist()
+        stands = frame.world_from_agent @ pose(x, y, -DatasetGround(split.data).height_of(i))
         for turn, sample in enumerate(samples[4 * number : 4 * number + 4]):
             world = stands @ pose(0, 0, -CONFIG.ground_z_m, turn * np.pi / 2)
             moved = transform_points(world, sample.points[:, :3].astype(float))

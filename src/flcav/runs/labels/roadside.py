@@ -46,8 +46,8 @@ def _lower(frame: Frame, height_m: float, eye_m: float, turn_rad: float) -> Fram
     Returns keep their places in the world.
     """
     lidar = choose_lidar(frame)
-    mount = frame.agent_from_sensor[lidar]
-    stands = frame.world_from_agent @ pose(*mount[:2, 3], -height_m, turn_rad)  # on the ground below the LiDAR
+    x, y = frame.agent_from_sensor[lidar][:2, 3].tolist()
+    stands = frame.world_from_agent @ pose(x, y, -height_m, turn_rad)  # on the ground below the LiDAR
     eye = pose(0, 0, eye_m, 0)
     points = move_points(frame.lidar[lidar], inverse(stands @ eye) @ frame.world_from_sensor(lidar))
     calibration = replace(frame.calibration, agent_from_sensor={lidar: eye})
