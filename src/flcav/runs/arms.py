@@ -247,6 +247,7 @@ def _check_federation(recipe: RunRecipe, setting: Setting) -> None:
     if setting.fault is not None and not all(LABEL_SOURCES[kind].tracked for kind in setting.labels.values()):
         raise InputError(f"fault: '{setting.fault}' is one of labels by tracks; choose 'tracks' or 'road+tracks'")
     _check_distillation(setting, edge, cloud)
+    _check_roadside(setting)
     _check_imitation(setting)
     if setting.compressed and (bare := [task for task in recipe.tasks if not isinstance(task_named(task), Compresses)]):
         raise InputError(f"compressed: it is a form of sweeps, and '{bare[0]}' uploads none; leave it out")
@@ -282,6 +283,15 @@ def _check_distillation(setting: Setting, edge: Strategy, cloud: Strategy) -> No
     for task in setting.training:
         if task != OBJECTS.name:
             raise InputError(f"{field}: detectors teach by scores, and '{task}' has none; leave 'objects' alone")
+
+
+def _check_roadside(setting: Setting) -> None:
+    """Raise `InputError` where roadside units shall train and have no detector's boxes to learn from."""
+    for task, kind in setting.labels.items() if setting.federation.roadside_clients else ():
+        if not (LABEL_SOURCES[kind].from_poles and LABEL_SOURCES[kind].trained and setting.placement.count):
+            raise InputError(
+                f"federation.roadside_clients: labels '{kind}' of '{task}' have no boxes of roadside units"
+            )
 
 
 def _check_imitation(setting: Setting) -> None:

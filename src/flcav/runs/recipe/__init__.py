@@ -154,6 +154,7 @@ class _Strategies(Rules):
         default=0.0, ge=0, lt=1
     )  # weight in the cloud's averages of its own training on the samples of stage I, which it has
     cloud_distillation: CloudDistillation | None = None  # of stage III's averages; None: they stay as they are
+    roadside_clients: bool = False  # whether roadside units train, too, wired to their edge server
     score_statistics: bool = False  # validate stage III also with each region's own statistics of batch normalisation
     network: NetworkSettings | None = None  # radio, wireline and rules of rounds; default: every message arrives
 

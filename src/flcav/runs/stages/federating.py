@@ -356,7 +356,7 @@ def _drive(work: Work, settings: StageSettings, federation: StageFederation, pla
         else:
             seeds = [schedule.work(number).seed for number in numbers]
         rules = follow_plan(how, plan, after_edge=cloud or bool(at.earlier))
-        vehicles = {name: client for name, client in at.clients.items() if name not in federation.conduct.within}
+        vehicles = {name: client for name, client in at.clients.items() if name not in federation.within}
         about = (federation.learning, settings.regions[region], replace(at, clients=vehicles))
         driven[region] = drive_region(work, settings, *about, rules, seeds)
     return join_regions(driven, how.edge_rounds_per_cloud_round, ways_s)

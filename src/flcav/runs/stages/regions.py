@@ -26,6 +26,7 @@ from flcav.runs.label_sources import LABEL_SOURCES, LabelSource
 from flcav.runs.labels.faults import give_fault, read_occlusion
 from flcav.runs.labels.pseudo_labels import annotated_samples, label_detected, label_frames, select_frames_near
 from flcav.runs.labels.quality import measure_labels
+from flcav.runs.labels.roadside import label_roadside
 from flcav.runs.labels.tracks import label_tracked, load_heard, load_tracks
 from flcav.runs.poles import find_sites
 from flcav.runs.registry import LABELLERS, LOSSES, load_all
@@ -112,6 +113,10 @@ def label_samples(
     pretrained = Pretrained.load(work.inputs[inputs.pretrain])
     threshold = pretrained.track_threshold if kind.tracked else pretrained.threshold
     assert threshold is not None  # fixed wherever labels come from detections
+    units = {}
+    if settings.federation.roadside_clients:
+        spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
+        units = label_roadside(split, poles, inputs.region, frozen.config, spins)
     about = Labelling(split, frames, poles, frozen.config, threshold, inputs, book, stage)
     for label in load_all(LABELLERS):
         if (renewed := label(work, settings, about)) is not None:
@@ -131,8 +136,8 @@ def label_samples(
             truth = annotated_samples(task, frozen.config, split, frames, inputs.region)
             hidden = read_occlusion(split, frames, inputs.region, frozen.config)
             samples = give_fault(truth, samples, hidden, settings.fault)
-        return LabelledSamples(samples, poles)
-    return LabelledSamples(label_frames(label_detected(frozen, threshold, split), *where), poles)
+        return LabelledSamples({**samples, **units}, poles)
+    return LabelledSamples({**label_frames(label_detected(frozen, threshold, split), *where), **units}, poles)
 
 
 def load_uploads(work: Work, learning: Learning, config: Any, pretrained: str, pools: Mapping[str, str]) -> list[Any]:

@@ -25,6 +25,7 @@ from flcav.federation.trainable import LocalUpdate, Trainable, Weights
 from flcav.interface.progress import Report
 from flcav.network.clock.records import RoundTiming
 from flcav.network.ledger import Ledger
+from flcav.perception.agents import POLE, kind_of
 from flcav.perception.client import SharedSamples, TaskClient
 from flcav.perception.outcomes import score_network
 from flcav.perception.weights import from_arrays, save_network, to_arrays
@@ -141,6 +142,12 @@ class StageFederation:
     relabel: BeforeRound | None = None  # changes the clients' labels before every round of stage II
     conduct: Conduct = field(default_factory=Conduct)  # of the rounds of stage II
     first_loss: float | None = None  # first loss of stage II, if it is over: divergence is measured by it
+
+    @property
+    def within(self) -> frozenset[str]:
+        """The clients whose messages do not use the radio: at the edge server itself, and roadside units."""
+        clients = {name for start in self.regions.values() for name in start.clients}
+        return self.conduct.within | {name for name in clients if kind_of(name.rpartition("/")[2]) == POLE}
 
     def afford(self, rules: Rules, rounds: int, buffers: Mapping[str, Buffers]) -> int:
         """Return the number of `rounds` that the privacy budget affords in every region; all without a budget."""
@@ -285,7 +292,7 @@ def federate_stage(
     everybody = {name: client for region in own.regions for name, client in own.list_vehicles(region).items()}
     if where.timed and not rules.hides_draws:  # times would reveal which clients were drawn
         everybody = time_clients(everybody, own.folder)
-    clients, within = own.conduct.enlist(everybody), own.conduct.within
+    clients, within = own.conduct.enlist(everybody), own.within
     wireless = Account(own.book, server, task.name, "wireless", driven.outages, within)
     far = where.deployed and where.deployed.beside(within)
     own.conduct.resume(own.folder, clients, far, wireless, done)
