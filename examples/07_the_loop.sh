@@ -19,7 +19,7 @@ drive 11 "$scenes" learn
 drive 12 $((scenes / 2 + 1)) look
 flcav record learn.yaml --out data/learn
 flcav record look.yaml --out data/look
-flcav train objects --network tiny --data data/learn --epochs $((steps / 12 + 1)) --out network
+flcav train objects --data data/learn --epochs $((steps / 12 + 1)) --out network
 flcav errors objects --weights network/weights.safetensors --data data/look --out errors.csv --map errors.png
 
 echo "== Where a roadside sensor would help most"
@@ -29,21 +29,24 @@ flcav place --errors errors.csv --poles poles.csv --range 40 --count 1 --town mi
 echo "== Pretraining in another town, edge FL here and there, cloud FL over both"
 cat > run.yaml << YAML
 seed: 3
+retrainings: 2
+retrain_from: edge
 splits:
   pool: {scenes: $scenes, spins: 4, cavs: 4}
   validation: {scenes: $((scenes / 2 + 1)), spins: 2, cavs: 3}
-  registry: {scenes: 1, spins: 2, cavs: 2}
-  edge: {scenes: $scenes, spins: 2, cavs: 2}
-  test: {scenes: $((scenes + 1)), spins: 1, cavs: 3}
-training: {steps: $((steps * 4)), local_steps: $((steps / 7 + 1))}
+  registry: {scenes: 1, spins: 2, cavs: 3}
+  edge: {scenes: $scenes, spins: 3, cavs: 3}
+  test: {scenes: $((scenes * 2 + 1)), spins: 1, cavs: 3}
+training: {steps: $((steps * 8)), local_steps: $((steps / 3 + 1)), local_rate: 1.0, start_share: 0}
 tasks:
-  objects: {network: tiny, plan: {samples: $((scenes * 12)), edge_rounds: 3, cloud_rounds: 2}}
+  objects: {labels: road+tracks, plan: {samples: $((scenes * 12)), edge_rounds: 5, cloud_rounds: 1}}
 regions:
   suburb: {role: pretrain}
   mine: {role: federate}
   ring: {role: federate}
 budgets_mb: {wireless: 200, wireline: 100}
 placement: {count: 1, range_m: 40, group_range_m: 100}
+federation: {upload: {compression: int8}, download: int8}
 YAML
 flcav run run.yaml --out run --json > run.json
 echo "$PWD/run/report.html: the report"
