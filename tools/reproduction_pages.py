@@ -2,7 +2,8 @@
 
 A page (README.md) marks a table's place by `<!-- NAME -->` and `<!-- end -->`; the text between is replaced by the
 table of that name, made from the folder's result.json, or from results.json where the page is of a run (`flcav run`);
-where it is of a run's seeds, from theirs and summary.json. All other text stays.
+where it is of a run's seeds, from theirs and summary.json. A page of both has the run's tables as `<!-- run NAME -->`.
+All other text stays.
 """
 
 import functools
@@ -15,7 +16,7 @@ from flcav.config import InputError, read_json
 from flcav.experiments.experiment import load_experiment
 from flcav.report import run_tables, seed_tables
 from flcav.runs.results.run import Run, Summary
-from flcav.runs.running import RESULTS, seed_folders
+from flcav.runs.running import RESULTS
 from flcav.storage.files import write_bytes
 
 Tables = Mapping[str, str]
@@ -37,12 +38,12 @@ def fill(page: str, tables: Tables) -> str:
 @functools.cache
 def tables_of(folder: Path) -> Tables:
     """Return the tables of a reproduction's folder as Markdown, by name."""
-    if (folder / RESULTS).is_file():
-        return run_tables.tables(Run.load(folder, RESULTS))
+    one = run_tables.tables(Run.load(folder, RESULTS)) if (folder / RESULTS).is_file() else {}
     if (folder / Summary.file).is_file():
-        return seed_tables.tables(
-            [Run.load(each) for _, each in sorted(seed_folders(folder).items())], Summary.load(folder)
-        )
+        runs = sorted(map(Run.load, folder.glob("seed*/")), key=lambda run: run.recipe.seed)
+        return seed_tables.tables(runs, Summary.load(folder)) | {f"run {name}": one[name] for name in one}
+    if one:
+        return one
     path = folder / "result.json"
     return load_experiment(str(folder)).tabulate(read_json(path), str(path))
 

@@ -57,10 +57,10 @@ def test_the_recipe_of_the_tutorial_is_one(tmp_path: Path, monkeypatch: pytest.M
 
 
 def test_the_strategy_that_is_shown_is_one():
-    page = (ROOT / "docs" / "how-to.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "own-strategy.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(from collections[^`]*class .*?)^```$", page, re.M | re.S)
     names: dict = {"__name__": "mine"}
-    exec(compile(code, "how-to.md", "exec"), names)
+    exec(compile(code, "own-strategy.md", "exec"), names)
     updates = [LocalUpdate({"w": np.full(2, float(i))}, samples=1, loss=float(i)) for i in (1, 2)]
     assert names["LossWeighted"]().combine({}, updates)["w"] == pytest.approx([9 / 5] * 2)
 
@@ -84,10 +84,10 @@ class Unable:
 
 @pytest.mark.parametrize("privacy", [None, Privacy(clip=1.0, noise=1.0, seeded=True)])
 def test_the_strategy_that_is_shown_runs_under_central_noise_and_one_that_fails_is_a_sentence(privacy: Privacy | None):
-    page = (ROOT / "docs" / "how-to.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "own-strategy.md").read_text(encoding="utf-8")
     (code,) = re.findall(r"^```python\n(from collections[^`]*class .*?)^```$", page, re.M | re.S)
     names: dict = {"__name__": "mine"}
-    exec(compile(code, "how-to.md", "exec"), names)
+    exec(compile(code, "own-strategy.md", "exec"), names)
     start, schedule = {"w": np.zeros(4)}, Schedule(1, 1, 0.1, 0.1, seed=1)
     clients = {f"cav{i}": Fixed(float(i)) for i in range(1, 4)}
 

@@ -57,7 +57,7 @@ def hold(value: Json) -> Any:
 def names_of(file: str) -> Mapping[str, Any]:
     """Return what expressions know: the results `r`, and of a run its tests and differences by stage and region."""
     path = ROOT / "reproductions" / file
-    if path.parent.parent.name != "runs" or path.name == Summary.file:
+    if not file.startswith("runs/") or path.name == Summary.file:
         return {**NAMES, "r": hold(read_json(path))}
     run = Run.load(path.parent, path.name)
     if run.recipe.spread is not None and not run.recipe.retrainings:

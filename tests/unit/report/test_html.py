@@ -16,7 +16,7 @@ from flcav.runs.results.tests import HomeCost, RunFinding
 from flcav.runs.running import RESULTS
 from flcav.statistics.estimates import Estimate
 
-DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
+DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo" / "earlier" / "road"
 PIXEL = b"\x89PNG made up"
 PICTURES: dict[str, bytes] = {"before_after": PIXEL}
 DRAWINGS: dict[str, str] = dict.fromkeys(("rounds_objects", "megabytes"), "<svg><g></g></svg>")

@@ -44,7 +44,7 @@ def judged(run: Run, *verdicts: str) -> Run:
     ],
 )
 def test_the_word_is_that_of_the_verdict_on_the_mean_over_regions(verdicts: tuple[str, ...], word: str) -> None:
-    run = judged(Run.load(RUNS / "demo", RESULTS), *verdicts)
+    run = judged(Run.load(RUNS / "demo/earlier/float32", RESULTS), *verdicts)
     answer = tell_answer(run)
     assert answer is not None
     assert answer.word == word
@@ -64,10 +64,10 @@ def test_the_word_is_that_of_the_verdict_on_the_mean_over_regions(verdicts: tupl
     ],
 )
 def test_without_one_all_regions_count(verdicts: tuple[str, ...], word: str) -> None:
-    answer = tell_answer(judged(Run.load(RUNS / "retraining", RESULTS), *verdicts))
+    answer = tell_answer(judged(Run.load(RUNS / "demo/earlier/retraining", RESULTS), *verdicts))
     assert answer is not None
     assert answer.word == word
-    run = judged(Run.load(RUNS / "retraining", RESULTS), *verdicts)
+    run = judged(Run.load(RUNS / "demo/earlier/retraining", RESULTS), *verdicts)
     tile = list_tiles(run)[0]
     assert tile.title == "AP50 in grid and ring"
     assert tile.verdict == (verdicts[0] if len({*verdicts}) == 1 else None)
@@ -77,7 +77,7 @@ def test_without_one_all_regions_count(verdicts: tuple[str, ...], word: str) -> 
 
 
 def test_there_is_no_price_where_no_measure_fell_at_home_by_more_than_its_interval() -> None:
-    run = judged(Run.load(RUNS / "demo", RESULTS), HELD)
+    run = judged(Run.load(RUNS / "demo/earlier/float32", RESULTS), HELD)
     assert run.home is not None
     kept = replace(run, home=(replace(run.home[0], difference=Estimate(-0.27, -0.6, 0.06)),))
     answer = tell_answer(kept)
@@ -86,7 +86,7 @@ def test_there_is_no_price_where_no_measure_fell_at_home_by_more_than_its_interv
 
 
 def test_numbers_are_means_over_regions_and_trainings_and_megabytes_those_of_the_stage() -> None:
-    run = Run.load(RUNS / "demo", RESULTS)
+    run = Run.load(RUNS / "demo/earlier/float32", RESULTS)
     answer = tell_answer(run)
     assert answer is not None
     means = {
@@ -118,7 +118,7 @@ def counted(stage: str, region: str, found: float, false: float | None) -> Found
 
 
 def test_counts_take_the_place_of_the_measure_and_are_summed_over_towns() -> None:
-    run = Run.load(RUNS / "demo", RESULTS)
+    run = Run.load(RUNS / "demo/earlier/float32", RESULTS)
     rows = [(PRETRAIN, 180, 80), (EDGE, 190, 70), (CLOUD, 185, 60)]
     counts = tuple(counted(stage, region, *row) for stage, *row in rows for region in ("grid", "ring"))
     answer = tell_answer(replace(run, counts=counts))
@@ -133,7 +133,7 @@ def test_counts_take_the_place_of_the_measure_and_are_summed_over_towns() -> Non
 
 
 def test_tiles_have_the_gain_the_control_the_budget_and_the_cost() -> None:
-    tiles = list_tiles(Run.load(RUNS / "demo", RESULTS))
+    tiles = list_tiles(Run.load(RUNS / "demo/earlier/float32", RESULTS))
     assert [tile.title for tile in tiles] == [
         "AP50 in grid and ring", "As many steps without FL", "Radio budget, all stages", "AP70 at home, in suburb",
     ]  # fmt: skip
@@ -144,7 +144,7 @@ def test_tiles_have_the_gain_the_control_the_budget_and_the_cost() -> None:
 
 
 def test_claims_are_worded_without_the_names_of_arms() -> None:
-    run = Run.load(RUNS / "demo", RESULTS)
+    run = Run.load(RUNS / "demo/earlier/float32", RESULTS)
     rows = list_claims(run)
     assert [row.verdict for row in rows] == [finding.verdict for finding in run.findings]
     assert (rows[0].claim, rows[1].claim) == (
@@ -157,13 +157,13 @@ def test_claims_are_worded_without_the_names_of_arms() -> None:
 
 
 def test_arms_are_worded_by_what_differs() -> None:
-    told = {row.claim for row in list_claims(Run.load(RUNS / "demo_road", RESULTS))}
+    told = {row.claim for row in list_claims(Run.load(RUNS / "demo/earlier/road", RESULTS))}
     assert "Edge FL beats the pole with the densest traffic" in told
     assert "Edge FL against labels of an ideal road detector, an upper bound" in told
 
 
 def test_a_run_without_the_claim_has_no_answer() -> None:
-    run = Run.load(RUNS / "demo", RESULTS)
+    run = Run.load(RUNS / "demo/earlier/float32", RESULTS)
     others = [
         (each, finding)
         for each, finding in zip(run.differences, run.findings, strict=False)

@@ -17,7 +17,7 @@ from flcav.runs.results.run import Run
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.verdicts import signed
 
-DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo_road"
+DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo" / "earlier" / "road"
 
 
 @pytest.fixture(scope="module")

@@ -58,7 +58,7 @@ def test_tasks_without_further_measures_have_none() -> None:
 
 
 def test_results_tell_the_cost_of_every_measure_at_home() -> None:
-    run = Run.load(RUNS / "demo_road", RESULTS)
+    run = Run.load(RUNS / "demo/earlier/road", RESULTS)
     own, further = list_home_costs(replace(run, home=None))
     assert (own.region, own.measure, own.trainings) == ("suburb", "AP50", 1)
     assert own.difference == next(each.estimate for each in run.differences if each.region == "suburb")

@@ -15,7 +15,7 @@ from flcav.runs.results.table import Row, save_table, tabulate
 from flcav.storage.records import select
 
 RUNS = Path(__file__).parents[3] / "reproductions" / "runs"
-KNOWN = ("demo", "demo_road", "radio", "retraining", "three_tasks")
+KNOWN = ("demo", "demo/earlier/road", "radio", "demo/earlier/retraining", "three_tasks")
 
 
 @pytest.fixture(scope="module", params=KNOWN)

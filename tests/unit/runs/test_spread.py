@@ -58,7 +58,7 @@ def test_a_table_that_is_not_there_is_refused(tmp_path: Path) -> None:
 
 def test_the_package_s_table_is_that_of_the_retrainings_and_of_the_run_on_another_processor() -> None:
     tool = runpy.run_path(str(ROOT / "tools/ship_spreads.py"))
-    measured = tool["measure"]([RUNS / "retraining", RUNS / "demo_avx2"])
+    measured = tool["measure"]([RUNS / "demo/earlier/retraining", RUNS / "demo/earlier/avx2"])
     assert len(measured) == 19
     assert read_spreads("demo", Path()) == {
         (row.task, row.region, row.arm, row.stage, row.before_arm, row.before_stage): Spread(round(row.sd, 5), 9)
@@ -67,7 +67,10 @@ def test_the_package_s_table_is_that_of_the_retrainings_and_of_the_run_on_anothe
 
 
 def test_a_further_run_is_one_more_training_of_every_figure() -> None:
-    run, further = Run.load(RUNS / "retraining", "results.json"), Run.load(RUNS / "demo_avx2", "results.json")
+    run, further = (
+        Run.load(RUNS / "demo/earlier/retraining", "results.json"),
+        Run.load(RUNS / "demo/earlier/avx2", "results.json"),
+    )
     own, more = list_spreads(run, "seed1"), list_spreads(run, "seed1", [further])
     assert [row.trainings for row in (*own, *more)] == [8] * 19 + [9] * 19
     place = list(list_figures(run)).index(GAIN)
@@ -78,7 +81,7 @@ def test_a_further_run_is_one_more_training_of_every_figure() -> None:
 
 
 def test_pages_judge_a_run_by_the_present_table() -> None:
-    run = Run.load(RUNS / "demo_road", "results.json")
+    run = Run.load(RUNS / "demo/earlier/road", "results.json")
     spreads = read_spreads("demo", Path())
     widened = widen_anew(run, spreads)
     for before, after in zip(run.differences, widened.differences, strict=True):
@@ -93,8 +96,8 @@ def test_pages_judge_a_run_by_the_present_table() -> None:
 
 
 def test_the_page_of_another_processor_has_the_gains_by_its_own_pole_and_by_the_committed_run_s() -> None:
-    page = (RUNS / "demo_avx2" / "README.md").read_text(encoding="utf-8")
-    own, fixed = (Run.load(RUNS / "demo_avx2", name) for name in ("results.json", "results_pole4.json"))
+    page = (RUNS / "demo/README.md").read_text(encoding="utf-8")
+    own, fixed = (Run.load(RUNS / "demo/earlier/avx2", name) for name in ("results.json", "results_pole4.json"))
     for run, poles, said in ((own, (2,), "edge FL gains 0.021"), (fixed, (4,), "edge FL gains 0.045")):
         (placed,) = [each for each in run.arms["main"].placed if each.region == "ring"]
         gain = list_figures(run)[GAIN].trainings[0]

@@ -55,7 +55,7 @@ class Learning:
 
         The learning rate decays over the first rounds after pretraining; after `earlier` rounds it stays at its final
         value. `restart`: share of the task's rate to restart at, which loses what the earlier rounds reached
-        (reproductions/runs/retraining).
+        (reproductions/runs/demo, spread of retraining).
         """
         rate = self.task.practice.learning_rate
         training = self.training
