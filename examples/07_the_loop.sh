@@ -31,6 +31,7 @@ cat > run.yaml << YAML
 seed: 3
 retrainings: 2
 retrain_from: edge
+primary_claims: [edge]
 splits:
   pool: {scenes: $scenes, spins: 4, cavs: 4}
   validation: {scenes: $((scenes / 2 + 1)), spins: 2, cavs: 3}
@@ -54,7 +55,7 @@ echo "$PWD/run/report.html: the report"
 echo "== What this run teaches the next: learning curves, and a plan by them under both budgets"
 weighs() { python3 -c "import json; print(json.load(open('run.json'))['arms']['main']['plan']['tasks']['objects']['$1'])"; }
 cat > problem.yaml << YAML
-budgets_mb: {wireless: $((scenes * 5 + 20)), wireline: $((scenes * 6 + 8))}
+budgets_mb: {wireless: $((scenes * 5 + 5)), wireline: $((scenes * 5 + 3))}
 tasks:
   - name: objects
     sample_mb: $(weighs sample_mb)
