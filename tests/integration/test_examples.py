@@ -166,7 +166,7 @@ def test_the_loop(tmp_path: Path):
     assert "13 candidate poles of mine" in done.stdout
     assert re.search(r"cover \d+ of \d+ errors, weight \d+ \(optimal\)", done.stdout)
     history = (tmp_path / "loop/run/history.csv").read_text().splitlines()
-    assert len(history) == 1 + 1 + 3 + 2  # pretrained, each edge round, each cloud round
+    assert len(history) == 1 + 1 + 5 + 1  # pretrained, each edge round, each cloud round
     assert "optimal for the fitted curve (proven" in done.stdout
     for name in ("errors.png", "placed.png", "run/pictures/map_mine.png"):
         with Image.open(tmp_path / "loop" / name) as picture:
