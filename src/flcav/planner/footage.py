@@ -231,7 +231,8 @@ def find_frame(split: Frames, error: PerceptionError) -> int | None:
     for number in split.vehicles:
         if data.keys[number].scene != error.scene:
             continue
-        if abs(np.hypot(*(data.world_from_agent(number)[:2, 3] - place)) - error.distance_m) > SAME_M:
+        far = np.hypot(*(data.world_from_agent(number)[:2, 3] - place))
+        if not abs(far - error.distance_m) <= SAME_M:  # nor is it where the distance is NaN
             continue
         truth = data.frame(number).annotations
         there = np.hypot(*(truth.boxes.center[truth.track == error.track, :2] - place).T) <= SAME_M

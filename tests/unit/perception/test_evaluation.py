@@ -98,7 +98,9 @@ def test_misses_are_registered_once_per_track():
     assert math.isclose(errors[0].x, 120)  # where it was first missed
     assert math.isclose(errors[0].z, 0.8)
     assert (errors[0].returns, errors[0].occlusion, errors[0].label) == (9, 0.25, "Car")
-    assert [e.distance_m for e in errors] == pytest.approx([20, 30, 10])  # from the vehicle, not from the world's origin
+    assert [e.distance_m for e in errors] == pytest.approx(
+        [20, 30, 10]
+    )  # from the vehicle, not from the world's origin
 
 
 def test_low_scores_do_not_find():

@@ -63,12 +63,11 @@ export function Replay({ api, run, played, setPlayed, say, fail }: Props) {
   }, [playing, at]);
   useLayoutEffect(() => {
     const keyed = (event: KeyboardEvent) => {
-      if ((event.target as Element).matches("input, button")) {
-        if (event.key !== " " || (event.target as Element).matches("button")) return;
-      }
+      const target = event.target as Element;
+      if (target.matches("button") ? event.key === " " : target.matches("input") && event.key !== " ") return; // theirs
       if (event.key === " ") play();
-      else if (event.key === "ArrowRight") go(at + 1);
-      else if (event.key === "ArrowLeft") go(at - 1);
+      else if (event.key === "ArrowRight") go(clock.current!.at + 1);
+      else if (event.key === "ArrowLeft") go(clock.current!.at - 1);
       else return;
       event.preventDefault();
     };
