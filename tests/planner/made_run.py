@@ -3,8 +3,10 @@
 import shutil
 import subprocess
 import sys
-from math import dist, nan
+from math import nan
 from pathlib import Path
+
+import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import PerceptionError, save_errors
@@ -58,15 +60,16 @@ def _save_networks(before: Path, after: Path) -> None:
 
 
 def _save_errors(data: Dataset, folder: Path) -> None:
-    """Register as missed the first two cars that are seen in the last frame, the second at an unknown distance."""
+    """Register as missed the two nearest cars in the last frame, the second at an unknown distance."""
     folder.mkdir()
     frame = data.frame(len(data) - 1)
     truth = frame.annotations
-    cars = [row for row, label in enumerate(truth.boxes.label.tolist()) if label == "car"][:2]
-    at, names = truth.boxes.center[cars].tolist(), truth.track[cars].tolist()
+    here, cars = frame.world_from_agent[:2, 3], np.flatnonzero(truth.boxes.label == "car")
+    far = np.hypot(*(truth.boxes.center[cars, :2] - here).T)
+    near = cars[np.argsort(far)[:2]].tolist()
     missed = [
-        PerceptionError(x, y, z, 1.0, "miss", "Car", 9, 0.2, frame.scene, name, far)
-        for (x, y, z), name, far in zip(at, names, (dist(frame.world_from_agent[:2, 3], at[0][:2]), nan), strict=True)
+        PerceptionError(*truth.boxes.center[row].tolist(), 1.0, "miss", "Car", 9, 0.2, frame.scene, str(track), metres)
+        for row, track, metres in zip(near, truth.track[near], (far.min(), nan), strict=True)
     ]
     save_errors(missed, folder / "errors.parquet")
 
