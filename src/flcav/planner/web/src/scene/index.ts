@@ -21,6 +21,7 @@ function show(host: HTMLElement) {
     host.classList.add("drawn"); // its height may depend on it
     try {
       made = new SweepScene(host, data);
+      made.shareWheel();
       fallbacks.forEach((each) => (each.hidden = true));
     } catch (error) {
       host.classList.remove("drawn");

@@ -93,6 +93,14 @@ export class SweepScene {
     this.stage.look([Math.min(Math.max(middle, 8), 30), 0, data.ground], 52, 0.55, 0);
   }
 
+  /** Leave the wheel to the page that scrolls, until the picture has the focus. */
+  shareWheel() {
+    const { controls, renderer } = this.stage;
+    controls.enableZoom = false;
+    renderer.domElement.addEventListener("focus", () => (controls.enableZoom = true));
+    renderer.domElement.addEventListener("blur", () => (controls.enableZoom = false));
+  }
+
   dispose() {
     this.stage.dispose();
   }
