@@ -90,7 +90,7 @@ class Seen:
 def read_seen(run: Run, work: Path) -> Seen:
     """Return the errors by region and the chosen sweep, those that the run has."""
     placed = run.arms[MAIN].placed
-    changes = {place.region: found for place in placed if (found := _read_changes(run, work, place)) is not None}
+    changes = {place.region: found for place in placed if (found := read_changes(run, work, place)) is not None}
     if not (work / LOOK).is_dir():
         return Seen(changes)
     compared = SweepComparison.load(work / LOOK)
@@ -216,7 +216,7 @@ def _file_name(task: str) -> str:
     return task.replace(":", "_")
 
 
-def _read_changes(run: Run, work: Path, placed: Placed) -> ErrorChanges | None:
+def read_changes(run: Run, work: Path, placed: Placed) -> ErrorChanges | None:
     """Return a region's errors and what became of them; None without a town, poles, or tasks of the placement."""
     names, tasks = run.steps, run.recipe.placement.tasks
     if not tasks or not placed.poles or not (work / names.remaining(placed.region, tasks[0])).is_dir():
