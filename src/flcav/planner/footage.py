@@ -23,6 +23,7 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import load_network
 from flcav.planner.placing import describe_town
+from flcav.report.pictures.loop import find_instant
 from flcav.report.pictures.sweep_scene import describe_sweep
 from flcav.runs.frames import DATA, Frames
 from flcav.runs.recipe import PRETRAIN
@@ -260,11 +261,8 @@ def _first_traces(data: Dataset) -> Iterator[tuple[str, Trace]]:
 
 def _when(trace: Trace, track: str, at: tuple[float, float]) -> float:
     """Return the time [s] from the start of a trace at which an error was made: its road user is nearest to it then."""
-    rows = np.flatnonzero(trace.actor == track)
-    if not len(rows):
-        return 0.0
-    far = np.hypot(*(trace.position[:, rows[0], :2] - at).T)
-    return 0.0 if np.isnan(far).all() else _tenth(trace.time_s[int(np.nanargmin(far))] - trace.time_s[0])
+    instant = find_instant(trace, track, at)
+    return 0.0 if instant is None else _tenth(trace.time_s[instant] - trace.time_s[0])
 
 
 def _drive(trace: Trace) -> dict[str, Json]:
