@@ -60,11 +60,12 @@ def _save_networks(before: Path, after: Path) -> None:
 
 
 def _save_errors(data: Dataset, folder: Path) -> None:
-    """Register as missed the two nearest cars in the last frame, the second at an unknown distance."""
+    """Register as missed the two nearest cars that drive in the last frame, the second at an unknown distance."""
     folder.mkdir()
     frame = data.frame(len(data) - 1)
     truth = frame.annotations
-    here, cars = frame.world_from_agent[:2, 3], np.flatnonzero(truth.boxes.label == "car")
+    moves = np.hypot(*truth.velocity[:, :2].T) > 1.0
+    here, cars = frame.world_from_agent[:2, 3], np.flatnonzero((truth.boxes.label == "car") & moves)
     far = np.hypot(*(truth.boxes.center[cars, :2] - here).T)
     near = cars[np.argsort(far)[:2]].tolist()
     missed = [
