@@ -139,7 +139,7 @@ def test_the_ledger_has_what_a_socket_carried_in_every_stage(wire: Wire, tmp_pat
     before = {name: array.copy() for name, array in to_arrays(network).items()}
     after = to_arrays(release_network(book, OBJECTS, network, "grid", split))
     assert all(np.array_equal(before[name], after[name]) for name in before)
-    missed = PerceptionError(1.0, 2.0, 3.0, 1.0, MISS, "Car", 7, 0.5, "a", "veh1")
+    missed = PerceptionError(1.0, 2.0, 3.0, 1.0, MISS, "Car", 7, 0.5, "a", "veh1", 21.0)
     assert report_errors(book, OBJECTS, Registry.of({0: [missed], 3: [missed]}), "grid", split).errors == (missed,)
     assert report_errors(book, OBJECTS, Registry((missed,)), "grid", split).errors == (missed,)
     view = RoadView(Boxes.empty(), np.zeros(2), np.ones((3, 5), bool), np.zeros((3, 5), bool))

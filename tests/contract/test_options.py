@@ -96,7 +96,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "validate": {},
     "birdseye": {"--frame": ALWAYS, "--range": ALWAYS, "--tracks": ALWAYS},
     "camera": {"--frame": ALWAYS, "--camera": ALWAYS, "--boxes": ALWAYS},
-    "view": {"--scene": ALWAYS, "--save": ALWAYS},
+    "view": {"--scene": ALWAYS, "--save": ALWAYS, "--animate": ALWAYS},
     "export": {  # which format takes which is said beside the formats
         "--labels": ALWAYS,
         "--validation": ALWAYS,

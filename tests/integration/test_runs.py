@@ -177,7 +177,7 @@ def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:
     )
     files = re.findall(r' href="([^"#]+)"', text)
     assert all((finished / file).exists() for file in files)  # of the run's folder: results, pictures
-    assert not re.search(r"url\((?!#)|@import|<script|<link|<iframe", text)
+    assert not re.search(r"url\((?!#)|@import|<script[^>]+src|<link|<iframe", text)
     read = html.unescape(re.sub(r"\s+", " ", text))
     assert all(finding.sentence in read for finding in result.findings)
     names = {path.stem for path in (finished / "pictures").iterdir()}
@@ -190,6 +190,16 @@ def test_the_report_needs_no_other_file(finished: Path, result: Run) -> None:
             colours = picture.convert("RGB").resize((300, 300)).getcolors(90_000)
             assert colours is not None
             assert len(colours) > 50, path.name
+
+
+def test_the_loop_of_a_run_is_an_animation(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture) -> None:
+    with pytest.raises(SystemExit) as stopped:
+        command(["view", str(finished), "--animate", str(tmp_path / "loop.webp")])
+    assert not stopped.value.code
+    assert "96 frames, 8 s" in capsys.readouterr().out
+    with Image.open(tmp_path / "loop.webp") as film:
+        assert film.n_frames > 40
+        assert film.size == (960, 540)
 
 
 def test_the_run_leaves_history_that_fit_reads(studied: tuple[Path, Any, Any], capsys: pytest.CaptureFixture) -> None:

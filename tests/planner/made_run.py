@@ -3,11 +3,18 @@
 import shutil
 import subprocess
 import sys
+from math import nan
 from pathlib import Path
+
+import numpy as np
 
 from flcav.dataset.store import Dataset
 from flcav.perception.errors import PerceptionError, save_errors
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.task import build_network
+from flcav.perception.weights import find_shipped, load_network, save_network
 from flcav.runs.frames import Recorded
+from flcav.runs.results.saved import WEIGHTS
 from flcav.runs.results.tests import SweepComparison, SweepDetections
 
 FLCAV = Path(sys.executable).with_name("flcav")
@@ -41,19 +48,29 @@ def make_run(folder: Path) -> Path:
         shutil.copytree(data.parent, work / name)
     _save_errors(recorded, work / "grid-errors-objects")
     _save_sweep(recorded, work / "look")
+    _save_networks(work / "pretrain-objects", work / "grid-edge-fl-objects")
     return run
 
 
+def _save_networks(before: Path, after: Path) -> None:
+    """Save a network that has learned nothing, and the packaged one."""
+    trained = load_network(OBJECTS, find_shipped(OBJECTS))
+    save_network(OBJECTS, build_network(OBJECTS, trained.config, 1), before / WEIGHTS)
+    save_network(OBJECTS, trained, after / WEIGHTS)
+
+
 def _save_errors(data: Dataset, folder: Path) -> None:
-    """Register as missed the first two cars that are seen in the last frame."""
+    """Register as missed the two nearest cars that drive in the last frame, the second at an unknown distance."""
     folder.mkdir()
     frame = data.frame(len(data) - 1)
     truth = frame.annotations
-    cars = [row for row, label in enumerate(truth.boxes.label.tolist()) if label == "car"][:2]
-    at, names = truth.boxes.center[cars].tolist(), truth.track[cars].tolist()
+    moves = np.hypot(*truth.velocity[:, :2].T) > 1.0
+    here, cars = frame.world_from_agent[:2, 3], np.flatnonzero((truth.boxes.label == "car") & moves)
+    far = np.hypot(*(truth.boxes.center[cars, :2] - here).T)
+    near = cars[np.argsort(far)[:2]].tolist()
     missed = [
-        PerceptionError(x, y, z, 1.0, "miss", "Car", 9, 0.2, frame.scene, name)
-        for (x, y, z), name in zip(at, names, strict=True)
+        PerceptionError(*truth.boxes.center[row].tolist(), 1.0, "miss", "Car", 9, 0.2, frame.scene, str(track), metres)
+        for row, track, metres in zip(near, truth.track[near], (far.min(), nan), strict=True)
     ]
     save_errors(missed, folder / "errors.parquet")
 

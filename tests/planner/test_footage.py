@@ -2,6 +2,8 @@
 
 import base64
 import json
+import re
+import shutil
 
 import numpy as np
 import pytest
@@ -11,8 +13,11 @@ from test_place import wait_for
 
 from flcav.config import InputError
 from flcav.dataset.store import Dataset
-from flcav.planner.footage import Footage
+from flcav.perception.errors import load_errors
+from flcav.planner.footage import Footage, find_frame
 from flcav.planner.replaying import open_run
+from flcav.runs.frames import Frames
+from flcav.runs.stages.testing import detect_before_after
 
 
 @pytest.fixture(scope="module")
@@ -49,6 +54,35 @@ def test_only_what_the_run_has_is_told(footage):
     assert bare.shown == {"regions": [], "sweep": False, "pictures": []}
     with pytest.raises(InputError):
         bare.sweep()
+
+
+def test_the_sweep_of_an_error_is_that_of_the_vehicle_that_made_it(footage, recorded_run):
+    data = Dataset.open(recorded_run / "work" / "grid-registry-objects" / "data")
+    error = load_errors(footage.errors_of("grid"))[0]
+    number = find_frame(Frames.open(recorded_run / "work" / "grid-registry-objects"), error)
+    frame = data.frame(len(data) - 1)
+    assert data.keys[number] == data.keys[len(data) - 1]
+    sweep = footage.error_sweep("grid", 0)
+    world = frame.world_from_sensor(next(iter(frame.lidar))) @ np.array((*sweep["mark"], 1.0))
+    assert world[:3] == pytest.approx((error.x, error.y, error.z), abs=0.02)
+    assert sweep["before"]["title"] == "pretrained"  # type: ignore
+    assert sweep["before"]["found"] == [False] * len(sweep["targets"])  # type: ignore
+    assert sweep["after"]["title"] == "after edge FL"  # type: ignore
+    found = detect_before_after(
+        *(recorded_run / "work" / name for name in ("pretrain-objects", "grid-edge-fl-objects")),
+        Frames(data, (number,), {}),
+    )
+    assert sweep["after"]["found"] == list(found.after.found)  # type: ignore
+
+
+def test_the_sweep_of_an_error_without_a_distance_is_not_known(footage):
+    for ask, told in (
+        (lambda: footage.error_sweep("grid", 1), "does not tell in which sweep"),
+        (lambda: footage.error_sweep("grid", 2), "grid has 2 errors"),
+        (lambda: footage.error_sweep("ring", 0), "no longer has the sweeps"),
+    ):
+        with pytest.raises(InputError, match=told):
+            ask()
 
 
 def test_labels_of_a_picture_are_those_of_its_frame(footage, recorded_run):
@@ -88,6 +122,68 @@ def test_the_errors_of_a_recorded_run_are_on_its_map(opened, recorded):
     page.get_by_role("button", name="Place", exact=True).click()
     page.wait_for_selector(".map svg")
     wait_for(page, "#total", "2")
+
+
+def test_an_error_opens_its_sweep_by_keys_and_by_a_tap(opened, recorded):
+    page = opened(recorded.address, has_touch=True)
+    page.get_by_role("button", name="Place", exact=True).click()
+    page.wait_for_selector(".map svg")
+    one = page.locator("#error-0")
+    assert re.match(
+        r"Car missed, \d+ m from the vehicle, 20 % hidden, not covered; Enter", one.get_attribute("aria-label")
+    )
+    one.focus()
+    assert "20 %" in page.locator(".tip").inner_text()
+    page.keyboard.press("Enter")
+    page.wait_for_selector("dialog .sweep canvas", timeout=60_000)  # networks are loaded first
+    assert "pretrained: 0 found" in page.locator("dialog canvas").get_attribute("aria-label")
+    page.keyboard.press("Escape")
+    page.locator("dialog").wait_for(state="detached")
+    page.wait_for_function("() => document.activeElement.id === 'error-0'")
+    page.keyboard.press("Escape")
+    page.locator(".tip").wait_for(state="detached")
+    where = page.locator("#error-0").bounding_box()
+    page.touchscreen.tap(where["x"] + 6, where["y"] + 6)  # beside it, as fingers do
+    page.get_by_role("button", name="Show its sweep").tap()
+    page.wait_for_selector("dialog .sweep canvas", timeout=60_000)
+    page.get_by_role("button", name="Back to the map").tap()
+    page.locator("dialog").wait_for(state="detached")
+
+
+def test_what_an_earlier_table_does_not_tell_is_unknown(opened, recorded):
+    page = opened(recorded.address)
+    page.get_by_role("button", name="Place", exact=True).click()
+    page.wait_for_selector(".map svg")
+    page.locator("#error-1").hover()
+    assert "unknown" in page.locator(".tip").inner_text()
+    page.locator("#error-1").focus()
+    wait_for(page, ".tip", "the table has no distances")
+    assert page.get_by_role("button", name="Show its sweep").count() == 0
+    page.keyboard.press("Enter")
+    assert page.locator("dialog").count() == 0
+
+
+def test_region_and_moment_of_a_replay_are_in_its_address(opened, recorded_run, tmp_path):
+    run = tmp_path / "recorded"
+    shutil.copytree(recorded_run, run, symlinks=True)
+    shutil.copytree(run / "work" / "grid-registry-objects", run / "work" / "ring-registry-objects")
+    planner = serve(run)
+    try:
+        page = opened(planner.address)
+        page.wait_for_selector("canvas.drive")
+        page.get_by_role("button", name="ring", exact=True).click()
+        for _ in range(3):
+            page.keyboard.press("ArrowRight")
+        wait_for(page, "#moment", "edge round 3")
+        page.wait_for_function("() => location.hash.includes('r=ring&m=3')")
+        assert len(page.url) < 2000
+        assert "token" not in page.url
+        other = opened(f"{page.url}&{planner.address.partition('#')[2]}")
+        wait_for(other, "#moment", "edge round 3")
+        assert other.get_by_role("button", name="ring", exact=True).get_attribute("aria-pressed") == "true"
+        other.wait_for_function("() => location.hash.includes('tab=replay') && location.hash.includes('r=ring&m=3')")
+    finally:
+        planner.stop()
 
 
 def pack(folder, *names: str) -> dict[str, str]:

@@ -15,6 +15,8 @@ from test_place import wait_for
 import flcav.planner
 from flcav.optimization.graph import load_problem
 from flcav.planner.planning import plan_budgets, with_budgets
+from flcav.planner.server import ASSETS
+from flcav.report.scene import SCENE
 
 WEB = Path(flcav.planner.__file__).parent / "web"
 AXE = WEB / "node_modules" / "axe-core" / "axe.min.js"
@@ -100,5 +102,5 @@ def test_the_bundle_is_that_of_its_sources(tmp_path):
     if not (WEB / "node_modules").exists() or shutil.which("npm") is None:
         pytest.skip("no esbuild: npm ci in src/flcav/planner/web")
     subprocess.run(["npm", "run", "-s", "bundle"], cwd=WEB, check=True, env={**os.environ, "OUT": str(tmp_path)})
-    for name in ("planner.js", "scene.js"):
-        assert (tmp_path / name).read_bytes() == (WEB.parent / "assets" / name).read_bytes()
+    for path in (ASSETS / "planner.js", SCENE):
+        assert (tmp_path / path.name).read_bytes() == path.read_bytes()

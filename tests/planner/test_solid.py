@@ -13,7 +13,7 @@ from test_place import COVERED, drag, middle_of, placed, seen_from, show, wait_f
 
 from flcav.dataset.store import Dataset
 from flcav.planner.replaying import open_run
-from flcav.planner.server import ASSETS
+from flcav.report.scene import SCENE
 
 
 def solid(opened, address: str, **options):
@@ -98,7 +98,7 @@ def test_a_slope_is_a_slope(opened):
 def test_a_sweep_is_shown_in_any_page(opened, recorded_run, tmp_path):
     desk = open_run(recorded_run)
     assert desk.footage is not None
-    data, program = json.dumps(desk.footage.sweep()), (ASSETS / "scene.js").read_text()
+    data, program = json.dumps(desk.footage.sweep()), SCENE.read_text()
     page_file = tmp_path / "sweep.html"
     page_file.write_text(
         '<!doctype html><meta charset="utf-8"><div class="flcav-sweep" data-from="sweep" style="height: 300px"></div>'
@@ -107,7 +107,7 @@ def test_a_sweep_is_shown_in_any_page(opened, recorded_run, tmp_path):
     page = opened(page_file.as_uri())
     page.wait_for_selector(".flcav-sweep canvas")
     told = page.locator(".flcav-sweep canvas").get_attribute("aria-label")
-    assert "pretrained: 0 found, 2 missed, 0 false; after the last stage: 1 found, 1 missed, 1 false" in told
+    assert "pretrained: 0 found, 2 missed, 0 false; after edge FL: 1 found, 1 missed, 1 false" in told
 
 
 def test_points_and_boxes_of_a_sweep_are_those_of_its_frame(opened, recorded_run, recorded):

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import typer
 
-from flcav.cli.options import check_finite, check_png
+from flcav.cli.options import check_finite, check_png, refuse_unused
 from flcav.cli.terminal import echo
 from flcav.interface.wording import plural
 
@@ -89,9 +89,22 @@ def view(
     folder: Path = typer.Argument(metavar="DIR", help="A dataset, or the folder of a run, for its test frames."),
     scene: str | None = typer.Option(None, "--scene", help="Name of the scene; else the first."),
     save: Path | None = typer.Option(None, "--save", help="Write this .rrd file instead of opening the viewer."),
+    animate: Path | None = typer.Option(
+        None,
+        "--animate",
+        help="Write this .webp or .gif instead: eight seconds of a run's misses, pole, rounds and megabytes.",
+    ),
 ) -> None:
     """Show a scene in Rerun: points, images, boxes, tracks, map, radar. Needs the extra `view`."""
     from flcav.config import InputError
+
+    if animate is not None:
+        refuse_unused("--animate", "scene", "save")
+        from flcav.report.pages.loop_film import write_loop
+
+        frames, seconds = write_loop(folder, animate)
+        echo(f"{animate}: {plural(frames, 'frame')}, {seconds:g} s, {animate.stat().st_size / 1e6:.1f} MB")
+        return
     from flcav.interface import progress
     from flcav.interface.wording import format_install_command
     from flcav.storage.files import atomic_path

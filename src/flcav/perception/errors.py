@@ -47,6 +47,7 @@ class PerceptionError:
     occlusion: float  # of a missed object, in [0, 1]; NaN if unknown
     scene: str
     track: str  # track of the object; false positives are numbered per scene
+    distance_m: float = float("nan")  # from the vehicle in whose frame it was made, on the ground [m]; NaN if unknown
 
 
 @dataclass(frozen=True)
@@ -143,6 +144,11 @@ def is_among(error: PerceptionError, others: Iterable[PerceptionError], *, stand
     return any(other.track == error.track and (standing or other.scene == error.scene) for other in alike)
 
 
+def measure_distance(world_from_agent: Array, x: float, y: float) -> float:
+    """Return the distance on the ground [m] of a place in the world from a vehicle, whose pose (4, 4) is given."""
+    return float(np.hypot(*(world_from_agent[:2, 3] - (x, y))))
+
+
 def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
     """Write mistakes as Parquet or CSV, by the suffix of `path`; raises `InputError` for any other suffix.
 
@@ -156,7 +162,7 @@ def save_errors(errors: Sequence[PerceptionError], path: Path) -> None:
 
 
 def load_errors(path: Path) -> tuple[PerceptionError, ...]:
-    """Return the mistakes in a Parquet file that `save_errors` wrote."""
+    """Return the mistakes in a Parquet file that `save_errors` wrote; files of earlier versions have no distances."""
     rows = pq.read_table(path).to_pylist()
     return tuple(PerceptionError(**{("label" if name == CLASS else name): row[name] for name in row}) for row in rows)
 

@@ -39,6 +39,7 @@ class Desk:
     run: Mapping[str, Json] | None = None  # a finished run, as `replay` tells it
     footage: "Footage | None" = None  # what this run recorded
     spaces: dict[str, Workspace] = field(default_factory=dict)
+    regions: dict[str, str] = field(default_factory=dict)  # by workspace, of the run: those whose errors have sweeps
     _lock: threading.Lock = field(default_factory=threading.Lock, repr=False)
 
     def find(self, key: str) -> Workspace:

@@ -6,7 +6,7 @@ Everything is read from the run's folder when it is asked for, and is empty wher
 import base64
 import io
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -16,20 +16,22 @@ from PIL import Image
 from flcav.config import InputError, Json, shorten
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
-from flcav.perception.errors import THRESHOLD, PerceptionError, load_errors
+from flcav.perception.errors import MISS, THRESHOLD, PerceptionError, load_errors
 from flcav.perception.marks import PictureBoxes
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import load_network
 from flcav.planner.placing import describe_town
+from flcav.report.pictures.loop import find_instant
+from flcav.report.pictures.sweep_scene import describe_sweep
 from flcav.runs.frames import DATA, Frames
 from flcav.runs.recipe import PRETRAIN
 from flcav.runs.results.plans import Placed
 from flcav.runs.results.run import Run
 from flcav.runs.results.saved import ERRORS, WEIGHTS
-from flcav.runs.results.tests import SweepComparison, SweepDetections
-from flcav.runs.stages.testing import LOOK
+from flcav.runs.results.tests import SweepComparison
+from flcav.runs.stages.testing import LOOK, detect_before_after
 from flcav.sensors.frame import Frame
 from flcav.world.trace import Trace
 
@@ -37,7 +39,7 @@ WORK = "work"  # folder of a run's steps
 MOST_SCENES = 4  # of a recording that are played
 APART_S = 0.8  # least time between two poses that the page is given [s]
 PEDESTRIAN = "pedestrian"
-MOST_POINTS = 60_000  # of a sweep
+SAME_M = 1e-3  # difference of distances and places that are the same [m]
 MOST_PX = 960  # width of a picture
 MOST_FRAMES = 60  # of a test, among which the picture with most labels is looked for
 
@@ -96,7 +98,53 @@ class Footage:
         if region is None:
             raise InputError("the run's folder has no sweep before and after training")
         compared = SweepComparison.load(self.folder / WORK / LOOK)
-        return describe_sweep(dict(self._tests(OBJECTS.name))[region].frame(compared.frame), compared)
+        return describe_sweep(
+            dict(self._tests(OBJECTS.name))[region].frame(compared.frame), compared, self._first_stage
+        )
+
+    def error_sweep(self, region: str, row: int) -> dict[str, Json]:
+        """Return the sweep in which the error in a row of a region's table was made, with that place marked.
+
+        Both networks look at it anew. Raises `InputError` where the run does not have what that needs.
+        """
+        found, folder = self.errors_in(region, OBJECTS.name), self._where(region, "registry")
+        if found is None or folder is None:
+            raise InputError(f"{region}: the run's folder no longer has the sweeps of its errors")
+        errors = load_errors(found)
+        if row >= len(errors):
+            raise InputError(f"row: {region} has {len(errors)} errors")
+        split = Frames.open(folder)
+        number = find_frame(split, errors[row])
+        if number is None:
+            raise InputError("the table of errors does not tell in which sweep this one was made")
+        steps = [
+            self.folder / WORK / self.run.steps.stage(self.arm, stage, region, OBJECTS.name)
+            for stage in (PRETRAIN, self._first_stage)
+        ]
+        if not all((step / WEIGHTS).exists() for step in steps):
+            raise InputError("the run's folder no longer has its networks")
+        compared = detect_before_after(steps[0], steps[1], replace(split, vehicles=(number,)))
+        place = np.array((errors[row].x, errors[row].y, errors[row].z))
+        return describe_sweep(split.data.frame(number), compared, self._first_stage, place)
+
+    def has_error_sweeps(self, region: str) -> bool:
+        """Return whether the errors that the region's workspace shows are of objects, whose sweeps are still there."""
+        path = self.errors_of(region)
+        return (
+            path is not None
+            and path == self.errors_in(region, OBJECTS.name)
+            and self._where(region, "registry") is not None
+        )
+
+    def errors_of(self, region: str) -> Path | None:
+        """Return the table of a region's errors, of the first task that has one; None where none has."""
+        paths = (self.errors_in(region, task) for task in self.run.recipe.placement.tasks or self.run.recipe.tasks)
+        return next((path for path in paths if path is not None), None)
+
+    def errors_in(self, region: str, task: str) -> Path | None:
+        """Return the table of a task's errors in a region; None where the folder has none."""
+        path = self.folder / WORK / self.run.steps.errors(self.arm, region, task) / ERRORS
+        return path if path.exists() else None
 
     def picture(self, task: str) -> dict[str, Json]:
         """Return a test picture of a task with what is labelled, and what is found in it before and after training.
@@ -133,11 +181,14 @@ class Footage:
         return None
 
     def _errors(self, region: str) -> Sequence[PerceptionError]:
-        for task in self.run.recipe.placement.tasks or self.run.recipe.tasks:
-            path = self.folder / WORK / self.run.steps.errors(self.arm, region, task) / ERRORS
-            if path.exists():
-                return load_errors(path)
-        return []
+        path = self.errors_of(region)
+        return () if path is None else load_errors(path)
+
+    @property
+    def _first_stage(self) -> str:
+        """The stage after pretraining, whose network the run's sweep compares."""
+        stages = (each.stage for each in self.run.arms[self.arm].stages)
+        return next((stage for stage in stages if stage != PRETRAIN), PRETRAIN)
 
     def _sweep_region(self) -> str | None:
         """Return the region whose test has the sweep, the first that federates; None where the folder has none."""
@@ -172,6 +223,25 @@ class Footage:
                 yield {"title": title, "boxes": rows, "said": ", ".join(mark.caption for mark in finding.marks)}
 
 
+def find_frame(split: Frames, error: PerceptionError) -> int | None:
+    """Return the frame in which an error was made: the first whose vehicle is as far from it as the table says.
+
+    A missed object is there, too. None where there is no such frame, as in tables without distances.
+    """
+    data, place = split.data, np.array((error.x, error.y))
+    for number in split.vehicles:
+        if data.keys[number].scene != error.scene:
+            continue
+        far = np.hypot(*(data.world_from_agent(number)[:2, 3] - place))
+        if not abs(far - error.distance_m) <= SAME_M:  # nor is it where the distance is NaN
+            continue
+        truth = data.frame(number).annotations
+        there = np.hypot(*(truth.boxes.center[truth.track == error.track, :2] - place).T) <= SAME_M
+        if error.kind != MISS or there.any():
+            return number
+    return None
+
+
 def _tenth(value: float) -> float:
     return round(float(value), 1)
 
@@ -191,11 +261,8 @@ def _first_traces(data: Dataset) -> Iterator[tuple[str, Trace]]:
 
 def _when(trace: Trace, track: str, at: tuple[float, float]) -> float:
     """Return the time [s] from the start of a trace at which an error was made: its road user is nearest to it then."""
-    rows = np.flatnonzero(trace.actor == track)
-    if not len(rows):
-        return 0.0
-    far = np.hypot(*(trace.position[:, rows[0], :2] - at).T)
-    return 0.0 if np.isnan(far).all() else _tenth(trace.time_s[int(np.nanargmin(far))] - trace.time_s[0])
+    instant = find_instant(trace, track, at)
+    return 0.0 if instant is None else _tenth(trace.time_s[instant] - trace.time_s[0])
 
 
 def _drive(trace: Trace) -> dict[str, Json]:
@@ -214,29 +281,6 @@ def _drive(trace: Trace) -> dict[str, Json]:
             size = trace.size[number, :2].round(1).tolist()
             users.append({"name": name, "walks": category == PEDESTRIAN, "size": size, "path": path})
     return {"times": (trace.time_s[kept] - trace.time_s[0]).round(2).tolist(), "users": users}
-
-
-def describe_sweep(frame: Frame, compared: SweepComparison) -> dict[str, Json]:
-    """Return a sweep and its matched boxes as `scene.js` takes them: points as base64 of int16 [cm]."""
-    lidar = next(iter(frame.lidar))
-    points = frame.lidar[lidar][:, :3]
-    points = points[np.isfinite(points).all(axis=1) & (np.abs(points) < 320).all(axis=1)][:MOST_POINTS]
-    centimetres = np.round(points * 100).astype("<i2")
-    return {
-        "points": base64.b64encode(centimetres.tobytes()).decode(),
-        "ground": -float(frame.agent_from_sensor[lidar][2, 3]),
-        "targets": _boxes(compared.targets),
-        "before": _side("pretrained", compared.before),
-        "after": _side("after the last stage", compared.after),
-    }
-
-
-def _side(title: str, seen: SweepDetections) -> dict[str, Json]:
-    return {"title": title, "boxes": _boxes(seen.boxes), "hit": list(seen.hit), "found": list(seen.found)}
-
-
-def _boxes(rows: Sequence[Sequence[float]]) -> list[Json]:
-    return [[round(value, 2) for value in row[:7]] for row in rows]
 
 
 def _labels(frame: Frame, camera: str, *, signs: bool) -> list[Json]:

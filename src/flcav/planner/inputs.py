@@ -27,7 +27,7 @@ from flcav.world.trace import Trace
 Array = NDArray[np.float64]
 
 FACTORS = ("weight", "severity", "exposure")  # columns of errors whose product is an error's weight
-ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "track")
+ERRORS = (*AXES, *FACTORS, CLASS, "kind", "returns", "occlusion", "scene", "track", "distance_m")
 POLES = ("id", *AXES, "cost", "yaw_deg", "kind", "height_m")
 SENSORS = ("name", "range_m", "cost")
 REGISTERED = {MISS, FALSE_POSITIVE, FINAL_ERROR}  # kinds of errors; other rows are user-defined points

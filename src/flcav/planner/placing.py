@@ -302,7 +302,9 @@ def describe_workspace(space: Workspace) -> dict[str, Json]:
     ]
     errors: list[Json] = []
     if given is not None:
-        columns = {name: given.column(name) for name in ("class", "returns", "occlusion", "scene", "track")}
+        columns = {
+            name: given.column(name) for name in ("class", "returns", "occlusion", "distance_m", "scene", "track")
+        }
         for row, (xyz, weight, kind) in enumerate(
             zip(given.errors.tolist(), given.weight.tolist(), given.kind.tolist())
         ):

@@ -5,9 +5,8 @@ from pathlib import Path
 
 from flcav.config import InputError, Json
 from flcav.planner.desk import Desk, lay_out, with_errors
-from flcav.planner.footage import WORK, Footage
+from flcav.planner.footage import Footage
 from flcav.runs.results.run import ArmResult, Run
-from flcav.runs.results.saved import ERRORS
 from flcav.runs.results.training import StageResult
 from flcav.storage.records import select
 from flcav.world.map.town import load_town
@@ -27,16 +26,16 @@ def open_run(folder: Path) -> Desk:
     if not run.arms:
         raise InputError(f"{folder}: the run has no arm")
     arm = "main" if "main" in run.arms else next(iter(run.arms))
-    task = run.recipe.placement.tasks[0] if run.recipe.placement.tasks else next(iter(run.recipe.tasks))
     footage = Footage(folder, run, arm)
     desk = Desk(run={**describe_run(run, arm, folder.resolve().name), "footage": footage.shown}, footage=footage)
     for placed in run.arms[arm].placed:
-        errors = folder / WORK / run.steps.errors(arm, placed.region, task) / ERRORS
-        region = run.recipe.regions[placed.region]
-        if errors.exists() and region.data is None:
+        errors, region = footage.errors_of(placed.region), run.recipe.regions[placed.region]
+        if errors is not None and region.data is None:
             town = load_town(region.town or placed.region, folder)
             space = with_errors(lay_out(town), errors)
             key = desk.add(space, f"{town.name}~{placed.region}")
+            if footage.has_error_sweeps(placed.region):
+                desk.regions[key] = placed.region
             desk.first = desk.first or key
     return desk
 

@@ -98,6 +98,13 @@ class AskedFootage(Body):
     name: str = Field(default="", max_length=64)
 
 
+class AskedError(Body):
+    """An error of a workspace, by its row in the table."""
+
+    workspace: str = Field(max_length=64)
+    row: int = Field(ge=0)
+
+
 class DroppedRun(Body):
     """What the page took from a run's folder that was dropped on it: texts of base64 by path in the folder."""
 

@@ -7,6 +7,7 @@ from flcav.planner.desk import Desk
 from flcav.planner.exporting import write_command
 from flcav.planner.placing import Question, describe_town, describe_workspace, look, trace_curve
 from flcav.planner.server import ASSETS
+from flcav.report.scene import SCENE
 
 MOST_MB = 5.0  # of a page, to be sent by mail
 POLICY = "default-src 'none'; script-src 'unsafe-inline'; style-src 'unsafe-inline'; img-src data: blob:"
@@ -42,8 +43,8 @@ def save_page(desk: Desk) -> bytes:
 
 def _join(saved: str) -> bytes:
     """Return the page of the server with its style, its program and what is `saved` in it."""
-    names = ("index.html", "planner.css", "planner.js", "scene.js")
-    page, style, program, scene = ((ASSETS / name).read_text("utf-8") for name in names)
+    paths = (*(ASSETS / name for name in ("index.html", "planner.css", "planner.js")), SCENE)
+    page, style, program, scene = (path.read_text("utf-8") for path in paths)
     policy = f'<meta charset="utf-8">\n<meta http-equiv="content-security-policy" content="{POLICY}">'
     program, scene = (text.replace("</script", "<\\/script") for text in (program, scene))
     data = f'<script type="application/json" id="saved">{saved}</script>'

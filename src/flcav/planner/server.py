@@ -39,6 +39,7 @@ from flcav.planner.planning import plan_budgets, plan_more, with_budgets
 from flcav.planner.requests import (
     MOST_BYTES,
     AskedBest,
+    AskedError,
     AskedExport,
     AskedFootage,
     AskedLook,
@@ -49,13 +50,18 @@ from flcav.planner.requests import (
     DroppedRun,
 )
 from flcav.planner.uploads import take_file, take_run
+from flcav.report.scene import SCENE
 
 if TYPE_CHECKING:
     from flcav.planner.footage import Footage  # loads torch, as runs do
 
 ASSETS = Path(__file__).with_name("assets")
-SHOWN = {"": ("index.html", "text/html"), "planner.js": ("planner.js", "text/javascript")}
-SHOWN |= {"planner.css": ("planner.css", "text/css"), "scene.js": ("scene.js", "text/javascript")}
+SHOWN = {
+    "": (ASSETS / "index.html", "text/html"),
+    "planner.js": (ASSETS / "planner.js", "text/javascript"),
+    "planner.css": (ASSETS / "planner.css", "text/css"),
+    "scene.js": (SCENE, "text/javascript"),
+}
 POLICY = (
     "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; "
     "connect-src 'self'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
@@ -216,6 +222,13 @@ def make_app(desk: Desk, token: str) -> FastAPI:
     def sweep() -> dict[str, Json]:
         return _footage(desk).sweep()
 
+    @app.post("/api/error-sweep", **guarded)
+    def error_sweep(asked: AskedError) -> dict[str, Json]:
+        if asked.workspace not in desk.regions:
+            raise InputError("there are no sweeps of these errors: flcav planner RUN")
+        with busy:
+            return _footage(desk).error_sweep(desk.regions[asked.workspace], asked.row)
+
     @app.post("/api/picture", **guarded)
     def picture(asked: AskedFootage) -> dict[str, Json]:
         with busy:
@@ -227,7 +240,7 @@ def make_app(desk: Desk, token: str) -> FastAPI:
         if name not in SHOWN:
             return _refuse(404, "there is no such page")
         path, kind = SHOWN[name]
-        return Response((ASSETS / path).read_bytes(), media_type=kind, headers=HEADERS)
+        return Response(path.read_bytes(), media_type=kind, headers=HEADERS)
 
     return app
 
@@ -264,7 +277,8 @@ def _footage(desk: Desk) -> "Footage":
 
 def _describe(desk: Desk, key: str) -> dict[str, Json]:
     space = desk.find(key)
-    return {"key": key, "map": describe_town(space.town), **describe_workspace(space)}
+    told = {"key": key, "map": describe_town(space.town), "sweeps": desk.footage is not None and key in desk.regions}
+    return {**told, **describe_workspace(space)}
 
 
 def serve_planner(desk: Desk, port: int | None, report: Callable[[str], None]) -> None:

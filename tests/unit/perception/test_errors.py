@@ -1,5 +1,6 @@
 """The error registry of signs and trajectories on a drive: misses in their place, inventions where their rays meet."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from flcav.perception.errors import (
     Registry,
     is_among,
     keep_first,
+    load_errors,
     pack_errors,
     save_errors,
     unpack_errors,
@@ -105,6 +107,7 @@ def test_an_invented_sign_is_where_its_ray_meets_the_town_or_is_dropped(drive, n
     frame = drive.frame(0)
     camera_from_world = np.linalg.inv(frame.world_from_sensor("front"))
     x, y, z = camera_from_world[:3, :3] @ (error.x, error.y, error.z) + camera_from_world[:3, 3]
+    assert error.distance_m == pytest.approx(np.linalg.norm(frame.world_from_agent[:2, 3] - (error.x, error.y)))
     assert z == pytest.approx(image.depth_m[tuple(ground)], rel=0.02)
     assert frame.calibration.intrinsics["front"] @ (x / z, y / z, 1) == pytest.approx((*(ground[::-1]), 1), abs=0.01)
 
@@ -122,6 +125,8 @@ def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypa
     (error,) = result.errors
     assert error.kind == FINAL_ERROR
     assert (error.x, error.y) == pytest.approx(tuple(samples.columns.pose[0, :2]))
+    vehicle = drive.frame(int(samples.columns.frame[0])).world_from_agent[:2, 3]
+    assert error.distance_m == pytest.approx(np.linalg.norm(vehicle - (error.x, error.y)))
     trace = drive.trace(error.scene)
     assert trace is not None
     assert error.track == trace.actor[samples.columns.actor[0]]
@@ -134,7 +139,7 @@ def test_a_path_that_ends_elsewhere_is_registered_at_the_present(drive, monkeypa
 
 
 def made(kind: str, track: str, x: float = 0.0, scene: str = "a") -> PerceptionError:
-    return PerceptionError(x, 0.0, 0.0, 1.0, kind, "Car", 3, 0.5, scene, track)
+    return PerceptionError(x, 0.0, 0.0, 1.0, kind, "Car", 3, 0.5, scene, track, 12.5)
 
 
 def test_each_mistake_is_kept_once():
@@ -160,6 +165,16 @@ def test_a_server_registers_what_vehicles_report_as_if_it_had_seen_it():
     assert [(error.track, error.scene) for error in standing if error.kind == MISS] == [("veh1", "a")]
     assert (len(standing), standing.dropped) == (3, 2)
     assert unpack_errors(pack_errors([])) == ()
+
+
+def test_a_table_of_an_earlier_version_has_no_distances(tmp_path: Path):
+    path = tmp_path / "errors.parquet"
+    save_errors([made(MISS, "veh1")], path)
+    assert load_errors(path) == (made(MISS, "veh1"),)
+    pq.write_table(pq.read_table(path).drop_columns("distance_m"), path)
+    (error,) = load_errors(path)
+    assert np.isnan(error.distance_m)
+    assert replace(error, distance_m=12.5) == made(MISS, "veh1")
 
 
 @pytest.mark.parametrize("ending", [".csv", ".parquet"])

@@ -98,6 +98,9 @@ def test_misses_are_registered_once_per_track():
     assert math.isclose(errors[0].x, 120)  # where it was first missed
     assert math.isclose(errors[0].z, 0.8)
     assert (errors[0].returns, errors[0].occlusion, errors[0].label) == (9, 0.25, "Car")
+    assert [e.distance_m for e in errors] == pytest.approx(
+        [20, 30, 10]
+    )  # from the vehicle, not from the world's origin
 
 
 def test_low_scores_do_not_find():
@@ -113,6 +116,7 @@ def test_false_positives_need_a_return_and_are_one_per_place():
     errors = register(frames, [found] * 3, CONFIG)
     assert [(e.kind, e.scene) for e in errors] == [("false_positive", "s0")] * 2 + [("false_positive", "s1")] * 2
     assert {round(e.x) for e in errors} == {10, 30}
+    assert all(math.isclose(e.distance_m, math.hypot(e.x, e.y)) for e in errors)
     assert all(e.returns >= 6 for e in errors)
 
 

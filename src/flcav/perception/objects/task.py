@@ -17,7 +17,7 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import frame_reader
-from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, Registry
+from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, Registry, measure_distance
 from flcav.perception.metrics.detection import assign_targets, on_neutral
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
 from flcav.perception.objects.evaluate import (
@@ -90,7 +90,10 @@ def _misses(frame: Frame, found: Boxes, matched: np.ndarray, config: SecondConfi
         annotations.boxes.center.tolist(), label, truth.returns, annotations.occlusion, annotations.track, missed
     )
     return [
-        PerceptionError(x, y, z, 1.0, MISS, str(name), int(returns), float(hidden), frame.scene, str(track))
+        PerceptionError(
+            *(x, y, z, 1.0, MISS, str(name), int(returns), float(hidden), frame.scene, str(track)),
+            distance_m=measure_distance(frame.world_from_agent, x, y),
+        )
         for (x, y, z), name, returns, hidden, track, lost in rows
         if lost
     ]
@@ -102,7 +105,10 @@ def _false_positives(frame: Frame, found: Boxes, config: SecondConfig) -> list[P
     returns = points_in_boxes(frame.lidar[name], found).sum(1)
     world = transform_points(frame.world_from_sensor(name), found.center)
     return [
-        PerceptionError(x, y, z, 1.0, FALSE_POSITIVE, str(label), int(count), float("nan"), frame.scene, "")
+        PerceptionError(
+            *(x, y, z, 1.0, FALSE_POSITIVE, str(label), int(count), float("nan"), frame.scene, ""),
+            distance_m=measure_distance(frame.world_from_agent, x, y),
+        )
         for (x, y, z), label, count in zip(world.tolist(), found.label, returns, strict=True)
         if count >= 1
     ]

@@ -10,7 +10,7 @@ from flcav.config import InputError
 from flcav.dataset.rectangles import CLASSES, HALF_PX, select_rectangles
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry
+from flcav.perception.errors import FALSE_POSITIVE, MISS, PerceptionError, Registry, measure_distance
 from flcav.perception.images import check_picture
 from flcav.perception.metrics.detection import match_greedily
 from flcav.perception.ops.boxes import rectangle_iou
@@ -98,7 +98,10 @@ def _misses(frame: Frame, camera: str, rows: Ints, things: SignsAndSignals) -> I
         label = CLASSES["signs"][shown.label[int(np.flatnonzero(shown.row == row)[0])]]
         x, y, z = things.position[thing].tolist()
         track = f"{signs.kind[row]}{thing}"
-        yield PerceptionError(x, y, z, 1.0, MISS, label, 0, float("nan"), frame.scene, track)
+        yield PerceptionError(
+            *(x, y, z, 1.0, MISS, label, 0, float("nan"), frame.scene, track),
+            distance_m=measure_distance(frame.world_from_agent, x, y),
+        )
 
 
 def _meets(
@@ -120,4 +123,7 @@ def _meets(
             continue
         x, y, z = (world_from_camera[:3, :3] @ ray * metres + world_from_camera[:3, 3]).tolist()
         label = config.classes[found.label[number]]
-        yield PerceptionError(x, y, z, 1.0, FALSE_POSITIVE, label, 0, float("nan"), frame.scene, "")
+        yield PerceptionError(
+            *(x, y, z, 1.0, FALSE_POSITIVE, label, 0, float("nan"), frame.scene, ""),
+            distance_m=measure_distance(frame.world_from_agent, x, y),
+        )

@@ -14,7 +14,7 @@ from flcav.arrays import Array, Mask, Words
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry
+from flcav.perception.errors import FINAL_ERROR, PerceptionError, Registry, measure_distance
 from flcav.perception.outcomes import Outcomes, Times, Values, weighted_mean
 from flcav.perception.task import Evaluated
 from flcav.perception.trajectory.config import TrajectoryConfig
@@ -282,6 +282,9 @@ def register_path_errors(
         x, y, _ = columns.pose[row].tolist()
         z, label = 0.0 if town is None else town.ground(x, y), str(trace.category[actor])
         misses.setdefault(int(columns.frame[row]), []).append(
-            PerceptionError(x, y, z, 1.0, FINAL_ERROR, label, 0, float("nan"), scene, str(trace.actor[actor]))
+            PerceptionError(
+                *(x, y, z, 1.0, FINAL_ERROR, label, 0, float("nan"), scene, str(trace.actor[actor])),
+                distance_m=measure_distance(data.world_from_agent(int(columns.frame[row])), x, y),
+            )
         )
     return Registry.of(misses)

@@ -1,5 +1,6 @@
 """HTML page and pictures of a run, from its results and the files of its steps."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -8,6 +9,7 @@ from typing import Any, Protocol
 import numpy as np
 from matplotlib.figure import Figure
 
+from flcav.config import Json
 from flcav.dataset.ground import DatasetGround
 from flcav.dataset.store import Dataset
 from flcav.federation.privacy import SEEDED
@@ -22,6 +24,8 @@ from flcav.report.charts.timeline import timeline_of_rounds
 from flcav.report.pages import html
 from flcav.report.pictures import clouds, maps, perspective
 from flcav.report.pictures.changes import ErrorChanges, draw_changes, look_from_poles
+from flcav.report.pictures.sweep_scene import describe_sweep
+from flcav.report.scene import SCENE, pack
 from flcav.runs.analysis.answer import list_stage_means, tell_answer
 from flcav.runs.analysis.caveats import PLACED_BARE
 from flcav.runs.analysis.claims import ClaimRow, list_claims
@@ -39,12 +43,14 @@ from flcav.runs.results.training import TOGETHER
 from flcav.runs.running import WORK
 from flcav.runs.stages.testing import LOOK
 from flcav.runs.training.records import list_rounds
+from flcav.sensors.frame import Frame
 from flcav.storage.files import write_bytes
 from flcav.storage.records import select
 
 OBJECTS, SWEEP, OVERVIEW = "objects", "before_after", "overview"
 PHOTOS = (SWEEP, OVERVIEW)  # pictures of many points, which the page has as PNG files, the latter not at all
 SHOWN_ROUNDS = 3  # number of rounds in a timeline
+MOST_POINTS = 30_000  # of the sweep that the page draws
 
 
 class DrawSection(Protocol):
@@ -78,13 +84,20 @@ class Seen:
 
     changes: Mapping[str, ErrorChanges] = field(default_factory=dict)
     sweep: SweepComparison | None = None
+    scene: Mapping[str, Json] | None = None  # this sweep as `scene.js` draws it
 
 
 def read_seen(run: Run, work: Path) -> Seen:
     """Return the errors by region and the chosen sweep, those that the run has."""
     placed = run.arms[MAIN].placed
-    changes = {place.region: found for place in placed if (found := _read_changes(run, work, place)) is not None}
-    return Seen(changes, SweepComparison.load(work / LOOK) if (work / LOOK).is_dir() else None)
+    changes = {place.region: found for place in placed if (found := read_changes(run, work, place)) is not None}
+    if not (work / LOOK).is_dir():
+        return Seen(changes)
+    compared = SweepComparison.load(work / LOOK)
+    stage = next((each.stage for each in run.arms[MAIN].stages if each.stage != PRETRAIN), EDGE)
+    return Seen(
+        changes, compared, describe_sweep(_read_frame(work, run, compared)[0], compared, stage, most=MOST_POINTS)
+    )
 
 
 def page(run: Run, seen: Seen | None = None) -> dict[str, Any]:
@@ -95,6 +108,7 @@ def page(run: Run, seen: Seen | None = None) -> dict[str, Any]:
         **vars(main),
         **vars(run),
         "seen": seen or Seen(),
+        "packed": _pack_scene(seen),
         "tasks": list(recipe.tasks),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "means": list_stage_means(run),
@@ -126,6 +140,13 @@ def page(run: Run, seen: Seen | None = None) -> dict[str, Any]:
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
         "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
     }
+
+
+def _pack_scene(seen: Seen | None) -> Mapping[str, str]:
+    """Return the sweep and the script that draws it, packed; empty without a sweep."""
+    if seen is None or seen.scene is None:
+        return {}
+    return {"sweep": pack(json.dumps(seen.scene)), "scene": pack(SCENE.read_text("utf-8"))}
 
 
 def _span(claims: Sequence[ClaimRow]) -> tuple[float, float]:
@@ -195,7 +216,7 @@ def _file_name(task: str) -> str:
     return task.replace(":", "_")
 
 
-def _read_changes(run: Run, work: Path, placed: Placed) -> ErrorChanges | None:
+def read_changes(run: Run, work: Path, placed: Placed) -> ErrorChanges | None:
     """Return a region's errors and what became of them; None without a town, poles, or tasks of the placement."""
     names, tasks = run.steps, run.recipe.placement.tasks
     if not tasks or not placed.poles or not (work / names.remaining(placed.region, tasks[0])).is_dir():
@@ -232,12 +253,17 @@ def _chart(run: Run, rows: Sequence[Row], task: str) -> tuple[list[Row], list[Ro
 
 
 def _read_sweep(work: Path, run: Run, looked: SweepComparison) -> clouds.ComparedSweep:
-    region = run.recipe.with_role("federate")[0]
-    data: Dataset = Frames.open(work / run.steps.recording(region, "test", OBJECTS)).data
-    frame = data.frame(looked.frame)
+    frame, data = _read_frame(work, run, looked)
     points, ground_m = clouds.read_sweep(frame, choose_lidar(frame), DatasetGround(data).relief)
     before, after = _detections("Pretrained", looked.before), _detections("After edge FL", looked.after)
     return clouds.ComparedSweep(points, ground_m, _boxes(looked.targets), before, after)
+
+
+def _read_frame(work: Path, run: Run, looked: SweepComparison) -> tuple[Frame, Dataset]:
+    """Return the frame of the run's sweep, and its dataset."""
+    region = run.recipe.with_role("federate")[0]
+    data: Dataset = Frames.open(work / run.steps.recording(region, "test", OBJECTS)).data
+    return data.frame(looked.frame), data
 
 
 def _detections(title: str, seen: SweepDetections) -> clouds.MatchedDetections:

@@ -2,12 +2,13 @@
 import type { Kind, Placing, Stand } from "./types";
 
 export type Tab = "place" | "plan" | "replay";
-export type Shared = { town: string; tab: Tab | null; placing: Partial<Placing>; budgets: number[]; solid: boolean };
+export type Played = { region: string; moment: number }; // what is replayed: a region's map, and the number of a moment
+export type Shared = { town: string; tab: Tab | null; placing: Partial<Placing>; budgets: number[]; solid: boolean; played: Played };
 
 const enc = encodeURIComponent;
 const short = (value: number) => String(Math.round(value * 100) / 100);
 
-export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: number[], solid: boolean): string {
+export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: number[], solid: boolean, played: Played): string {
   const parts = [];
   if (town) parts.push(`t=${enc(town)}`);
   if (tab !== "place") parts.push(`tab=${tab}`);
@@ -24,6 +25,7 @@ export function writeAddress(town: string, tab: Tab, placing: Placing, budgets: 
     if (solid) parts.push("v=3d");
     if (placing.without.length) parts.push(`w=${placing.without.map(enc).join(";")}`);
   }
+  if (tab === "replay") parts.push(...(played.region ? [`r=${enc(played.region)}`] : []), `m=${played.moment}`);
   if (budgets.length) parts.push(`b=${budgets.map(short).join(",")}`);
   return parts.join("&");
 }
@@ -60,5 +62,7 @@ export function readAddress(hash: string): Shared {
   if (without) placing.without = without.split(";").map(text);
   const tab = fields.get("tab");
   const budgets = (fields.get("b") ?? "").split(",").map(Number).filter((each) => each > 0);
-  return { town: text(fields.get("t") ?? ""), tab: tab === "place" || tab === "plan" || tab === "replay" ? tab : null, placing, budgets, solid: fields.get("v") === "3d" };
+  const moment = Number(fields.get("m") ?? 0);
+  const played = { region: text(fields.get("r") ?? ""), moment: Number.isInteger(moment) && moment > 0 ? moment : 0 };
+  return { played, town: text(fields.get("t") ?? ""), tab: tab === "place" || tab === "plan" || tab === "replay" ? tab : null, placing, budgets, solid: fields.get("v") === "3d" };
 }

@@ -18,6 +18,7 @@ export interface Api {
   more(budgets: Budgets): Promise<{ savings?: Saving[] }>;
   drive(region: string): Promise<RegionDrive>;
   sweep(): Promise<SweepData>;
+  errorSweep(key: string, row: number): Promise<SweepData>;
   picture(task: string): Promise<Picture>;
 }
 export type Budgets = { wireless_mb: number; wireline_mb: number; horizon_s: number | null };
@@ -98,6 +99,7 @@ export function makeLive(poles: () => number): Api {
     more: (budgets) => ask("plan-more", budgets),
     drive: (name) => ask("drive", { name }),
     sweep: () => ask("sweep", {}),
+    errorSweep: (key, row) => ask("error-sweep", { workspace: key, row }),
     picture: (name) => ask("picture", { name }),
   };
 }
@@ -130,6 +132,7 @@ export function makeSaved(saved: Saved): Api {
     more: none,
     drive: none,
     sweep: none,
+    errorSweep: none,
     picture: none,
   };
 }

@@ -5,13 +5,15 @@ import type { Api } from "./api";
 import { DriveView, tellMoment, type Clock } from "./drive";
 import { loadScenes } from "./scenes";
 import type { SweepData, SweepScene } from "./scene/sweep";
-import type { Picture, RegionDrive, RunInfo } from "./types";
+import { nameOf, tellDistance } from "./errors";
+import type { Picture, RegionDrive, RunInfo, Workspace } from "./types";
 
 type Asked = { api: Api; run: RunInfo; fail: (error: unknown) => void };
 
-export function Drives({ api, run, fail, clock, playing }: Asked & { clock: RefObject<Clock>; playing: boolean }) {
+type Driven = { clock: RefObject<Clock>; playing: boolean; region: string; pick: (region: string) => void };
+
+export function Drives({ api, run, fail, clock, playing, region, pick }: Asked & Driven) {
   const { regions } = run.footage;
-  const [region, setRegion] = useState(regions[0]);
   const [drives, setDrives] = useState<Record<string, RegionDrive>>({});
   useEffect(() => {
     if (!drives[region]) api.drive(region).then((found) => setDrives((held) => ({ ...held, [region]: found }))).catch(fail);
@@ -21,7 +23,7 @@ export function Drives({ api, run, fail, clock, playing }: Asked & { clock: RefO
     <section class="footage" aria-label="Drives">
       {regions.length > 1 && (
         <div class="row" role="group" aria-label="Region">
-          {regions.map((each) => <button type="button" aria-pressed={each === region} onClick={() => setRegion(each)}>{each}</button>)}
+          {regions.map((each) => <button type="button" aria-pressed={each === region} onClick={() => pick(each)}>{each}</button>)}
         </div>
       )}
       {shown ? <DriveView {...{ shown, region, clock, playing }} moments={run.moments} /> : <p class="drive wait" role="status">Reading the drives of {region} …</p>}
@@ -30,7 +32,8 @@ export function Drives({ api, run, fail, clock, playing }: Asked & { clock: RefO
   );
 }
 
-export function Sweep({ api, fail }: { api: Api; fail: (error: unknown) => void }) {
+/** A sweep before and after, drawn once it is read; `once` is what it is read for. */
+function SweepView({ load, once, fail }: { load: () => Promise<SweepData>; once: string; fail: (error: unknown) => void }) {
   const host = useRef<HTMLDivElement>(null);
   const [told, setTold] = useState<[string, string] | null>(null);
   const [refused, setRefused] = useState("");
@@ -40,7 +43,7 @@ export function Sweep({ api, fail }: { api: Api; fail: (error: unknown) => void 
     const watch = new IntersectionObserver(([entry]) => {
       if (!entry.isIntersecting) return;
       watch.disconnect();
-      Promise.all([api.sweep(), loadScenes()]).then(([data, scenes]: [SweepData, Awaited<ReturnType<typeof loadScenes>>]) => {
+      Promise.all([load(), loadScenes()]).then(([data, scenes]: [SweepData, Awaited<ReturnType<typeof loadScenes>>]) => {
         if (gone) return;
         setTold(scenes.tellSweep(data));
         try {
@@ -48,19 +51,43 @@ export function Sweep({ api, fail }: { api: Api; fail: (error: unknown) => void 
         } catch (error) {
           setRefused((error as Error).message);
         }
-      }).catch(fail);
+      }).catch((error) => [!gone && setRefused((error as Error).message), fail(error)]);
     }, { rootMargin: "200px" });
     watch.observe(host.current!);
     return () => [(gone = true), watch.disconnect(), made?.dispose()] as unknown as void;
-  }, []);
+  }, [once]);
+  return (
+    <>
+      <div class="sides">{told ? told.map((each) => <p><b>{each.split(": ")[0]}</b> {each.split(": ")[1]}</p>) : !refused && <p class="wait" role="status">Reading the sweep …</p>}</div>
+      <div class="sweep" ref={host}>{refused && <p class="refused" role="alert">{refused}</p>}</div>
+      <ul class="keys"><li class="found">found</li><li class="missed">missed</li><li class="false">false</li></ul>
+    </>
+  );
+}
+
+export function Sweep({ api, fail }: { api: Api; fail: (error: unknown) => void }) {
   return (
     <section class="footage">
       <h2>A test sweep before and after</h2>
-      <div class="sides">{told ? told.map((each) => <p><b>{each.split(": ")[0]}</b> {each.split(": ")[1]}</p>) : <p class="wait" role="status">Reading the sweep …</p>}</div>
-      <div class="sweep" ref={host}>{refused && <p class="refused" role="alert">{refused}</p>}</div>
-      <ul class="keys"><li class="found">found</li><li class="missed">missed</li><li class="false">false</li></ul>
+      <SweepView load={() => api.sweep()} once="" fail={fail} />
       <p class="note">Drag to turn, wheel or two fingers to go nearer. The sweep is the test's with the median gain.</p>
     </section>
+  );
+}
+
+/** The sweep in which an error was made, in a window of its own above the map. */
+export function ErrorSweep({ api, space, row, onClose }: { api: Api; space: Workspace; row: number; onClose: () => void }) {
+  const dialog = useRef<HTMLDialogElement>(null);
+  useEffect(() => dialog.current?.showModal(), []);
+  const error = space.errors[row];
+  const far = tellDistance(error);
+  return (
+    <dialog ref={dialog} class="over footage" aria-label="The sweep of an error" onClose={onClose} onKeyDown={(event) => event.stopPropagation()}>
+      <h2>{nameOf(error)}{far && `, ${far} from the vehicle`}{error.occlusion != null && `, ${Math.round(error.occlusion * 100)} % hidden from it`}</h2>
+      <SweepView load={() => api.errorSweep(space.key, row)} once={`${space.key} ${row}`} fail={() => {}} />
+      <p class="note">The arrow marks the error. Both networks look at the sweep anew; boxes are of what has five returns or more. Drag or arrows turn it, wheel, + and − go nearer and away.</p>
+      <button type="button" class="primary" onClick={() => dialog.current?.close()}>Back to the map</button>
+    </dialog>
   );
 }
 

@@ -25,6 +25,7 @@ function App() {
   });
   const [tab, setTab] = useState<Tab>(shared.tab ?? "place");
   const [solid, setSolid] = useState(shared.solid);
+  const [played, setPlayed] = useState(shared.played);
   const [budgets, setBudgets] = useState<Budgets | null>(null);
   const [busy, setBusy] = useState("");
   const [problem, setProblem] = useState("");
@@ -58,7 +59,7 @@ function App() {
         setBudgets({ wireless_mb: wireless_mb ?? problem.wireless_mb, wireline_mb: wireline_mb ?? problem.wireline_mb, horizon_s: horizon_s ?? problem.horizon_s });
         setTab("plan");
       }
-      if (found.run && !shared.town) setTab("replay");
+      if (found.run && !shared.tab && !shared.town) setTab("replay");
       const wanted = shared.town || found.first;
       if (!wanted || ((found.problem || found.run) && !found.first)) return;
       setBusy(`Opening ${wanted} …`);
@@ -80,9 +81,9 @@ function App() {
   useEffect(() => {
     if (!start || api.saved) return;
     const numbers = budgets && tab === "plan" ? [budgets.wireless_mb, budgets.wireline_mb, ...(budgets.horizon_s ? [budgets.horizon_s] : [])] : [];
-    const address = writeAddress(space?.key ?? "", tab, placing, numbers, solid);
+    const address = writeAddress(space?.key ?? "", tab, placing, numbers, solid, played);
     if (address.length < 2000) history.replaceState(null, "", `${location.pathname}#${address}`);
-  }, [space, tab, placing, budgets, start, solid]);
+  }, [space, tab, placing, budgets, start, solid, played]);
 
   const open = (name: string) => {
     setBusy(`Opening ${name} …`);
@@ -106,6 +107,7 @@ function App() {
       .then(async (found) => api.dropRun(found.name, await packFolder(found)))
       .then((found) => {
         setStart(found);
+        setPlayed({ region: "", moment: 0 });
         setTab("replay");
         setNotice(`Rounds and errors of ${found.run!.name} were read. Its drives, sweeps and pictures are shown by: flcav planner ${found.run!.name}`);
         if (!space && found.first) return api.workspace(found.first).then((at) => take(at, found.kinds));
@@ -158,7 +160,7 @@ function App() {
       {busy && <div class="busy" role="status"><i aria-hidden="true" />{busy}</div>}
       {tab === "place" && space && placing.kinds.length > 0 && <Place {...{ api, space, placing, setPlacing, undo, solid, setSolid, say, fail }} />}
       {tab === "plan" && start?.problem && budgets && <PlanTab {...{ api, problem: start.problem, budgets, setBudgets, say, fail }} />}
-      {tab === "replay" && start?.run && <Replay api={api} run={start.run} say={say} fail={fail} />}
+      {tab === "replay" && start?.run && <Replay key={start.run.name} {...{ api, played, setPlayed, say, fail }} run={start.run} />}
       {start && !space && !start.problem && !start.run && !busy && <Welcome cards={start.towns} onOpen={open} onFile={drop} onFolder={dropRun} />}
       <p class="said" role="status" aria-live="polite">{said}</p>
     </>

@@ -1,8 +1,9 @@
 /** The map: a town in metres, its errors, poles and sensors, with pointer and keyboard. */
 import { memo } from "preact/compat";
 import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
+import { besides, hasSweep, pressErrorKey, Sign, Tip } from "./errors";
 import { placeOf, pressKey, settleAt, useCarried, type MapProps } from "./standing";
-import type { Look, Point, Pole, Stand, TownMap, Wrong } from "./types";
+import type { Point, Stand, TownMap } from "./types";
 
 const path = (points: Point[]) => `M${points.map(([x, y]) => `${x} ${y}`).join("L")}Z`;
 
@@ -17,6 +18,7 @@ const Ground = memo(({ map }: { map: TownMap }) => (
 
 type Box = { x: number; y: number; w: number; h: number };
 type Drag = { stand: Stand; fresh: boolean; moved: boolean };
+const [TOUCH_PX, MOUSE_PX] = [18, 7]; // how near a press is to the error that is meant
 
 export function TownView(props: MapProps) {
   const { space, stands, kinds, looks, covered, shown } = props;
@@ -28,7 +30,8 @@ export function TownView(props: MapProps) {
     return { x: x0, y: -y1, w: x1 - x0, h: y1 - y0 };
   }, [map]);
   const [box, setBox] = useState<Box>(whole);
-  const [hover, setHover] = useState<{ error: number; x: number; y: number } | null>(null);
+  const [hover, setHover] = useState<number | null>(null);
+  const press = useRef<Point | null>(null); // where the pointer went down, until it moves
   const drag = useRef<Drag | null>(null);
   const fingers = useRef(new Map<number, Point>());
   useEffect(() => setBox(whole), [whole]);
@@ -71,12 +74,14 @@ export function TownView(props: MapProps) {
     svg.current!.setPointerCapture(event.pointerId);
     fingers.current.set(event.pointerId, [event.clientX, event.clientY]);
     setHover(null);
+    press.current = stand || fingers.current.size > 1 ? null : [event.clientX, event.clientY];
     drag.current = stand && fingers.current.size === 1 ? { stand, fresh: false, moved: false } : null;
   };
   const moved = (event: PointerEvent) => {
     const before = fingers.current.get(event.pointerId);
     if (!before) return;
     const now: Point = [event.clientX, event.clientY];
+    if (press.current && Math.hypot(now[0] - press.current[0], now[1] - press.current[1]) > 4) press.current = null;
     if (drag.current) {
       if (!drag.current.moved && Math.hypot(now[0] - before[0], now[1] - before[1]) < 4) return;
       const next = settle(toWorld(event), drag.current.stand);
@@ -93,10 +98,25 @@ export function TownView(props: MapProps) {
       if (far(now) > 10) zoom(far(before) / far(now), toWorld({ clientX: now[0], clientY: now[1] }));
     } else setBox({ ...box, x: box.x - (now[0] - before[0]) * scale, y: box.y - (now[1] - before[1]) * scale });
   };
+  /** Tell of the error that is pressed, the nearest within reach of a finger or of the mouse, or of none. */
+  const hold = (event: PointerEvent) => {
+    const [x, y] = toWorld(event);
+    const far = (row: number) => Math.hypot(errors[row].at[0] - x, errors[row].at[1] - y);
+    const near = errors.reduce((best, _, row) => (shown[row] && (best < 0 || far(row) < far(best)) ? row : best), -1);
+    const meant = near >= 0 && far(near) <= px(event.pointerType === "mouse" ? MOUSE_PX : TOUCH_PX);
+    if (meant) focusError(near);
+    else props.onHold(null);
+  };
+  const focusError = (row: number) => {
+    props.onHold(row);
+    document.getElementById(`error-${row}`)?.focus({ preventScroll: true });
+  };
   const released = (event: PointerEvent) => {
     fingers.current.delete(event.pointerId);
     const done = drag.current;
     drag.current = null;
+    if (press.current && event.type === "pointerup") hold(event);
+    press.current = null;
     if (!done) return;
     if (done.moved) props.onPut(done.stand, false);
     else props.onSelect(done.stand.id);
@@ -105,8 +125,15 @@ export function TownView(props: MapProps) {
   useCarried(props, svg, toWorld);
   const keyed = (event: KeyboardEvent, stand: Stand) => pressKey(event, stand, props);
 
+  const latest = useRef<(event: KeyboardEvent, row: number) => void>(() => {}); // signs are drawn anew only where they change
+  latest.current = (event, row) => pressErrorKey(event, row, props, focusError);
   const occupied = new Set(stands.map((each) => each.pole));
-  const told = hover && errors[hover.error];
+  const told = hover ?? props.held;
+  const first = props.held !== null && shown[props.held] ? props.held : shown.indexOf(true);
+  const onPage = ([x, y]: Point | [number, number, number]): Point => [
+    size[0] / 2 + (x - box.x - box.w / 2) / scale,
+    size[1] / 2 + (-y - box.y - box.h / 2) / scale,
+  ];
   return (
     <div class="map" data-scale={scale}>
       <svg
@@ -137,9 +164,21 @@ export function TownView(props: MapProps) {
         <g class="names" aria-hidden="true">
           {map.streets.map(({ name, line }) => <StreetName name={name} line={line} px={px} />)}
         </g>
-        <g class="errors" aria-hidden="true">
+        <g class="errors" role="group" aria-label={`${errors.length} ${space.noun}s: arrows go from one to the next`}>
           {errors.map((error, row) =>
-            shown[row] ? <Sign error={error} row={row} seen={covered.has(row)} px={px} onHover={setHover} many={errors.length > 400} /> : null,
+            shown[row] ? (
+              <Sign
+                key={row}
+                {...{ error, row, px }}
+                seen={covered.has(row)}
+                many={errors.length > 400}
+                first={row === first}
+                opens={hasSweep(props, error)}
+                onHover={setHover}
+                onHold={props.onHold}
+                onKey={(event, at) => latest.current(event, at)}
+              />
+            ) : null,
           )}
         </g>
         {props.news.map((place, number) => (
@@ -209,55 +248,8 @@ export function TownView(props: MapProps) {
         <button type="button" aria-label="Whole town" onClick={() => setBox(whole)}>⤢</button>
       </div>
       <Ruler scale={scale} />
-      {told && hover && (
-        <div class="tip" style={{ left: `${hover.x}px`, top: `${hover.y}px` }}>
-          <Told error={told} row={hover.error} stands={stands} poles={poles} looks={looks} />
-        </div>
-      )}
+      {told !== null && shown[told] && <Tip {...props} row={told} stays={told === props.held} at={besides(onPage(errors[told].at), size)} />}
     </div>
-  );
-}
-
-const Sign = memo(
-  ({ error, row, seen, px, onHover, many }: { error: Wrong; row: number; seen: boolean; px: (n: number) => number; onHover: (h: { error: number; x: number; y: number } | null) => void; many: boolean }) => {
-    const [x, y] = error.at;
-    const r = px(many ? 2.6 : 4);
-    const at = (event: PointerEvent) => {
-      const frame = (event.currentTarget as Element).closest(".map")!.getBoundingClientRect();
-      onHover({ error: row, x: Math.min(event.clientX - frame.left, frame.width - 272), y: Math.min(event.clientY - frame.top, frame.height - 170) });
-    };
-    const common = { class: `e ${error.kind}${seen ? " seen" : ""}`, onPointerEnter: at, onPointerLeave: () => onHover(null) };
-    if (error.kind === "false_positive")
-      return <path {...common} stroke-width={px(2)} d={`M${x - r} ${-y - r}l${2 * r} ${2 * r}m0 ${-2 * r}l${-2 * r} ${2 * r}`} />;
-    if (error.kind === "final_error")
-      return <path {...common} stroke-width={px(1)} d={`M${x} ${-y - r * 1.2}l${r * 1.15} ${r * 2.1}h${-r * 2.3}Z`} />;
-    return <circle {...common} cx={x} cy={-y} r={r} stroke-width={px(1)} />;
-  },
-  (one, other) => one.seen === other.seen && one.error === other.error && one.px(1) === other.px(1),
-);
-
-const NAMES: Record<string, string> = { miss: "missed", false_positive: "false positive", final_error: "final error", point: "point" };
-export const wordOf = (kind: string) => NAMES[kind] ?? kind;
-
-export function Told({ error, row, stands, poles, looks }: { error: Wrong; row: number; stands: Stand[]; poles: Pole[]; looks: Map<number, Look> }) {
-  const by = stands.filter((each) => looks.get(each.id)?.covered.includes(row));
-  const far = (stand: Stand) => {
-    const [x, y] = placeOf(stand, poles);
-    return Math.hypot(x - error.at[0], y - error.at[1]);
-  };
-  const near = [...stands].sort((one, other) => far(one) - far(other))[0];
-  return (
-    <>
-      <b>{error.class ?? ""} {wordOf(error.kind)}</b>
-      <dl>
-        {near && <><dt>nearest sensor</dt><dd>{far(near).toFixed(0)} m</dd></>}
-        <dt>seen by</dt><dd>{by.length ? by.map((each) => (each.pole === null ? "own place" : `pole ${poles[each.pole].id}`)).join(", ") : "none"}</dd>
-        {error.occlusion != null && <><dt>hidden from the vehicle</dt><dd>{Math.round(error.occlusion * 100)} %</dd></>}
-        {error.returns != null && <><dt>LiDAR returns</dt><dd>{error.returns}</dd></>}
-        {error.scene && <><dt>sweep of</dt><dd>{error.scene}{error.track ? `, ${error.track}` : ""}</dd></>}
-        {error.weight !== 1 && <><dt>weight</dt><dd>{error.weight}</dd></>}
-      </dl>
-    </>
   );
 }
 

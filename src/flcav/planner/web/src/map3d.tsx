@@ -1,12 +1,10 @@
 /** The map in three dimensions: scenery drawn by three.js; poles and sensors above it are buttons, as on the flat map. */
 import { useEffect, useLayoutEffect, useRef, useState } from "preact/hooks";
-import { Told } from "./map";
+import { besides, hasSweep, pressErrorKey, tellError, Tip } from "./errors";
 import { loadScenes } from "./scenes";
 import { MOUNT_M, pressKey, settleAt, useCarried, type MapProps } from "./standing";
 import type { TownScene } from "./scene/town";
 import type { Point, Stand } from "./types";
-
-type Hover = { error: number; x: number; y: number };
 
 export function Town3D({ fail, keep, ...props }: MapProps & { fail: (error: unknown) => void; keep: (scene: TownScene | null) => void }) {
   const { space, stands, kinds, looks, covered, shown, news } = props;
@@ -15,7 +13,7 @@ export function Town3D({ fail, keep, ...props }: MapProps & { fail: (error: unkn
   const pins = useRef<HTMLDivElement>(null);
   const [scene, setScene] = useState<TownScene | null>(null);
   const [refused, setRefused] = useState("");
-  const [hover, setHover] = useState<Hover | null>(null);
+  const [hover, setHover] = useState<number | null>(null);
   const [theme, setTheme] = useState(0);
   const drag = useRef<{ stand: Stand; from: Point; moved: boolean } | null>(null);
 
@@ -99,17 +97,39 @@ export function Town3D({ fail, keep, ...props }: MapProps & { fail: (error: unkn
   };
   const look = (event: PointerEvent) => {
     if (event.buttons || !scene || event.target !== host.current?.firstChild) return setHover(null);
-    const row = scene.errorAt(event);
-    const frame = host.current.getBoundingClientRect();
-    setHover(row === null ? null : { error: row, x: Math.min(event.clientX - frame.left, frame.width - 272), y: Math.min(event.clientY - frame.top, frame.height - 170) });
+    setHover(event.pointerType === "mouse" ? scene.errorAt(event) : null);
   };
+  const press = useRef<Point | null>(null); // where the pointer went down
+  const hold = (event: PointerEvent) => {
+    const from = press.current;
+    press.current = null;
+    if (!from || !scene || Math.hypot(event.clientX - from[0], event.clientY - from[1]) > 4) return;
+    props.onHold(scene.errorAt(event));
+  };
+  const told = hover ?? props.held;
+  const first = props.held !== null && shown[props.held] ? props.held : shown.indexOf(true);
+  const goTo = (row: number) => {
+    props.onHold(row);
+    requestAnimationFrame(() => document.querySelector<HTMLElement>(".pin.error")?.focus());
+  };
+  const frame: Point = [host.current?.clientWidth ?? 800, host.current?.clientHeight ?? 600];
 
   const occupied = new Set(stands.map((each) => each.pole));
   return (
     <div class="map solid">
-      <div class="scene" ref={host} onPointerMove={look} onPointerLeave={() => setHover(null)} />
+      <div class="scene" ref={host} onPointerMove={look} onPointerLeave={() => setHover(null)} onPointerDown={(event) => (press.current = [event.clientX, event.clientY])} onPointerUp={hold} />
       {refused ? <p class="refused" role="alert">{refused}</p> : !scene && <p class="refused" role="status">Drawing the town …</p>}
       <div class="pins" ref={pins}>
+        {first >= 0 && (
+          <button
+            type="button"
+            class={`pin error${first === props.held ? " chosen" : ""}`}
+            data-at={errors[first].at.join()}
+            aria-label={tellError(errors[first], covered.has(first), hasSweep(props, errors[first]))}
+            onFocus={() => props.onHold(first)}
+            onKeyDown={(event) => pressErrorKey(event, first, props, goTo)}
+          />
+        )}
         {poles.map((pole, number) =>
           occupied.has(number) ? null : (
             <button
@@ -151,10 +171,8 @@ export function Town3D({ fail, keep, ...props }: MapProps & { fail: (error: unkn
           <span key={`n${number}`} class="pin new" data-at={[found.site.x, found.site.y, MOUNT_M].join()}>+{Math.round(found.gain * 10) / 10}</span>
         ))}
       </div>
-      {hover && errors[hover.error] && (
-        <div class="tip" style={{ left: `${hover.x}px`, top: `${hover.y}px` }}>
-          <Told error={errors[hover.error]} row={hover.error} stands={stands} poles={poles} looks={looks} />
-        </div>
+      {told !== null && shown[told] && scene?.project(errors[told].at) && (
+        <Tip {...props} row={told} stays={told === props.held} at={besides(scene.project(errors[told].at)!, frame)} />
       )}
     </div>
   );

@@ -1,7 +1,7 @@
 /** Parts of the tab Place: the bar of coverage, the legend, the command that does the same. */
 import { useEffect, useState } from "preact/hooks";
 import type { Api } from "./api";
-import { wordOf } from "./map";
+import { wordOf } from "./errors";
 import type { Placing, Workspace } from "./types";
 
 export function Command({ api, space, placing, say, fail }: { api: Api; space: Workspace; placing: Placing; say: (text: string) => void; fail: (error: unknown) => void }) {

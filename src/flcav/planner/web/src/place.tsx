@@ -1,12 +1,14 @@
 /** The tab Place: a map with sensors, and beside it what they cover, what could be covered, and what that costs. */
 import { useEffect, useLayoutEffect, useMemo, useRef, useState } from "preact/hooks";
-import type { Api } from "./api";
+import { Unreachable, type Api } from "./api";
 import { Curve } from "./curve";
 import { saveBlob, saveMap, saveText } from "./saving";
 import type { TownScene } from "./scene/town";
 import { KindsSection, number } from "./kinds";
 import { useLooks } from "./looks";
-import { TownView, wordOf } from "./map";
+import { wordOf } from "./errors";
+import { ErrorSweep } from "./footage";
+import { TownView } from "./map";
 import { Town3D } from "./map3d";
 import { Bar, Command, Legend } from "./parts";
 import { placeOf } from "./standing";
@@ -32,16 +34,18 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
   const [kind, setKind] = useState(0);
   const [selected, setSelected] = useState<number | null>(null);
   const [carried, setCarried] = useState<number | null>(null);
-  const [best, setBest] = useState<Best | null>(null);
+  const [best, setBest] = useState<Best | null>(null); // at the same cost, or without prices of as many sensors
+  const [asMany, setAsMany] = useState<Best | null>(null); // with prices: of as many sensors, whatever they cost
   const [bestFor, setBestFor] = useState("");
   const [refused, setRefused] = useState("");
+  const [unfit, setUnfit] = useState(""); // why the wished placement cannot be
   const [curve, setCurve] = useState<Best[] | null>(null);
   const [news, setNews] = useState<NewPole[]>([]);
   const [sought, setSought] = useState(false);
+  const [held, setHeld] = useState<number | null>(null);
+  const [swept, setSwept] = useState<number | null>(null); // the error whose sweep is shown
   const [moving, setMoving] = useState(false);
   const priced = placing.kinds.some((each) => each.cost > 0) || space.poles.some((each) => each.cost > 0);
-  const [by, setBy] = useState<"count" | "cost">("cost");
-  const same = priced ? by : "count";
   const { kinds, without, sight } = placing;
 
   const stands = useMemo(() => {
@@ -75,18 +79,18 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
 
   // The best placement, and the curve, follow what is placed; the last question that was asked is the one answered.
   const asked = JSON.stringify([space.key, kinds, without, sight, stands.filter((each) => each.pole === null).map((each) => [each.x, each.y])]);
-  const limit = same === "cost" ? { budget: Math.round(cost * 1e6) / 1e6 } : { count: placing.stands.length };
-  const bestAsked = JSON.stringify([asked, limit]);
+  const count = { count: placing.stands.length };
+  const limit = priced ? { budget: Math.round(cost * 1e6) / 1e6 } : count;
+  const bestAsked = JSON.stringify([asked, limit, count]);
   useEffect(() => {
     if (!space.errors.length || !placing.stands.length || drag) return;
     let current = true;
     const later = setTimeout(() => {
       performance.mark("best-asked");
-      api
-        .best(space.key, placing, limit)
-        .then((found) => {
+      Promise.all([api.best(space.key, placing, limit), priced && !api.saved ? api.best(space.key, placing, count) : null])
+        .then(([found, other]) => {
           performance.measure("best", "best-asked");
-          if (current) [setBest(found), setBestFor(bestAsked), setRefused("")];
+          if (current) [setBest(found), setAsMany(other), setBestFor(bestAsked), setRefused("")];
         })
         .catch((error) => current && [setBest(null), setRefused(String(error.message))]);
     }, 60);
@@ -100,6 +104,7 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
     }, 250);
     return () => [clearTimeout(later), (current = false)];
   }, [asked, !drag]);
+  useEffect(() => setUnfit(""), [asked, placing.stands.length]);
   useEffect(() => [setNews([]), setSought(false)] as unknown as void, [asked, JSON.stringify(placing.stands)]);
 
   const put = (stand: Stand, fresh: boolean) => {
@@ -169,9 +174,23 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
   const noun = space.noun;
   const fair = !api.saved || without.length === 0;
   const current = best && bestFor === bestAsked && !drag && placing.stands.length ? best : null;
-  const after = same === "count" && !priced && current ? curve?.find((each) => each.pairs.length === placing.stands.length + 1) : null;
+  const after = !priced && current ? curve?.find((each) => each.pairs.length === placing.stands.length + 1) : null;
   const more = after && current && fair ? { ...after, gain: Math.max(even ? after.covered - current.covered : after.weight - current.weight, 0) } : null;
-  const limited = same === "cost" ? `for ${number(cost)}` : `with ${plural(placing.stands.length, "sensor")}`;
+  const withAsMany = `with ${plural(placing.stands.length, "sensor")}`;
+  const told = (found: Best) => (
+    <>
+      <b>{even ? found.covered : number(found.weight)}</b>
+      {!even && " in weight"}
+      {found.optimal ? ", proven" : `, at most ${number(found.bound)} (gap ${number((100 * (found.bound - found.weight)) / found.weight)} %)`}
+      {api.saved && ", precomputed"}
+    </>
+  );
+  const wish = (event: Event, limit: { count?: number; budget?: number }) => {
+    event.preventDefault();
+    setUnfit("");
+    api.best(space.key, placing, limit).then(show).catch((error: Error) => (error instanceof Unreachable ? fail(error) : setUnfit(`No placement: ${error.message}.`)));
+  };
+  const wished = (event: Event, name: string) => Number(new FormData(event.currentTarget as HTMLFormElement).get(name));
   const beyond = current?.beyond ?? curve?.[0]?.beyond ?? null;
   useEffect(() => {
     if (!drag && settled && space.errors.length && placing.stands.length) say(`${covered.size} of ${total} ${noun}s covered by ${plural(placing.stands.length, "sensor")}`);
@@ -197,7 +216,11 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
     onRemove: remove,
     onRange: range,
     onSelect: setSelected,
+    held,
+    onHold: setHeld,
+    onSweep: setSwept,
   };
+  useEffect(() => [setHeld(null), setSwept(null)] as unknown as void, [space.key]);
   return (
     <div class="place">
       <main class="stage">
@@ -207,6 +230,7 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
         <button type="button" aria-pressed={!solid} onClick={() => setSolid(false)}>Above</button>
         <button type="button" aria-pressed={solid} onClick={() => setSolid(true)}>3D</button>
       </div>
+      {swept !== null && <ErrorSweep {...{ api, space }} row={swept} onClose={() => [setSwept(null), document.getElementById(`error-${swept}`)?.focus()]} />}
       <Legend space={space} covered={placing.stands.length > 0} solid={solid} />
       </main>
       <aside class="panel" aria-label="Sensors and what they cover">
@@ -219,11 +243,14 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
             <ul class="facts">
               {current && fair && (
                 <li id="best">
-                  Best possible {limited}: <b>{even ? current.covered : number(current.weight)}</b>
-                  {!even && " in weight"}
-                  {current.optimal ? ", proven" : `, at most ${number(current.bound)} (gap ${number((100 * (current.bound - current.weight)) / current.weight)} %)`}
-                  {api.saved && ", precomputed"}
+                  Best possible {priced ? `for ${number(cost)}` : withAsMany}: {told(current)}
                   {!even && ` · yours: ${number(weight)}`}
+                </li>
+              )}
+              {current && fair && priced && asMany && (
+                <li id="as-many">
+                  {withAsMany[0].toUpperCase() + withAsMany.slice(1)}, whatever they cost: {told(asMany)}, for {number(asMany.cost)}{" "}
+                  <button type="button" class="quiet" onClick={() => show(asMany)}>Show it</button>
                 </li>
               )}
               {!current && placing.stands.length > 0 && <li class="wait">{refused || (drag ? "Best possible: when you let go" : "Computing the best possible …")}</li>}
@@ -237,30 +264,19 @@ export function Place({ api, space, placing, setPlacing, undo, solid, setSolid, 
               <button type="button" onClick={() => undo?.()} disabled={!undo}>Undo <kbd>Z</kbd></button>
               <button type="button" onClick={() => setPlacing({ ...placing, stands: [] })} disabled={!placing.stands.length}>Clear</button>
             </div>
-            {!api.saved && (
-              <form
-                class="wish"
-                onSubmit={(event) => {
-                  event.preventDefault();
-                  const value = Number(new FormData(event.currentTarget).get("wish"));
-                  api.best(space.key, placing, same === "cost" ? { budget: value } : { count: Math.round(value) }).then(show).catch(fail);
-                }}
-              >
-                <label>
-                  {same === "cost" ? "The best for a cost of" : "The best with"}{" "}
-                  <input name="wish" type="number" required min={same === "cost" ? 0 : 1} max={same === "cost" ? undefined : space.poles.length + placing.stands.length} step={same === "cost" ? "any" : 1} />
-                  {same === "cost" ? "" : " sensors"}
-                </label>
+            {!api.saved && priced && (
+              <form class="wish" onSubmit={(event) => wish(event, { budget: wished(event, "cost") })}>
+                <label>The best for a cost of <input name="cost" type="number" required min={0} step="any" /></label>
                 <button type="submit">Show</button>
               </form>
             )}
-            {priced && !api.saved && (
-              <fieldset class="row">
-                <legend>Compare with the best</legend>
-                <label><input type="radio" checked={same === "cost"} onChange={() => setBy("cost")} /> at the same cost</label>
-                <label><input type="radio" checked={same === "count"} onChange={() => setBy("count")} /> of as many sensors</label>
-              </fieldset>
+            {!api.saved && (
+              <form class="wish" onSubmit={(event) => wish(event, { count: Math.round(wished(event, "count")) })}>
+                <label>The best with <input name="count" type="number" required min={1} step={1} /> sensors</label>
+                <button type="submit">Show</button>
+              </form>
             )}
+            {unfit && <p class="unfit" role="alert">{unfit}</p>}
           </section>
         ) : (
           <section class="headline">

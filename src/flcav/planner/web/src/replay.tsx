@@ -1,5 +1,6 @@
 /** The tab Replay: a finished run, played moment by moment: scores, messages of every server, the ledger that fills. */
 import { useEffect, useLayoutEffect, useRef, useState } from "preact/hooks";
+import type { Played } from "./address";
 import type { Api } from "./api";
 import type { Clock } from "./drive";
 import { Drives, Shot, Sweep } from "./footage";
@@ -25,16 +26,19 @@ export function findBestRound(moments: Moment[]): { at: number; gain: number } |
   return best;
 }
 
-export function Replay({ api, run, say, fail }: { api: Api; run: RunInfo; say: (text: string) => void; fail: (error: unknown) => void }) {
+type Props = { api: Api; run: RunInfo; played: Played; setPlayed: (played: Played) => void; say: (text: string) => void; fail: (error: unknown) => void };
+
+export function Replay({ api, run, played, setPlayed, say, fail }: Props) {
   const { moments, footage } = run;
-  const [at, setMoment] = useState(0);
-  const clock = useRef<Clock>({ at: 0, part: 1 });
+  const at = Math.min(played.moment, moments.length - 1);
+  const region = footage.regions.includes(played.region) ? played.region : (footage.regions[0] ?? "");
+  const clock = useRef<Clock>({ at, part: 1 });
   const [playing, setPlaying] = useState(false);
   const moment = moments[at];
   const best = findBestRound(moments);
   const setAt = (to: number, part: number) => {
     clock.current = { at: to, part };
-    setMoment(to);
+    setPlayed({ region, moment: to });
   };
   const go = (to: number) => setAt(Math.min(Math.max(to, 0), moments.length - 1), playing ? 0 : 1);
   const play = () => {
@@ -59,12 +63,11 @@ export function Replay({ api, run, say, fail }: { api: Api; run: RunInfo; say: (
   }, [playing, at]);
   useLayoutEffect(() => {
     const keyed = (event: KeyboardEvent) => {
-      if ((event.target as Element).matches("input, button")) {
-        if (event.key !== " " || (event.target as Element).matches("button")) return;
-      }
+      const target = event.target as Element;
+      if (target.matches("button") ? event.key === " " : target.matches("input") && event.key !== " ") return; // theirs
       if (event.key === " ") play();
-      else if (event.key === "ArrowRight") go(at + 1);
-      else if (event.key === "ArrowLeft") go(at - 1);
+      else if (event.key === "ArrowRight") go(clock.current!.at + 1);
+      else if (event.key === "ArrowLeft") go(clock.current!.at - 1);
       else return;
       event.preventDefault();
     };
@@ -81,7 +84,7 @@ export function Replay({ api, run, say, fail }: { api: Api; run: RunInfo; say: (
           <input type="range" min={0} max={moments.length - 1} value={at} aria-label="Moment of the run" aria-valuetext={moment.told} onInput={(event) => go(Number(event.currentTarget.value))} />
           <output id="moment">{moment.told}</output>
         </div>
-        {footage.regions.length > 0 && <Drives {...{ api, run, fail, clock, playing }} />}
+        {footage.regions.length > 0 && <Drives {...{ api, run, fail, clock, playing, region }} pick={(name) => setPlayed({ region: name, moment: at })} />}
         <Scores run={run} at={at} best={best && best.gain > 0 ? best.at : -1} onPick={go} />
         {best && best.gain <= 0 && <p id="gained">No round gained: the mean of the regions' scores never rose, on {run.frames} validation frames each.</p>}
         {best && best.gain > 0 && (

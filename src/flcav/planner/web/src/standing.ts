@@ -27,6 +27,9 @@ export type MapProps = {
   onRange: (kind: number, by: number) => void;
   selected: number | null;
   onSelect: (id: number | null) => void;
+  held: number | null; // row of the error of which is told until another is chosen
+  onHold: (row: number | null) => void;
+  onSweep: (row: number) => void; // show the sweep in which an error was made
 };
 
 export function placeOf(stand: Stand, poles: Pole[]): Point {

@@ -8,6 +8,7 @@ export type Wrong = {
   class?: string;
   returns?: number;
   occlusion?: number;
+  distance_m?: number; // from the vehicle that made it
   scene?: string;
   track?: string;
 };
@@ -32,6 +33,7 @@ export type Workspace = {
   table: string;
   notes: string[];
   traffic: number;
+  sweeps?: boolean; // whether the sweeps in which errors were made can be asked for
 };
 export type Look = { area: string; covered: number[]; z: number };
 export type Best = {

@@ -10,11 +10,26 @@ export type Scenes = { TownScene: typeof TownScene; SweepScene: typeof SweepScen
 
 (globalThis as unknown as { flcavScene: Scenes }).flcavScene = { TownScene, SweepScene, tellSweep };
 
-for (const host of document.querySelectorAll<HTMLElement>(".flcav-sweep[data-from]")) {
+/** Draw a sweep in its element, in place of what stands there with `data-fallback`, anew when the colours change. */
+function show(host: HTMLElement) {
   const data = JSON.parse(document.getElementById(host.dataset.from!)!.textContent!) as SweepData;
-  try {
-    new SweepScene(host, data);
-  } catch (error) {
-    host.textContent = (error as Error).message;
-  }
+  const fallbacks = host.querySelectorAll<HTMLElement>("[data-fallback]");
+  const say = (text: string) => host.append(Object.assign(document.createElement("p"), { textContent: text }));
+  let made: SweepScene | null = null;
+  const draw = () => {
+    made?.dispose();
+    host.classList.add("drawn"); // its height may depend on it
+    try {
+      made = new SweepScene(host, data);
+      made.shareWheel();
+      fallbacks.forEach((each) => (each.hidden = true));
+    } catch (error) {
+      host.classList.remove("drawn");
+      say((error as Error).message);
+    }
+  };
+  draw();
+  if (made) matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
 }
+
+document.querySelectorAll<HTMLElement>(".flcav-sweep[data-from]").forEach(show);

@@ -11,6 +11,7 @@ export type SweepData = {
   targets: Box[];
   before: Detections;
   after: Detections;
+  mark?: [number, number, number]; // a place that is marked
 };
 
 const LOW_M = 0.25; // returns below this height above the ground are drawn as ground
@@ -49,6 +50,18 @@ function drawBoxes(boxes: Box[], colour: string): Group {
   return group;
 }
 
+/** An arrow that comes down on a place. */
+function drawMark([x, y, z]: [number, number, number], ground: number, colour: string): Group {
+  const [tip, top] = [z + 1.2, Math.max(z, ground) + 5];
+  const head = [[0.6, 0], [-0.3, 0.52], [-0.3, -0.52]].map(([u, v]) => [x + u, y + v, tip + 1.4]);
+  const faces = [0, 1, 2].flatMap((n) => [x, y, tip, ...head[n], ...head[(n + 1) % 3]]);
+  const group = new Group();
+  const shape = (at: number[]) => new BufferGeometry().setAttribute("position", new BufferAttribute(new Float32Array(at), 3));
+  group.add(new Mesh(shape(faces), new MeshBasicMaterial({ color: colour, side: 2 })));
+  group.add(new LineSegments(shape([x, y, tip + 1.4, x, y, top]), new LineBasicMaterial({ color: colour })));
+  return group;
+}
+
 export class SweepScene {
   private readonly stage: Stage;
   private readonly sides: Scene[] = [];
@@ -68,10 +81,24 @@ export class SweepScene {
       scene.add(drawBoxes(data.targets.filter((_, n) => !side.found[n]), colours.missed));
       scene.add(drawBoxes(side.boxes.filter((_, n) => side.hit[n]), colours.found));
       scene.add(drawBoxes(side.boxes.filter((_, n) => !side.hit[n]), colours.false));
+      if (data.mark) scene.add(drawMark(data.mark, data.ground, colourOf(host, "ink", "#1d2125")));
       this.sides.push(scene);
+    }
+    if (data.mark) {
+      const [x, y] = data.mark;
+      this.stage.look([x, y, data.ground], 34, 0.6, Math.atan2(y, x));
+      return;
     }
     const middle = data.targets.length ? data.targets.reduce((sum, box) => sum + box[0], 0) / data.targets.length : 15;
     this.stage.look([Math.min(Math.max(middle, 8), 30), 0, data.ground], 52, 0.55, 0);
+  }
+
+  /** Leave the wheel to the page that scrolls, until the picture has the focus. */
+  shareWheel() {
+    const { controls, renderer } = this.stage;
+    controls.enableZoom = false;
+    renderer.domElement.addEventListener("focus", () => (controls.enableZoom = true));
+    renderer.domElement.addEventListener("blur", () => (controls.enableZoom = false));
   }
 
   dispose() {
