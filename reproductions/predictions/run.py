@@ -36,7 +36,8 @@ from flcav.runs.results.run import Run
 from flcav.runs.tables import HistoryPoint, parse_history, read_history
 from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import recipe_path
-from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
+from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import MeanOverSeeds, half_width, mean_over_seeds
 from flcav.statistics.verdicts import describe_means, judge_means
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
@@ -46,6 +47,7 @@ from flcav.world.map.town import Town, load_town
 VISIBLE = "objects in sight"
 PREDICTORS = (COVERAGE, TRAFFIC, VISIBLE, EXPECTED)
 RIVALS = (TRAFFIC, VISIBLE)  # of the errors covered
+MOST = 0.999  # largest correlation that has a place on Fisher's scale
 PLANS, HISTORY = "demo_seeds", "tracks"  # runs of the plans, and the history of the curve that predicts them
 
 Correlations = Mapping[str, Mapping[str, float]]  # rank correlation with the gain, by predictor and choice of frames
@@ -58,7 +60,7 @@ class Predictions(Record):
     placements: int  # pairs of a region and a pole
     seeds: tuple[Correlations, ...]  # of poles, in the mean over regions, by seed
     poles: Mapping[str, Mapping[str, MeanOverSeeds]]  # by predictor and frames
-    averaged: Mapping[str, Mapping[str, MeanOverSeeds]]  # of the means over seeds, by predictor and frames
+    averaged: Mapping[str, Mapping[str, Estimate]]  # of the means over seeds, by predictor and frames
     claims: Mapping[str, MeanOverSeeds]
     plans: int  # of a run
     curve: MeanOverSeeds  # of plans
@@ -113,25 +115,32 @@ def average_poles(seeds: Sequence[Sequence[PoleGain]]) -> tuple[PoleGain, ...]:
     )
 
 
-def correlate_averages(regions: Sequence[Sequence[Sequence[PoleGain]]]) -> dict[str, dict[str, MeanOverSeeds]]:
+def correlate_averages(regions: Sequence[Sequence[Sequence[PoleGain]]]) -> dict[str, dict[str, Estimate]]:
     """Return the rank correlation of mean predictors with mean gains, with the jackknife's interval over seeds.
 
-    regions: poles by region and seed. The jackknife's pseudo-values are n r - (n - 1) r_i, where r_i leaves seed i out
-    (Efron, "The Jackknife, the Bootstrap and Other Resampling Plans", 1982); their mean corrects r for its bias.
+    regions: poles by region and seed. The interval is of Student's t on Fisher's scale z = artanh r, by pseudo-values
+    n z - (n - 1) z_i, where z_i leaves seed i out (Efron, "The Jackknife, the Bootstrap and Other Resampling Plans",
+    1982).
     """
     seeds = len(regions[0])
 
-    def of(left_out: int | None) -> Correlations:
-        return correlate(
-            [average_poles([own for number, own in enumerate(region) if number != left_out]) for region in regions]
-        )
-
-    whole, parts = of(None), [of(number) for number in range(seeds)]
-    return {
-        name: {
-            frames: mean_over_seeds([seeds * at - (seeds - 1) * part[name][frames] for part in parts])
-            for frames, at in by_frames.items()
+    def scale(left_out: int | None) -> dict[str, dict[str, float]]:
+        kept = [[own for number, own in enumerate(region) if number != left_out] for region in regions]
+        found = correlate([average_poles(region) for region in kept])
+        return {
+            name: {frames: float(np.arctanh(np.clip(r, -MOST, MOST))) for frames, r in by_frames.items()}
+            for name, by_frames in found.items()
         }
+
+    def estimate(z: float, parts: Sequence[float]) -> Estimate:
+        pseudo = mean_over_seeds([seeds * z - (seeds - 1) * part for part in parts])
+        half = half_width(pseudo.sd, seeds)
+        low, middle, high = np.tanh([z - half, z, z + half]).tolist()
+        return Estimate(middle, low, high)
+
+    whole, parts = scale(None), [scale(number) for number in range(seeds)]
+    return {
+        name: {frames: estimate(z, [part[name][frames] for part in parts]) for frames, z in by_frames.items()}
         for name, by_frames in whole.items()
     }
 
