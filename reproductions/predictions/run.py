@@ -26,6 +26,7 @@ from flcav.reproductions.placement.records import (
     PlacementProof,
     PoleGain,
     SeedGains,
+    list_claims,
 )
 from flcav.reproductions.placement.run import IMPORTED, TASK
 from flcav.runs.analysis.histories import make_history_points
@@ -46,7 +47,7 @@ from flcav.world.map.town import Town, load_town
 
 VISIBLE = "objects in sight"
 PREDICTORS = (COVERAGE, TRAFFIC, VISIBLE, EXPECTED)
-RIVALS = (TRAFFIC, VISIBLE)  # of the errors covered
+CORRELATION = "rank correlation"
 MOST = 0.999  # largest correlation that has a place on Fisher's scale
 PLANS, HISTORY = "demo_seeds", "tracks"  # runs of the plans, and the history of the curve that predicts them
 
@@ -61,7 +62,7 @@ class Predictions(Record):
     seeds: tuple[Correlations, ...]  # of poles, in the mean over regions, by seed
     poles: Mapping[str, Mapping[str, MeanOverSeeds]]  # by predictor and frames
     averaged: Mapping[str, Mapping[str, Estimate]]  # of the means over seeds, by predictor and frames
-    claims: Mapping[str, MeanOverSeeds]
+    claims: Mapping[str, MeanOverSeeds]  # those of placement and the leads over objects in sight, corrected together
     plans: int  # of a run
     curve: MeanOverSeeds  # of plans
     gain_error: MeanOverSeeds  # mean error of the predicted gain of a plan over pretraining, in its measure
@@ -69,7 +70,8 @@ class Predictions(Record):
 
     def sentences(self) -> list[str]:
         """Return the verdicts on the claims and the correlation of plans, in words."""
-        return [*describe_means(self.claims), f"rank correlation of plans: {self.curve.describe(sign=True)}"]
+        told = [line for line in describe_means(self.claims) if CORRELATION in line]
+        return [*told, f"rank correlation of plans: {self.curve.describe(sign=True)}"]
 
 
 def count_in_sight(recipe: RunRecipe, region: str, seed: int, town: Town, beside: Path) -> dict[int, float]:
@@ -145,16 +147,13 @@ def correlate_averages(regions: Sequence[Sequence[Sequence[PoleGain]]]) -> dict[
     }
 
 
-def compare_predictors(seeds: Sequence[Correlations]) -> dict[str, MeanOverSeeds]:
-    """Return the claims: errors covered predict the gain, and they do so better than their rivals."""
-    claims = {}
-    for frames in FRAMES:
-        own = [seed[COVERAGE][frames] for seed in seeds]
-        claims[f"gain {frames}: rank correlation with {COVERAGE}"] = mean_over_seeds(own)
-        for rival in RIVALS:
-            beyond = [at - seed[rival][frames] for at, seed in zip(own, seeds, strict=True)]
-            claims[f"gain {frames}: rank correlation with {COVERAGE} - with {rival}"] = mean_over_seeds(beyond)
-    return claims
+def compare_with_sight(seeds: Sequence[Correlations]) -> dict[str, MeanOverSeeds]:
+    """Return the claims that errors covered predict the gain better than objects in sight do."""
+
+    def lead(frames: str) -> MeanOverSeeds:
+        return mean_over_seeds([seed[COVERAGE][frames] - seed[VISIBLE][frames] for seed in seeds])
+
+    return {f"gain {frames}: {CORRELATION} with {COVERAGE} - with {VISIBLE}": lead(frames) for frames in FRAMES}
 
 
 def rank_plans(runs: Sequence[Sequence[HistoryPoint]], name: str = HISTORY) -> tuple[MeanOverSeeds, MeanOverSeeds]:
@@ -187,6 +186,7 @@ def tabulate_predictions(results: Predictions) -> dict[str, str]:
             [
                 [name, results.claims[name].describe(sign=True), one.p_cell, one.verdict, one.takes_cell]
                 for name, one in judge_means(results.claims).items()
+                if CORRELATION in name
             ],
         ),
         "plans": format_table(
@@ -236,7 +236,7 @@ def _run(out: Path, options: Options) -> Outcome[Predictions]:
             for name in PREDICTORS
         },
         averaged=correlate_averages(regions),
-        claims=compare_predictors(seeds),
+        claims={**list_claims(proof), **compare_with_sight(seeds)},
         plans=len(points[0]),
         curve=curve,
         gain_error=off,
