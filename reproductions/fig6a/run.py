@@ -83,7 +83,7 @@ STEPS = (
         Listed("grid and ring, objects: edge FL - central training (more)"),
     ),
     Step(
-        "centralised on 0.84 MB of annotated sweeps - edge FL with 7.1 MB, both on ground truth",
+        "centralised, 0.84 MB of annotated sweeps - edge FL, 7.1 MB",
         CONTROL,
         "megabytes",
         Paired(
@@ -206,7 +206,7 @@ def draw_schemes(results: SchemesResult) -> bytes:
     axes.set_yticks(range(len(STEPS)), [step.name for step in STEPS])
     axes.set_ylim(len(STEPS) - 0.5, -0.5)
     axes.grid(axis="x")
-    axes.set_xlabel("difference in AP50, of selection in accuracy (95 % interval over seeds)")
+    axes.set_xlabel("difference, 95 % interval over seeds")
     style.key(figure, axes.get_legend_handles_labels()[0])
     return style.png(figure)
 

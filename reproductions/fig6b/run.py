@@ -18,6 +18,7 @@ from flcav.network.plan import MessageSizes
 from flcav.optimization.allocation.allocate import TaskAllocation
 from flcav.optimization.allocation.baselines import baseline
 from flcav.optimization.curves.bands import bootstrap_bands
+from flcav.optimization.curves.curves import OwnCurve
 from flcav.optimization.curves.fitting import CurveFit, fit
 from flcav.optimization.curves.history import History
 from flcav.optimization.curves.levels import level_seeds
@@ -93,31 +94,37 @@ def measure_area(accuracies: Array) -> Array:
     return np.asarray((one * two + two * three + three * one) / 3)
 
 
-def compare_plans(plans: Mapping[str, Plan], fits: Mapping[str, CurveFit], budget_mb: float) -> AtBudget:
-    """Return the triangles of plans by rule, with percentile intervals over refitted curves."""
-    refitted = {task: bands.curves for task, found in fits.items() if (bands := bootstrap_bands(found)) is not None}
+def compare_plans(plans: Mapping[str, Plan], refitted: Mapping[str, Sequence[OwnCurve]], budget_mb: float) -> AtBudget:
+    """Return the triangles of plans by rule, with percentile intervals over refitted curves.
 
-    def predict(plan: Plan, draw: int | None) -> Array:
-        curves = {task: fits[task].curve if draw is None else refitted[task][draw] for task in TASKS}
-        return np.array([1 - float(curves[task].error(*plan[task], 1)) for task in TASKS])
+    `refitted`: by task the curve itself, and those of the bootstrap.
+    """
 
     draws = min(map(len, refitted.values()))
-    middle = {rule: predict(plan, None) for rule, plan in plans.items()}
-    area = {rule: float(measure_area(values)) for rule, values in middle.items()}
-    spread = {rule: measure_area(np.array([predict(plan, i) for i in range(draws)])) for rule, plan in plans.items()}
+    predicted = {
+        rule: np.array([[1 - float(refitted[task][i].error(*plan[task], 1)) for task in TASKS] for i in range(draws)])
+        for rule, plan in plans.items()
+    }
+    areas = {rule: measure_area(values) for rule, values in predicted.items()}
 
-    def within(value: float, values: Array) -> Estimate:
-        low, high = np.quantile(values, TAILS).tolist()
-        return Estimate(value, low, high)
+    def within(values: Array) -> Estimate:
+        low, high = np.quantile(values[1:], TAILS).tolist()
+        return Estimate(float(values[0]), low, high)
 
     return AtBudget(
         budget_mb,
         {
-            rule: Triangle(plan, dict(zip(TASKS, middle[rule].tolist(), strict=True)), within(area[rule], spread[rule]))
+            rule: Triangle(plan, dict(zip(TASKS, predicted[rule][0].tolist(), strict=True)), within(areas[rule]))
             for rule, plan in plans.items()
         },
-        {rule: within(area[JOINT] - area[rule], spread[JOINT] - spread[rule]) for rule in plans if rule != JOINT},
+        {rule: within(areas[JOINT] - areas[rule]) for rule in plans if rule != JOINT},
     )
+
+
+def refit_curves(found: CurveFit) -> tuple[OwnCurve, ...]:
+    """Return a fitted curve, and those that are fitted anew in the bootstrap's repeats."""
+    bands = bootstrap_bands(found)
+    return (found.curve, *(() if bands is None else bands.curves))
 
 
 def make_plans(budget_mb: float) -> dict[str, Plan]:
@@ -166,13 +173,13 @@ def tabulate_triangles(results: Triangles) -> dict[str, str]:
                     of.area.describe(),
                 ]
                 for at in results.budgets
-                for rule, of in at.triangles.items()
+                for rule, of in ((rule, at.triangles[rule]) for rule in RULES)
             ],
         ),
         "gains": format_table(
             ("MB of either link", *(f"area, joint - {rule}" for rule in RULES if rule != JOINT)),
             [
-                [f"{at.budget_mb:g}", *(gain.describe(sign=True) for gain in at.gains.values())]
+                [f"{at.budget_mb:g}", *(at.gains[rule].describe(sign=True) for rule in RULES if rule != JOINT)]
                 for at in results.budgets
             ],
         ),
@@ -189,7 +196,7 @@ def tabulate_triangles(results: Triangles) -> dict[str, str]:
 @style.styled
 def draw_triangles(results: Triangles) -> bytes:
     """Return the triangles as a PNG, a panel for each budget."""
-    figure = style.canvas(3.6 * len(results.budgets), 4.0)
+    figure = style.canvas(3.6 * len(results.budgets), 3.7)
     angles = np.pi / 2 + 2 * np.pi / 3 * np.arange(len(TASKS))
     corners = np.column_stack((np.cos(angles), np.sin(angles)))
     colours = dict(zip(RULES, (style.MUTED, style.ORANGE, style.BLUE), strict=True))
@@ -202,9 +209,9 @@ def draw_triangles(results: Triangles) -> bytes:
         for task, corner in zip(TASKS, corners, strict=True):
             axes.plot(*np.vstack(([0, 0], corner)).T, color=style.SIDEWALK, linewidth=1, zorder=0)
             axes.text(*(1.14 * corner), task, ha="center", va="center")
-        for rule, triangle in at.triangles.items():
-            ends = corners * np.array([triangle.accuracy[task] for task in TASKS])[:, None]
-            axes.plot(*np.vstack((ends, ends[:1])).T, color=colours[rule], linewidth=1.8, label=rule)
+        for rule, width in zip(RULES, (4.5, 2.8, 1.2), strict=True):
+            ends = corners * np.array([at.triangles[rule].accuracy[task] for task in TASKS])[:, None]
+            axes.plot(*np.vstack((ends, ends[:1])).T, color=colours[rule], linewidth=width, label=rule)
         axes.set_title(f"{at.budget_mb:g} MB of either link", fontweight="bold")
         axes.set(aspect="equal", xlim=(-1.25, 1.25), ylim=(-0.85, 1.3))
     style.key(figure, panels[0].get_legend_handles_labels()[0])
@@ -213,11 +220,11 @@ def draw_triangles(results: Triangles) -> bytes:
 
 def _run(_: Path, options: Options) -> Outcome[Triangles]:
     histories = {task: load_known_history(task) for task in TASKS}
-    fits = {task: fit(history, model="best") for task, history in histories.items()}
+    curves = {task: refit_curves(fit(history, model="best")) for task, history in histories.items()}
     budgets = list[AtBudget]()
     with options.show_progress(options.title) as report:
         for budget in BUDGETS_MB:
-            budgets.append(compare_plans(make_plans(budget), fits, budget))
+            budgets.append(compare_plans(make_plans(budget), curves, budget))
             report(len(budgets), len(BUDGETS_MB), f"{budget:g} MB")
     left_out = [each for task, history in histories.items() for each in leave_sizes_out(task, history, fit)]
     results = Triangles(tuple(budgets), tuple(left_out), provenance())
