@@ -5,7 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from flcav.reproductions.pole_rules.run import Study, compare_rules, pool_seeds, read_studies, tabulate_rules
+from flcav.reproductions.pole_rules.run import DENSEST, Study, compare_rules, pool_seeds, read_studies, tabulate_rules
+from flcav.runs.recipe import load_run_recipe
+from flcav.sources.recipe import recipe_path
 
 REPRODUCTIONS = Path(__file__).parents[3] / "reproductions"
 STUDIES = {
@@ -36,6 +38,14 @@ def test_signs_are_those_of_seeds_with_two_poles_and_both_claims_are_corrected()
     assert own < results.sign_p
     assert results.corrected == pytest.approx((2 * own, max(2 * own, results.sign_p)))
     assert results.verdicts() == ("undecided", "undecided")
+
+
+def test_the_recipe_differs_in_the_rule_alone_and_claims_that_it_matters() -> None:
+    recipe = load_run_recipe(recipe_path("runs/poles"))
+    arm = recipe.arms[DENSEST]
+    assert (recipe.placement.rule, arm.placement, recipe.primary_claims) == ("vrcsp", {"rule": "densest"}, (DENSEST,))
+    assert not (arm.labels or arm.training or arm.federation)
+    assert recipe.placement.count == 1
 
 
 def test_a_mean_below_nothing_did_not_hold() -> None:
