@@ -44,7 +44,7 @@ def test_the_recipe_differs_in_the_rule_alone_and_claims_that_it_matters() -> No
     recipe = load_run_recipe(recipe_path("runs/poles"))
     arm = recipe.arms[DENSEST]
     assert (recipe.placement.rule, arm.placement, recipe.primary_claims) == ("vrcsp", {"rule": "densest"}, (DENSEST,))
-    assert not (arm.labels or arm.training or arm.federation)
+    assert not any((arm.labels, arm.training, arm.federation))
     assert recipe.placement.count == 1
 
 
