@@ -18,6 +18,8 @@ def test_rows_are_those_of_the_studies() -> None:
     assert found["VRCSP pole - densest pole"].describe(sign=True) == "+0.019 (+0.002 to +0.037)"
     assert found["VRCSP pole - no road sensor"].describe(sign=True) == "+0.025 (+0.010 to +0.041)"
     assert found["edge + cloud FL - edge FL, in grid"].describe(sign=True) == "-0.041 (-0.060 to -0.021)"
+    trained = found["joint plan - equal stages, 80 MB + 20 MB, after edge FL"]
+    assert (trained.describe(sign=True), trained.seeds) == ("+0.045 (+0.027 to +0.063)", 3)
     table = tabulate_schemes(read_steps(REPRODUCTIONS))["schemes"]
     assert all(step.name in table for step in STEPS)
 
