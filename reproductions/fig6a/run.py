@@ -43,8 +43,9 @@ class Paired:
 
     def read(self, folder: Path) -> MeanOverSeeds:
         """Return its mean over the study's seeds."""
-        seeds: Any = read_json(folder / "result.json")["seeds"]
-        return mean_over_seeds([_walk(seed, self.after) - _walk(seed, self.before) for seed in seeds.values()])
+        result: Any = read_json(folder / "result.json")
+        seeds = result["seeds"].values()
+        return mean_over_seeds([_walk(seed, self.after) - _walk(seed, self.before) for seed in seeds])
 
 
 @dataclass(frozen=True)

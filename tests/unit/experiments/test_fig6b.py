@@ -7,11 +7,12 @@ import pytest
 from shapely.geometry import Polygon
 
 from flcav.config import read_json
-from flcav.optimization.curves.fitting import fit, fit_additive
+from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.history import History
 from flcav.reproductions.fig6b.run import (
     RULES,
     TASKS,
+    Plan,
     Triangles,
     compare_plans,
     leave_sizes_out,
@@ -22,7 +23,8 @@ from flcav.reproductions.plan_search.run import JOINT
 from flcav.runs.tables import load_known_history
 
 RESULTS = Path(__file__).parents[3] / "reproductions/fig6b/result.json"
-FEW, MORE = dict.fromkeys(TASKS, (40, 2, 1)), dict.fromkeys(TASKS, (80, 8, 4))
+FEW: Plan = dict.fromkeys(TASKS, (40, 2, 1))
+MORE: Plan = dict.fromkeys(TASKS, (80, 8, 4))
 
 
 def test_the_area_is_that_of_the_triangle_in_units_of_the_largest() -> None:
@@ -40,7 +42,7 @@ def test_intervals_are_paired_over_the_same_refitted_curves() -> None:
     at = compare_plans({"max-throughput": FEW, "equal-stages": MORE, JOINT: MORE}, dict.fromkeys(TASKS, curves), 10.0)
     same, gain = at.gains["equal-stages"], at.gains["max-throughput"]
     assert (same.mean, same.low, same.high) == (0.0, 0.0, 0.0)
-    accuracy, before = (1 - float(curve.error(*counts, 1)) for counts in (MORE["signs"], FEW["signs"]))
+    accuracy, before = (1 - float(curve.error(*counts)) for counts in (MORE["signs"], FEW["signs"]))
     assert at.triangles[JOINT].accuracy["objects"] == pytest.approx(accuracy)
     assert at.triangles[JOINT].area.mean == pytest.approx(accuracy**2)
     drawn = [(accuracy - more) ** 2 - (before - more) ** 2 for more in floors[1:]]
@@ -55,10 +57,7 @@ def test_a_size_is_predicted_from_the_others_alone() -> None:
     resources = np.column_stack((samples, np.zeros((len(samples), 2))))
     history = History(resources, accuracy, np.ones(len(samples)))
 
-    def curve_of(points: History) -> object:
-        return fit_additive(*points.resources.T, points.accuracy, points.weight)
-
-    found = {each.samples: each for each in leave_sizes_out("x", history, curve_of)}  # pyright: ignore[reportArgumentType]
+    found = {each.samples: each for each in leave_sizes_out("x", history, fit)}
     assert found[80].error == pytest.approx(0.1, abs=2e-3)
     assert found[80].inside < 0.09
     assert found[80].points == 3

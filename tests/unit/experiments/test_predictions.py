@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pytest
@@ -54,7 +55,7 @@ def regions() -> list[list[list[PoleGain]]]:
 
 
 def spearman(poles: Sequence[PoleGain], name: str, frames: str) -> float:
-    return float(spearmanr([pole.predictors[name] for pole in poles], [pole.gain[frames] for pole in poles])[0])
+    return cast("float", spearmanr([pole.predictors[name] for pole in poles], [pole.gain[frames] for pole in poles])[0])
 
 
 def test_correlations_are_spearmans_in_the_mean_over_regions(regions: list[list[list[PoleGain]]]) -> None:
