@@ -102,7 +102,7 @@ def search_plans(problem: Problem) -> Iterator[Found]:
     for fleet, form, importance in product(fleets, FORMS, weights):
         mb = {task: SIZES_MB[history] for task, history in problem.tasks.items()}
         sizes = {task: MessageSizes(sample, FORMS[form] * update, None) for task, (sample, update) in mb.items()}
-        base = _pose(problem, sizes, fleet, importance)
+        base = pose(problem, sizes, fleet, importance)
         for wireless, wireline in product(WIRELESS_MB[::2] if several else WIRELESS_MB, WIRELINE_MB):
             posed = base.model_copy(update={"budgets_mb": Budgets(wireless=wireless, wireline=wireline)})
             try:
@@ -128,7 +128,7 @@ def search_plans(problem: Problem) -> Iterator[Found]:
             )
 
 
-def _pose(
+def pose(
     problem: Problem, sizes: Mapping[str, MessageSizes], fleet: tuple[int, ...], importance: Sequence[float]
 ) -> AllocationProblem:
     """Return the allocation problem of a fleet, with budgets to be set; counts end where the histories do."""
