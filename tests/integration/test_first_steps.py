@@ -33,7 +33,7 @@ def test_the_program_of_the_readme(here: Path, capsys: pytest.CaptureFixture[str
     assert len([line for line in code.splitlines() if line]) <= 14
     exec(compile(code.replace("epochs=7", "epochs=1"), "README.md", "exec"), {})
     told = capsys.readouterr().out
-    shown = r"AP 0\.\d\d; pole [1-4] covers \d+ of \d+ errors\n\d+ samples, \d+ edge rounds, \d+ cloud rounds\n"
+    shown = r"AP 0\.\d\d; pole [1-4] covers \d+ of \d+ errors\n\d+ samples, \d+ edge and \d+ cloud rounds\n"
     assert re.fullmatch(shown, told)
     page = (ROOT / "README.md").read_text(encoding="utf-8")
     (printed,) = re.findall(r"^```text\n(AP .*?)^```$", page, re.M | re.S)
