@@ -12,7 +12,7 @@ from flcav.perception.road.model import STRIDE, RoadNetwork, enlarge
 from flcav.perception.road.predict import predict_logits
 from flcav.perception.road.samples import Sample
 
-WEIGHTS = (1.0, 2.0, 3.0, 2.0, 5.0, 2.0, 5.0)  # of the classes in the cross entropy: markings are few
+WEIGHTS = (1.0, 6.0, 8.0, 4.0, 8.0, 3.0, 8.0)  # of the classes in the cross entropy: markings are few
 DICE = 0.5  # weight of the Dice term
 SMOOTH_PX = 10.0  # added to both sides of the ratio, so that a class that hardly occurs hardly counts
 

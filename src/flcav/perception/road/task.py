@@ -29,7 +29,7 @@ class RoadTask(RoadOutcomes):
     name = "road"
     family = "road-fpn"
     configurations = CONFIGURATIONS
-    practice = Practice(batch=8, learning_rate=3e-3)
+    practice = Practice(batch=4, learning_rate=2e-3)
     recording: Mapping[str, Json] = {
         "vehicle_rig": camera_ahead(640, 384, 60.0),
         "weather": {"classes": list(WEATHER_CLASSES)},
@@ -62,8 +62,8 @@ class RoadTask(RoadOutcomes):
                     "weather": {"classes": list(BY_DAY), "turn_s": 6.0},
                 },
             },
-            epochs=20,
-            patience=20,
+            epochs=16,
+            patience=16,
         )
 
     def build(self, config: RoadConfig) -> RoadNetwork:
