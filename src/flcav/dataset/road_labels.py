@@ -148,11 +148,12 @@ class _View:
         intrinsics, distortion = frame.calibration.intrinsics[camera], frame.calibration.distortion[camera]
         rows, columns = np.nonzero(ground)
         plane = unproject_pixels(intrinsics, distortion, np.stack((columns, rows), axis=1).astype(np.float64))
-        z = depth[rows, columns, None]
-        seen = transform_points(world_from_camera, np.concatenate((plane * z, z), axis=1))
+        level = world_from_camera[:2]  # the rows of x and y
+        away = depth[rows, columns, None] * (plane @ level[:, :2].T + level[:, 2])
         place = np.full((*depth.shape, 2), np.nan)
-        place[rows, columns] = seen[:, :2]
-        distance = np.hypot(*np.moveaxis(place - world_from_camera[:2, 3], 2, 0))
+        distance = np.full(depth.shape, np.nan)
+        place[rows, columns] = away + level[:, 3]
+        distance[rows, columns] = np.hypot(*away.T)
         return cls(
             inverse(world_from_camera),
             inverse(frame.agent_at_trigger.get(camera, frame.world_from_agent)),

@@ -27,7 +27,7 @@ class RoadConfig:
 
     channels: tuple[Channels, Channels, Channels, Channels]  # of the maps at strides 2, 4, 8 and 16
     dilations: tuple[Annotated[int, Field(ge=1, le=32)], ...] = (1, 2, 4, 8)  # of the blocks at stride 16
-    window_px: tuple[Window, Window] = (512, 256)  # width, height of a training sample
+    window_px: tuple[Window, Window] = (384, 192)  # width, height of a training sample
 
 
 CONFIGURATIONS = {

@@ -62,8 +62,8 @@ class RoadTask(RoadOutcomes):
                     "weather": {"classes": list(BY_DAY), "turn_s": 6.0},
                 },
             },
-            epochs=16,
-            patience=16,
+            epochs=12,
+            patience=12,
         )
 
     def build(self, config: RoadConfig) -> RoadNetwork:
