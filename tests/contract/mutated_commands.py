@@ -70,7 +70,13 @@ DATASET = ("data/*", "data/*/*")
 BEGUN, DRAWN = ("out/events", "out/checkpoint.pt"), ("out/0",)
 FORMATS = {
     **{"kitti": "--min-points #1 --calibration assumed", "yolo": "--labels actors --validation #0.5 --min-pixels #1"},
-    **{"coco": "--min-pixels #1", "nuscenes": "--validation #0.5", "opv2v": "--min-points #2", "mcap": "", "culane": "--validation #0.5"},
+    **{
+        "coco": "--min-pixels #1",
+        "nuscenes": "--validation #0.5",
+        "opv2v": "--min-points #2",
+        "mcap": "",
+        "culane": "--validation #0.5",
+    },
 }
 # seconds of what trains a task, what reads a dataset for it, and what draws pictures
 LEARNERS = {
