@@ -1,4 +1,4 @@
-"""Study of the road task: F1 of lane lines by CULane's rule, IoU by class, errors on the ground, by weather, by light."""
+"""Study of the road task: F1 of lane lines by CULane's rule, IoU by class, errors on the ground, by condition."""
 
 from collections.abc import Callable, Sequence
 
