@@ -9,6 +9,7 @@ match (Pan et al., "Spatial As Deep: Spatial CNN for Traffic Scene Understanding
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 from scipy.optimize import linear_sum_assignment
 
@@ -51,7 +52,7 @@ def intersection_over_union(one: Mask, other: Mask) -> float:
     return both / max(int(np.count_nonzero(one)) + int(np.count_nonzero(other)) - both, 1)
 
 
-def f1_score(hits: Array, found: Array, wanted: Array) -> Array:
+def f1_score(hits: ArrayLike, found: ArrayLike, wanted: ArrayLike) -> Array:
     """Return 2 hits / (found + wanted) (...), the F1 of numbers of lines (...); NaN where no line is wanted."""
     with np.errstate(invalid="ignore", divide="ignore"):
         return np.where(np.asarray(wanted) > 0, 2 * np.asarray(hits) / (np.asarray(found) + np.asarray(wanted)), np.nan)

@@ -122,7 +122,7 @@ def count_pixels(truth: Bytes, found: Bytes) -> Ints:
     return np.bincount(pairs, minlength=classes**2).reshape(classes, classes)
 
 
-def overlaps(confusion: Array) -> Array:
+def overlaps(confusion: Ints) -> Array:
     """Return the IoU (..., classes) from confusion matrices (..., classes, classes); NaN of a class without pixels."""
     both = np.diagonal(confusion, axis1=-2, axis2=-1)
     either = confusion.sum(axis=-1) + confusion.sum(axis=-2) - both
@@ -130,7 +130,7 @@ def overlaps(confusion: Array) -> Array:
         return np.where(either > 0, both / either, np.nan)
 
 
-def mean_overlap(confusion: Array) -> Array:
+def mean_overlap(confusion: Ints) -> Array:
     """Return the mean IoU (...) of the classes that occur in confusion matrices (..., classes, classes)."""
     by_class = overlaps(confusion)
     known = np.isfinite(by_class)
@@ -149,7 +149,7 @@ def measure_offsets(found: TracedLine, wanted: SeenLine, eye: Array) -> tuple[Ar
     along = shapely.line_locate_point(line, points)
     inner = (along > 0) & (along < line.length)
     away = np.hypot(*(found.ground - eye).T)
-    off = shapely.distance(line, points)
+    off = np.asarray(shapely.distance(line, points))
     where = [inner & (away >= low) & (away < high) for low, high in pairwise(RANGES_M)]
     return np.array([off[part].sum() for part in where]), np.array([int(part.sum()) for part in where])
 
