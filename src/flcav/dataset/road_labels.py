@@ -237,7 +237,7 @@ def _stroke(
     seen = view.shows(pixels, depth) & near
     step = np.diff(pixels, axis=0)
     ahead = np.gradient(points, axis=0) if len(points) > 1 else np.ones_like(points)
-    left = np.stack((-ahead[:, 1], ahead[:, 0]), axis=1) / np.maximum(np.hypot(*ahead.T), 1e-9)[:, None]
+    left = np.stack((-ahead[:, 1], ahead[:, 0]), axis=1) / np.maximum(np.hypot(ahead[:, 0], ahead[:, 1]), 1e-9)[:, None]
     aside, _ = view.project(view.lift(points + width_m * left))
     across = (aside - pixels)[:-1]
     with np.errstate(invalid="ignore", divide="ignore"):
