@@ -1,6 +1,7 @@
 """Road perception: labels from the map, tracing of lane lines, the ground plane, and measures, each by another way."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -24,6 +25,7 @@ from flcav.perception.road.model import STRIDE, RoadNetwork
 from flcav.perception.road.predict import predict_logits, segment_picture
 from flcav.perception.road.samples import Sample, draw_window
 from flcav.perception.road.task import ROAD
+from flcav.sensors.frame import Calibration
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, project_points
 
 LENS = Lens(width=640, height=384, fov_deg=60.0)
@@ -58,6 +60,15 @@ def test_the_ground_plane_is_the_inverse_of_the_projection():
     ground = np.random.default_rng(0).uniform((5, -4), (40, 4), (50, 2))
     assert np.allclose(PLANE.locate(project(ground)), ground)
     assert np.isnan(PLANE.locate(np.array([[320.0, 10.0]]))).all()  # above the horizon
+
+
+def test_the_ground_of_a_pole_is_below_its_mount():
+    calibration = Calibration(
+        {"camera": np.linalg.inv(pose(0, 0, 1.5)) @ MOUNT}, {"camera": LENS.intrinsics()}, {"camera": LENS.distortion()}
+    )
+    frame = SimpleNamespace(assumed=calibration)
+    ground = straight(1.0)
+    assert np.allclose(GroundPlane.of(frame, "camera", 1.5).locate(project(ground)), ground)
 
 
 def test_lines_are_traced_with_kind_and_place_where_they_are_drawn():

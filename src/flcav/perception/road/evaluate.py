@@ -13,6 +13,7 @@ import numpy as np
 import shapely
 
 from flcav.arrays import Array, Bytes, Ints
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.road_labels import IGNORED, ROAD_CLASSES, RoadLabels, SeenLine, label_road
 from flcav.dataset.store import Dataset
 from flcav.interface.progress import Report, ignore_progress
@@ -178,10 +179,11 @@ class RoadOutcomes:
         rows: dict[str, list] = {
             name: [] for name in (HITS, FOUND, WANTED, SAME_KIND, CONFUSION, OFF_M, POINTS, WEATHER, LIGHT)
         }
+        ground = DatasetGround(data)
         for done, (number, camera) in enumerate(pairs, start=1):
             frame, truth = data.frame(number), _labels(data, number, camera)
             shares, classes = segment_picture(network, read_recorded_picture(data, number, camera))
-            plane = GroundPlane.of(frame, camera)
+            plane = GroundPlane.of(frame, camera, ground.height_of(number))
             traced = [line for line in trace_lines(shares, plane) if line.score >= SCORE]
             for name, value in _compare(traced, truth, plane).items():
                 rows[name].append(value)

@@ -11,6 +11,7 @@ import numpy as np
 
 from flcav.arrays import Array, Array32, Mask
 from flcav.dataset.road_labels import BROKEN, REACH_M, SHORTEST_M, SOLID, leads_away
+from flcav.geometry import pose
 from flcav.perception.road.model import STRIDE
 from flcav.sensors.frame import Frame
 from flcav.sensors.lens import unproject_pixels
@@ -36,17 +37,18 @@ class TracedLine:
 
 @dataclass(frozen=True)
 class GroundPlane:
-    """The plane z = 0 of an agent's frame, seen by one of its cameras with the calibration that it assumes."""
+    """The ground below an agent as the plane z = 0, seen by one of its cameras with the calibration that it assumes."""
 
-    agent_from_camera: Array  # (4, 4) [m]
+    agent_from_camera: Array  # (4, 4) [m]; of a pole, whose origin is its mount, from the ground below it
     intrinsics: Array  # (3, 3) [px]
     distortion: Array  # (5,)
 
     @classmethod
-    def of(cls, frame: Frame, camera: str) -> "GroundPlane":
-        """Return the plane as a camera of a frame sees it."""
+    def of(cls, frame: Frame, camera: str, height_m: float = 0.0) -> "GroundPlane":
+        """Return the plane `height_m` [m] below the origin of a frame's agent, as one of its cameras sees it."""
         assumed = frame.assumed
-        return cls(assumed.agent_from_sensor[camera], assumed.intrinsics[camera], assumed.distortion[camera])
+        raised = pose(0.0, 0.0, height_m) @ assumed.agent_from_sensor[camera]
+        return cls(raised, assumed.intrinsics[camera], assumed.distortion[camera])
 
     def locate(self, pixels: Array) -> Array:
         """Return the points (K, 2) x, y [m] of the plane at pixels (K, 2); NaN at and above the horizon."""

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from flcav.arrays import Array32, Bytes
+from flcav.dataset.ground import DatasetGround
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.road_labels import ROAD_CLASSES
 from flcav.dataset.store import Dataset
@@ -112,8 +113,10 @@ def _read(path: Path, frames: Sequence[int] | None) -> Iterator[tuple[Path, Pict
         yield from ((origin, rgb, None) for origin, rgb in read_pictures(path, frames))
         return
     data = Dataset.open(path)
+    ground = DatasetGround(data)
     for frame, camera, rgb in read_recorded(data, frames):
-        yield path / f"{frame.key}/{camera}", rgb, GroundPlane.of(frame, camera)
+        plane = GroundPlane.of(frame, camera, ground.height_of(data.number(frame.key)))
+        yield path / f"{frame.key}/{camera}", rgb, plane
 
 
 def _kind(line: TracedLine) -> str:
