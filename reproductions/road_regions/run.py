@@ -34,8 +34,8 @@ from flcav.storage.markdown import format_bullets, format_table
 HOME = "home"
 GAIN = 0.05  # aim: least gain of F1 in a region
 WORN = 0.9
-VEHICLES, SCENES, TEST_SCENES = 4, 3, 4
-ROUNDS, STEPS, RATES = 3, 12, (1e-3, 3e-4)
+VEHICLES, SCENES, TEST_SCENES = 4, 2, 3
+ROUNDS, STEPS, RATES = 3, 10, (1e-3, 3e-4)
 BUDGET_MB = 10_000.0  # of no effect: what is sent is counted
 
 
@@ -205,5 +205,5 @@ def draw(results: RegionsResult) -> bytes:
 
 
 EXPERIMENT = Experiment(
-    results=RegionsResult, run=run, tables=tables, seeds=5, takes=("seeds", "jobs", "engine", "stale")
+    results=RegionsResult, run=run, tables=tables, seeds=3, takes=("seeds", "jobs", "engine", "stale")
 )
