@@ -70,7 +70,13 @@ DATASET = ("data/*", "data/*/*")
 BEGUN, DRAWN = ("out/events", "out/checkpoint.pt"), ("out/0",)
 FORMATS = {
     **{"kitti": "--min-points #1 --calibration assumed", "yolo": "--labels actors --validation #0.5 --min-pixels #1"},
-    **{"coco": "--min-pixels #1", "nuscenes": "--validation #0.5", "opv2v": "--min-points #2", "mcap": ""},
+    **{
+        "coco": "--min-pixels #1",
+        "nuscenes": "--validation #0.5",
+        "opv2v": "--min-points #2",
+        "mcap": "",
+        "culane": "--validation #0.5",
+    },
 }
 # seconds of what trains a task, what reads a dataset for it, and what draws pictures
 LEARNERS = {
@@ -78,12 +84,13 @@ LEARNERS = {
     "signs": (0.2, 0.1, 0.7),
     "objects": (0.3, 0.13, 1.8),
     "trajectory": (0.55, 0.4, 0.8),
+    "road": (0.6, 0.3, 0.9),
 }
 SCORED = {name: "--threshold #0.3" if isinstance(task_named(name), Scores) else "" for name in TASKS}
 BOMBS, COPIED = 0.05, 0.1  # shares of files that unfold without end or are links, of imports with a recording twice
 SPLITS = ("train", "test")  # folders of recordings in every such format
 MOST_MB = 1500  # of memory that a case may take beyond what the process has, libraries included
-FILES = {"weather": "picture.*", "signs": "picture.*", "objects": "cloud.bin"}
+FILES = {"weather": "picture.*", "signs": "picture.*", "road": "picture.*", "objects": "cloud.bin"}
 
 
 def calls() -> list[Call]:

@@ -26,6 +26,7 @@ from flcav.federation.trainable import Trainable
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient, as_shared
 from flcav.perception.device import select_device
+from flcav.perception.road.task import ROAD
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import Task, build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -42,9 +43,12 @@ from flcav.sensors.frame import Frame
 from flcav.world.weather import Weather
 
 each_task = pytest.mark.parametrize("task", [task_named(name) for name in TASKS], ids=TASKS)
-CONFIGS = {"signs": replace(find_configuration(SIGNS, "n"), window_px=(96, 64))}
+CONFIGS = {
+    "signs": replace(find_configuration(SIGNS, "n"), window_px=(96, 64)),
+    "road": replace(find_configuration(ROAD, "tiny"), window_px=(96, 64)),
+}
 LACKING = {"objects": ({"lidar": False}, "no LiDAR"), "trajectory": ({"traffic": False}, "no traffic")}
-FILES = {"weather": "front/*.webp", "signs": "front/*.webp", "objects": "top/*.bin"}
+FILES = {"weather": "front/*.webp", "signs": "front/*.webp", "road": "front/*.webp", "objects": "top/*.bin"}
 
 
 def small(task: Task) -> Any:
@@ -335,7 +339,7 @@ def test_where_nothing_can_be_written_no_training_starts(task, data, tmp_path, c
         assert told.err == f"flcav: {out}: Not a directory\n"
 
 
-@pytest.mark.parametrize("task", [WEATHER, SIGNS], ids=lambda task: task.name)
+@pytest.mark.parametrize("task", [WEATHER, SIGNS, ROAD], ids=lambda task: task.name)
 def test_a_bad_picture_is_one_sentence(task, tmp_path, capsys):
     weights = tmp_path / "weights.safetensors"
     save_network(task, build_network(task, small(task), 1), weights)

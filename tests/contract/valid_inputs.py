@@ -20,6 +20,7 @@ from flcav.dataset.formats.writing import ExportOptions
 from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.geometry import pose
+from flcav.perception.road.task import ROAD
 from flcav.perception.signs.task import SIGNS
 from flcav.perception.task import build_network, find_configuration
 from flcav.perception.tasks import TASKS, task_named
@@ -204,6 +205,7 @@ def make_inputs(folder: Path) -> None:
     record(AllSensors(spins=2), folder / "data")
     networks = {name: find_configuration(task_named(name), None) for name in TASKS}
     networks["signs"] = replace(find_configuration(SIGNS, "n"), window_px=(WIDTH, HEIGHT))
+    networks["road"] = replace(find_configuration(ROAD, "tiny"), window_px=(WIDTH, HEIGHT))
     for name in TASKS:
         task = task_named(name)
         save_network(task, build_network(task, networks[name], 1), folder / "weights" / f"{name}.safetensors")

@@ -62,7 +62,7 @@ def test_own_tasks_and_strategies_are_found_in_the_working_directory():
 @pytest.mark.parametrize(
     ("name", "body", "said"),
     [
-        ("poetry", "", r"task 'poetry': choose one of weather, signs, objects, trajectory, or name your own"),
+        ("poetry", "", r"task 'poetry': choose one of weather, signs, objects, trajectory, road, or name your own"),
         ("no_such_sky:SKY", "", r"no module 'no_such_sky' in .* or among what is installed"),
         ("no_such.sky:SKY", "", r"no module 'no_such' in"),
         ("sky_1:", TASK, r"a module, a colon and a name in it are wanted"),

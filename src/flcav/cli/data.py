@@ -137,7 +137,7 @@ def export(
         None, "--min-points", help="kitti, opv2v: what has fewer LiDAR points is not labelled; 1 by default."
     ),
     calibration: str | None = typer.Option(
-        None, "--calibration", help="All but yolo, coco: true (the default), or assumed by the agents."
+        None, "--calibration", help="All but yolo, coco, culane: true (the default), or assumed by the agents."
     ),
 ) -> None:
     """Write a dataset in a format that other software reads: docs/formats.md has the tables."""

@@ -6,7 +6,7 @@ They are drawn on an image (H, W, 3), a point cloud (N, 4) or a bird's-eye map, 
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from flcav.arrays import Array, Words
+from flcav.arrays import Array, Bytes, Words
 from flcav.geometry import Boxes
 
 
@@ -35,6 +35,45 @@ class PictureBoxes:
     def caption(self) -> str:
         """Return the number of boxes in words."""
         return f"{len(self.box)} found"
+
+
+@dataclass(frozen=True)
+class PictureClasses:
+    """A class for every pixel of an image; the first class is the background, which is not drawn."""
+
+    classes: Bytes  # (H, W) index in `names`
+    names: tuple[str, ...]
+
+    @property
+    def caption(self) -> str:
+        """Return the share of the image that is not background, in words."""
+        return f"{(self.classes > 0).mean():.1%} of the picture marked"
+
+
+@dataclass(frozen=True)
+class PictureLines:
+    """Polylines on an image."""
+
+    lines: tuple[Array, ...]  # (K, 2) u, v [px]; the centre of the first pixel is (0, 0)
+    kind: tuple[str, ...]  # of each line
+
+    @property
+    def caption(self) -> str:
+        """Return the number of lines in words."""
+        return f"{len(self.lines)} line{'s' * (len(self.lines) != 1)}"
+
+
+@dataclass(frozen=True)
+class GroundLines:
+    """Polylines on the ground in front of an agent, drawn next to the input in bird's-eye view."""
+
+    lines: tuple[Array, ...]  # (K, 2) x forward, y left of the agent [m]
+    kind: tuple[str, ...]  # of each line
+
+    @property
+    def caption(self) -> str:
+        """Return how far ahead the lines reach, in words."""
+        return f"up to {max((float(line[:, 0].max()) for line in self.lines), default=0.0):.0f} m ahead"
 
 
 @dataclass(frozen=True)
@@ -99,4 +138,4 @@ class Paths:
         return f"{len(self.users)} predicted"
 
 
-Mark = Bars | PictureBoxes | CloudBoxes | Paths
+Mark = Bars | PictureBoxes | PictureClasses | PictureLines | GroundLines | CloudBoxes | Paths

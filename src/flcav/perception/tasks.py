@@ -2,7 +2,7 @@
 
 >>> from flcav import TASKS
 >>> list(TASKS)
-['weather', 'signs', 'objects', 'trajectory']
+['weather', 'signs', 'objects', 'trajectory', 'road']
 """
 
 from collections.abc import Mapping
@@ -18,6 +18,7 @@ TASKS: Mapping[str, str] = {  # name -> module:NAME, so that listing the tasks i
     "signs": "flcav.perception.signs.task:SIGNS",
     "objects": "flcav.perception.objects.task:OBJECTS",
     "trajectory": "flcav.perception.trajectory.task:TRAJECTORY",
+    "road": "flcav.perception.road.task:ROAD",
 }
 
 

@@ -42,6 +42,9 @@ class EmbeddedSource(DividedSource):
         if recipe.rare:
             drawn = self.town.parameters.model_copy(update={"rare": recipe.rare})
             self.town = replace(self.town, parameters=drawn)
+        if recipe.worn_paint:
+            worn = self.town.parameters.model_copy(update={"worn_paint": recipe.worn_paint})
+            self.town = replace(self.town, parameters=worn)
         check_town_name(self.town.name)
         known = self.town.poles.id.tolist()
         self.poles = known if recipe.poles == "all" else list(recipe.poles)
@@ -65,6 +68,7 @@ class EmbeddedSource(DividedSource):
         optional = {
             "randomise",
             "rare",
+            "worn_paint",
             "window_s",
             "window_every_s",
             "window_range_m",

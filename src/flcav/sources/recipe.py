@@ -112,6 +112,7 @@ class Recipe(Displayed, Config):
     calibration_error: CalibrationError = CalibrationError()  # errors of the calibration that agents assume
     scenarios: tuple[Scenario, ...] = ()  # corner cases, in every scene
     rare: RareKinds = Field(default={})  # shares of rare kinds of objects among the vehicles of their category
+    worn_paint: float = Field(default=0.0, ge=0, le=1)  # wear of the road markings; above 0 it replaces the town's
     randomise: Drawing | None = (
         None  # streets, sizes of cars and LiDARs drawn by `seed`; lidars: from 16 beams on; wide: with bays, too
     )
@@ -211,7 +212,7 @@ class CarlaRecipe(Recipe):
 
     @model_validator(mode="after")
     def _has_what_carla_has(self) -> "CarlaRecipe":
-        for name in ("scenarios", "rare", "randomise", "window_range_m"):
+        for name in ("scenarios", "rare", "randomise", "window_range_m", "worn_paint"):
             if getattr(self, name):
                 raise ValueError(f"'{name}' is of the built-in simulator; source: carla has no such thing")
         for name in ("vehicle_rig", "pole_rig"):

@@ -124,7 +124,7 @@ def test_formats_are_named(shown):
 def test_tasks_and_networks_are_named(shown):
     page = (Path(__file__).parents[3] / "docs" / "tasks.md").read_text()
     for command in ("train", "evaluate", "infer", "errors"):
-        assert "weather, signs, objects or trajectory, or one of your own" in shown((command,), 400)
+        assert "weather, signs, objects, trajectory or road, or one of your own" in shown((command,), 400)
     for name in TASKS:
         (row,) = re.findall(rf"^\| `{name}` \| (?:camera|LiDAR|tracks).*$", page, re.M)
         assert all(f"`{network}`" in row for network in task_named(name).configurations)

@@ -54,7 +54,7 @@ def test_the_further_measure_of_objects_is_their_ap70_with_a_paired_interval() -
 
 
 def test_tasks_without_further_measures_have_none() -> None:
-    assert {name for name in TASKS if further_measures(task_named(name))} == {"objects"}
+    assert {name for name in TASKS if further_measures(task_named(name))} == {"objects", "road"}
 
 
 def test_results_tell_the_cost_of_every_measure_at_home() -> None:

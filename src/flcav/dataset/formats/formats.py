@@ -16,6 +16,7 @@ EXPORTS: Mapping[str, str] = {  # name -> module:NAME, so that listing the forma
     "nuscenes": "flcav.dataset.formats.nuscenes.write:EXPORT",
     "opv2v": "flcav.dataset.formats.opv2v.write:EXPORT",
     "mcap": "flcav.dataset.formats.mcap:EXPORT",
+    "culane": "flcav.dataset.formats.culane:EXPORT",
 }
 IMPORTS: Mapping[str, str] = {
     "kitti": "flcav.dataset.formats.kitti.read:IMPORT",

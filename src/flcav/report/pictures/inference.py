@@ -7,13 +7,24 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure, FigureBase
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
 from flcav.perception.images import CameraView
-from flcav.perception.marks import Bars, CloudBoxes, Mark, Paths, PictureBoxes
+from flcav.perception.marks import (
+    Bars,
+    CloudBoxes,
+    GroundLines,
+    Mark,
+    Paths,
+    PictureBoxes,
+    PictureClasses,
+    PictureLines,
+)
 from flcav.perception.task import Finding
 from flcav.report import style
 from flcav.report.pictures.camera import boxes_on_picture, points_on_picture, show_view
@@ -23,7 +34,9 @@ from flcav.report.pictures.predicted_paths import paths_key, paths_on_map
 WIDTH_IN = 8.0
 ABOVE_IN = 6.5  # side of a cloud in bird's-eye view
 MAP_IN = 7.2  # side of a map
-BARS_IN = 3.6  # width of bars next to the input
+BARS_IN = 3.6  # width of what is drawn next to the input
+GROUND_AHEAD_M, GROUND_ASIDE_M = 42.0, 14.0  # shown of the ground
+HALF_PX = 0.5  # from pixels by their centres to pixels by their edges
 COLOURS = {  # of classes with a customary colour
     "Car": style.BLUE,
     "Pedestrian": style.VERMILLION,
@@ -31,7 +44,14 @@ COLOURS = {  # of classes with a customary colour
     "light_red": style.VERMILLION,
     "light_yellow": style.ORANGE,
     "light_green": style.GREEN,
+    "solid": style.VERMILLION,
+    "broken": style.SKY,
+    "road_edge": style.GREEN,
+    "stop_line": style.ORANGE,
+    "crossing": style.PURPLE,
+    "arrow": style.BLUE,
 }
+TINT = 0.55  # opacity of a class over the picture
 BOX: dict[str, Any] = {"facecolor": "none", "linewidth": 1.4}
 
 
@@ -45,26 +65,26 @@ class Panels:
 
 @style.styled
 def draw(finding: Finding) -> Figure:
-    """Return the network's input with all marks, bars next to it, and a camera's picture of the scene above a cloud.
+    """Return the network's input with all marks, bars and the ground next to it, and a camera's picture above a cloud.
 
     Clouds and maps are in bird's-eye view, with the observer's heading up. In a camera's picture the cloud is coloured
     by distance, and boxes are drawn by their edges.
     """
-    shares = [mark for mark in finding.marks if isinstance(mark, Bars)]
+    beside = [mark for mark in finding.marks if isinstance(mark, tuple(SIDE))]
     view = finding.view() if finding.seen.ndim == 2 else None
     width, height = _size(finding.seen, view)
-    figure = style.canvas(width + BARS_IN * len(shares), height)
+    figure = style.canvas(width + BARS_IN * len(beside), height)
     body: FigureBase = figure
-    if shares:
-        ratios = (width, *(BARS_IN for _ in shares))
-        body, *side = figure.subfigures(1, 1 + len(shares), width_ratios=ratios, squeeze=False)[0]
-        for page, mark in zip(side, shares, strict=True):
-            show_bars(page.add_subplot(), mark)
+    if beside:
+        ratios = (width, *(BARS_IN for _ in beside))
+        body, *side = figure.subfigures(1, 1 + len(beside), width_ratios=ratios, squeeze=False)[0]
+        for page, mark in zip(side, beside, strict=True):
+            SIDE[type(mark)](page.add_subplot(), mark)
     captions = " · ".join(mark.caption for mark in finding.marks)
     panels = _show(body, finding.seen, view, f"{finding.path.name} · {captions}" if captions else finding.path.name)
     handles: list[Artist] = []
     for mark in finding.marks:
-        if not isinstance(mark, Bars):
+        if type(mark) in DRAWERS:
             handles += DRAWERS[type(mark)](panels, finding.seen, mark)
     if finding.seen.ndim == 2:
         _frame_from_above(panels.seen, finding.marks)
@@ -167,6 +187,41 @@ def boxes_in_picture(axes: Axes, mark: PictureBoxes) -> None:
         )
 
 
+def show_ground(axes: Axes, mark: GroundLines) -> None:
+    """Draw lines on the ground in bird's-eye view, the agent's heading up."""
+    for line, kind in zip(mark.lines, mark.kind, strict=True):
+        axes.plot(*on_page(line).T, color=COLOURS.get(kind, style.BLUE), linestyle=_dashes(kind), linewidth=1.6)
+    axes.plot(0, 0, "^", color=style.INK, markersize=6)
+    style.hide_axes(axes)
+    axes.set(xlim=(-GROUND_ASIDE_M, GROUND_ASIDE_M), ylim=(-2, GROUND_AHEAD_M), aspect="equal")
+    axes.set_title("on the ground")
+    style.scale_bar(axes, 10)
+
+
+def _dashes(kind: str) -> str:
+    return "--" if kind == "broken" else "-"
+
+
+def _draw_classes(panels: Panels, seen: NDArray[Any], mark: PictureClasses) -> list[Artist]:
+    """Tint the picture by class, and return a key of the classes that occur."""
+    colours = [to_rgb(COLOURS.get(name, style.BLUE)) for name in mark.names]
+    tint = np.zeros((*mark.classes.shape, 4), np.float32)
+    present = [number for number in range(1, len(mark.names)) if (mark.classes == number).any()]
+    for number in present:
+        tint[mark.classes == number] = (*colours[number], TINT)
+    height, width = mark.classes.shape
+    panels.seen.imshow(tint, extent=(0, width, height, 0))
+    return [Patch(color=colours[number], label=mark.names[number].replace("_", " ")) for number in present]
+
+
+def _draw_lines(panels: Panels, seen: NDArray[Any], mark: PictureLines) -> list[Artist]:
+    for line, kind in zip(mark.lines, mark.kind, strict=True):
+        panels.seen.plot(*(line + HALF_PX).T, color="white", linestyle=_dashes(kind), linewidth=1.4)
+    if not mark.lines:
+        return []
+    return [Line2D([], [], color=style.RULE, linewidth=1.4, label=f"{len(mark.lines)} lane lines")]
+
+
 def _draw_picture_boxes(panels: Panels, seen: NDArray[Any], mark: PictureBoxes) -> list[Artist]:
     boxes_in_picture(panels.seen, mark)
     return []
@@ -198,6 +253,12 @@ def _draw_paths(panels: Panels, seen: NDArray[Any], mark: Paths) -> list[Artist]
 
 DRAWERS: Mapping[type, Callable[[Panels, NDArray[Any], Any], list[Artist]]] = {
     PictureBoxes: _draw_picture_boxes,
+    PictureClasses: _draw_classes,
+    PictureLines: _draw_lines,
     CloudBoxes: _draw_cloud_boxes,
     Paths: _draw_paths,
 }
+SIDE: Mapping[type, Callable[[Axes, Any], None]] = {
+    Bars: show_bars,
+    GroundLines: show_ground,
+}  # drawn next to the input

@@ -114,6 +114,7 @@ class Recording(Config):
     scenarios: tuple[Scenario, ...] | None = None
     rare: RareKinds | None = None
     rare_splits: tuple[SplitName, ...] | None = None  # that `rare` is for; None: all
+    worn_paint: float | None = Field(default=None, ge=0, le=1)
     source: Literal["carla"] | None = None  # from CARLA, with the fields of `CarlaRecipe` below
     host: str | None = None
     port: int | None = None

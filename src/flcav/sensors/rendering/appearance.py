@@ -113,7 +113,9 @@ def _of_town(scene: Scene) -> Appearance:
         colour=COLOUR[None],
         mirror=MIRROR,
         gloss=GLOSS,
-        markings=build_markings(map_layers(town) if town.net.exists() else MapLayers((), (), (), (), (), ())),
+        markings=build_markings(
+            map_layers(town) if town.net.exists() else MapLayers((), (), (), (), (), ()), town.parameters.worn_paint
+        ),
         facades=facades_of(town.name, town.buildings),
         plates=Plates(place, kinds, draw_signs()),
         noise=make_noise(),

@@ -36,20 +36,21 @@ class Markings(NamedTuple):
 
     rectangle: Array32  # (K, 6) see `Rectangle` [m]
     colour: Array32  # (K, 3) linear RGB
+    worn: np.float32  # wear of the paint, 0 to 1
     corner: Array  # (2,) lowest x, y of the grid [m]
     first: Ints32  # (cells along x, cells along y + 1) start of a cell's list
     listed: Ints32  # lists of rows of `rectangle`, cell by cell
 
 
-def build_markings(layers: MapLayers) -> Markings:
-    """Return the lane lines, crossings and arrows of a map as rectangles."""
+def build_markings(layers: MapLayers, worn: float = 0.0) -> Markings:
+    """Return the lane lines, crossings and arrows of a map as rectangles, with the wear of their paint, 0 to 1."""
     pieces = [(piece, COLOURS.get(line.colour, COLOURS["white"])) for line in layers.markings for piece in _line(line)]
     white = COLOURS["white"]
     pieces += [(_box(stripe), white) for crossing in layers.crossings for stripe in outline_stripes(crossing)]
     pieces += [(strip, white) for arrow in layers.arrows for strip in _arrow(arrow)]
     rectangle = np.array([piece for piece, _ in pieces], np.float32).reshape(-1, 6)
     colour = np.array([colour for _, colour in pieces], np.float32).reshape(-1, 3)
-    return Markings(rectangle, colour, *_grid(rectangle))
+    return Markings(rectangle, colour, np.float32(worn), *_grid(rectangle))
 
 
 @inlined
@@ -145,6 +146,13 @@ def _grid(rectangle: Array32) -> tuple[Array, Ints32, Ints32]:
     first[:, :-1] = starts[:-1].reshape(cells[0], cells[1])
     first[:, -1] = starts[cells[1] :: cells[1]]
     return corner, first, pairs[:, 1].astype(np.int32)
+
+
+@inlined
+def wear(x, y, worn, table):
+    """Return the share of the paint that is left at x, y [m]: with `worn` 1 none on half of it, a third elsewhere."""
+    lost = min(np.float32(0.35) + np.float32(1.3) * sample_noise(table, x * 0.6 + 13.0, y * 0.6), np.float32(1))
+    return 1 - worn * lost
 
 
 @inlined

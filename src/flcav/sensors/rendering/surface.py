@@ -9,7 +9,7 @@ import numpy as np
 
 from flcav.machine.compiled import inlined, kernel
 from flcav.sensors.rendering.facade import sample_sign, shade_facade
-from flcav.sensors.rendering.ground import asphalt, grass, paving, sample_paint
+from flcav.sensors.rendering.ground import asphalt, grass, paving, sample_paint, wear
 from flcav.sensors.rendering.noise import fade, hash_pair, sample_noise
 from flcav.sensors.rendering.state import AMBER, GREEN, RED
 from flcav.world.materials import Material
@@ -89,6 +89,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                 painted[ray] = share > ROAD_LINE
                 worn = np.float32(0.72) + np.float32(0.28) * sample_noise(table, x * 1.7, y * 1.7)
                 share *= min(worn + np.float32(0.25) * tone, np.float32(1))
+                if appearance.markings.worn > 0:
+                    share *= wear(x, y, appearance.markings.worn, table)
                 colour = appearance.markings.colour
                 red += share * (colour[piece, 0] * tone - red)
                 green += share * (colour[piece, 1] * tone - green)

@@ -231,6 +231,7 @@ class TownParameters(Config):
     stop_lines: tuple[StopLineParameters, ...] = ()  # stop lines of the map; approaches with one have no others
     parking: tuple[ParkingParameters, ...] = ()  # parking spaces of the map
     parking_taken: Share = 0.6  # fraction of these that are taken
+    worn_paint: Share = 0.0  # wear of the road markings: 0 as painted, 1 faded, half of it gone
 
     @model_validator(mode="after")
     def _known_shapes(self) -> "TownParameters":
