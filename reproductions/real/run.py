@@ -171,12 +171,13 @@ def count_split(folder: Path) -> Split:
 
 
 def shrink(recipe: RunRecipe) -> RunRecipe:
-    """Return the recipe with two trainings of two rounds, for a trial."""
+    """Return the recipe with two trainings of two rounds of one local step, for a trial."""
     (task,) = recipe.tasks.values()
     assert task.plan is not None
     few = task.plan.model_copy(update={"edge_rounds": 2, "cloud_rounds": 1})
     training = recipe.training_of(TASK).model_copy(update={"local_steps": 1})
-    changes = {"retrainings": 1, "training": training, "tasks": {TASK: task.model_copy(update={"plan": few})}}
+    tasks = {TASK: task.model_copy(update={"plan": few})}
+    changes = {"retrainings": 1, "size": "toy", "splits": None, "training": training, "tasks": tasks}
     return recipe.model_copy(update=changes)
 
 
