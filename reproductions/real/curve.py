@@ -27,7 +27,7 @@ from flcav.statistics.streams import derive_seed, stream
 from flcav.storage.records import write_any_table
 
 SIZES = (8, 15, 30, 60, 120)  # annotated sweeps
-DRAWS = 2  # of them, with a training each
+DRAWS = 1  # of them, with a training each
 HISTORY = "history.csv"
 UPLINK_MB = (1.0, 3.0)  # budgets of the wireless uplink that are planned for
 MODEL_MB = 1.5  # of an update, of which the plans have none
