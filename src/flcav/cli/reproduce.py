@@ -35,7 +35,10 @@ def reproduce(
     stale: Stale = STALE,
     kitti: Path | None = typer.Option(None, "--kitti", help="sim-to-real: a folder of real frames in KITTI's layout."),
     data: Path | None = typer.Option(
-        None, "--data", help="sim-to-real: a dataset of real frames, such as an imported one, instead."
+        None,
+        "--data",
+        help="sim-to-real: a dataset of real frames, such as an imported one, instead. real: a folder of frames that "
+        "lie elsewhere.",
     ),
     around: bool = typer.Option(False, "--around", help="sim-to-real, with --data: look in all directions."),
     weights: Path | None = typer.Option(

@@ -1,5 +1,6 @@
 """Augmentation: returns stay on their objects, labels stay true, pasted objects meet nothing."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 
 import numpy as np
@@ -9,8 +10,10 @@ from hypothesis import strategies as st
 from shapely.geometry import Polygon
 
 from flcav.geometry import Boxes, points_in_boxes
+from flcav.perception.objects import task
 from flcav.perception.objects.augment import (
     DENSE,
+    Cutouts,
     augment,
     cut_out_objects,
     fade_objects,
@@ -22,7 +25,7 @@ from flcav.perception.objects.augment import (
     select_free,
     tilt_sample,
 )
-from flcav.perception.objects.model import Augmentation, small_config
+from flcav.perception.objects.model import Augmentation, SecondConfig, small_config
 from flcav.perception.objects.samples import Sample, crop_to_range
 from flcav.perception.objects.truth import MIN_RETURNS
 
@@ -215,3 +218,20 @@ def test_a_margin_makes_the_boxes_of_its_class_larger_and_moves_no_return():
     np.testing.assert_array_equal(out.points, sample.points)
     np.testing.assert_allclose(out.boxes.size, [[2.2, 1.9, 2.4], [2, 2, 2]])
     np.testing.assert_allclose(out.boxes.center[:, 2] - out.boxes.size[:, 2] / 2, -1)
+
+
+def test_clients_that_take_turns_keep_their_databases(monkeypatch: pytest.MonkeyPatch):
+    made = []
+
+    def count(samples: Iterable[Sample], config: SecondConfig) -> Cutouts:
+        made.append(1)
+        return cut_out_objects(samples, config)
+
+    monkeypatch.setattr(task, "cut_out_objects", count)
+    objects, clients = task.ObjectsTask(), [[scene(seed)] * 150 for seed in range(3)]
+    for client in (0, 1, 2, 0, 1, 2):
+        objects.draw(clients[client], 0, CONFIG, np.random.default_rng(0))
+    assert len(made) == 3
+    objects.draw([scene(4)] * 500, 0, CONFIG, np.random.default_rng(0))  # as many as are kept
+    objects.draw(clients[0], 0, CONFIG, np.random.default_rng(0))
+    assert len(made) == 5

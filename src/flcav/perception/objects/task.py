@@ -139,6 +139,9 @@ def streets_study() -> StudyRecipe:
     )
 
 
+KEPT = 500  # samples, in all, whose ground-truth databases are kept for further drawing
+
+
 class ObjectsTask(ObjectsOutcomes):
     """3D object detection in LiDAR sweeps by SECOND, as a perception task (see `flcav.perception.task.Task`)."""
 
@@ -154,7 +157,7 @@ class ObjectsTask(ObjectsOutcomes):
     threshold = THRESHOLD
 
     def __init__(self) -> None:
-        self._cut: tuple[Sequence[Sample], Cutouts] | None = None  # the latest ground-truth database and its samples
+        self._cut: list[tuple[Sequence[Sample], Cutouts]] = []  # latest samples with their ground-truth databases
 
     def study(self) -> StudyRecipe:
         """Return the study recipe: training in three towns; tests on other scenes of them, in weather, of tracking."""
@@ -212,9 +215,15 @@ class ObjectsTask(ObjectsOutcomes):
         return augment(sample, how, rng)
 
     def _cutouts(self, samples: Sequence[Sample], config: SecondConfig) -> Cutouts:
-        if self._cut is None or self._cut[0] is not samples:
-            self._cut = samples, cut_out_objects((samples[number] for number in range(len(samples))), config)
-        return self._cut[1]
+        for known, cutouts in self._cut:
+            if known is samples:
+                return cutouts
+        made = cut_out_objects((samples[number] for number in range(len(samples))), config)
+        # The clients of a federation take turns in one process; others' samples are not kept in memory for long.
+        while self._cut and sum(len(known) for known, _ in self._cut) + len(samples) > KEPT:
+            del self._cut[0]
+        self._cut.append((samples, made))
+        return made
 
     def loss(self, network: Second, samples: Sequence[Sample]) -> Tensor:
         """Return the loss of SECOND on a batch, differentiable in the network's parameters."""
