@@ -22,7 +22,7 @@ from flcav.statistics.verdicts import Claim, describe_aims
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record, select
 
-TOWN, TASK = "grid", "objects"
+TOWN, TASK = "arterial", "objects"
 PRETRAINED, TRACKS, HEARD, TRUTH = "pretrained", "tracks", "tracks and messages", "ground truth"
 ARMS: Mapping[str, tuple[str, str]] = {  # name in the tables -> arm, stage
     PRETRAINED: (MAIN, PRETRAIN),

@@ -156,7 +156,7 @@ def test_classes_are_compared_one_by_one(tmp_path: Path) -> None:
     done = run(recipe, tmp_path)
     results = compare_classes(recipe, [done])
     (arms,) = results.seeds.values()
-    numbers = done.test(arm="heard", stage="edge", region="grid", task="objects").numbers
+    numbers = done.test(arm="heard", stage="edge", region="arterial", task="objects").numbers
     for kind, name in (("Car", "cars"), ("Pedestrian", "pedestrians"), ("Cyclist", "cyclists")):
         assert arms["tracks and messages"].ap50[kind] == (numbers[f"AP50 {kind}"] or 0.0)
         gained = arms["tracks and messages"].ap50[kind] - arms["tracks"].ap50[kind]
