@@ -262,7 +262,10 @@ def tabulate_real(results: RealResult) -> dict[str, str]:
         [number, ", ".join(map(str, chosen)), f"{covered} of {sum(drive.counts.values())}"]
         for number, (chosen, covered) in enumerate(zip(drive.chosen, drive.covered, strict=True), start=1)
     ]
-    points = [[size, *(f"{value:.3f}" for value in values)] for size, values in curve.points.items()]
+    points = [
+        [size, *(f"{value:.3f}" for value in values)]
+        for size, values in sorted(curve.points.items(), key=lambda point: int(point[0]))
+    ]
     draws = max(map(len, curve.points.values()))
     plans = [[f"{each.budget_mb:g}", each.sweeps, f"{each.predicted:.3f}"] for each in curve.plans]
     rates = [["-" if rate is None else f"{rate:.3f}" for rate in (labels.precision, labels.recall)]]

@@ -162,7 +162,9 @@ def test_classes_are_compared_one_by_one(tmp_path: Path) -> None:
         gained = arms["tracks and messages"].ap50[kind] - arms["tracks"].ap50[kind]
         assert results.differences[kind]["tracks and messages - tracks"].mean == pytest.approx(gained)
         assert any(sentence.startswith(f"*{name}, ") for sentence in results.sentences())
-    labels, *_ = done.arms["heard"].stages[0].labels or ()
+    known = done.arms["heard"].stages[0].labels
+    assert known is not None
+    (labels,) = known
     assert sum(each.targets for each in labels.by_class or ()) == labels.targets
     assert sum(each.right for each in labels.by_class or ()) == pytest.approx((labels.recall or 0) * labels.targets)
 

@@ -198,7 +198,7 @@ def test_the_loop_of_a_run_is_an_animation(finished: Path, tmp_path: Path, capsy
     assert not stopped.value.code
     assert "96 frames, 8 s" in capsys.readouterr().out
     with Image.open(tmp_path / "loop.webp") as film:
-        assert film.n_frames > 40
+        assert getattr(film, "n_frames", 1) > 40
         assert film.size == (960, 540)
 
 

@@ -69,8 +69,10 @@ def _save_errors(data: Dataset, folder: Path) -> None:
     far = np.hypot(*(truth.boxes.center[cars, :2] - here).T)
     near = cars[np.argsort(far)[:2]].tolist()
     missed = [
-        PerceptionError(*truth.boxes.center[row].tolist(), 1.0, "miss", "Car", 9, 0.2, frame.scene, str(track), metres)
-        for row, track, metres in zip(near, truth.track[near], (far.min(), nan), strict=True)
+        PerceptionError(x, y, z, 1.0, "miss", "Car", 9, 0.2, frame.scene, str(track), metres)
+        for (x, y, z), track, metres in zip(
+            truth.boxes.center[near].tolist(), truth.track[near], (far.min(), nan), strict=True
+        )
     ]
     save_errors(missed, folder / "errors.parquet")
 

@@ -60,6 +60,7 @@ def test_the_sweep_of_an_error_is_that_of_the_vehicle_that_made_it(footage, reco
     data = Dataset.open(recorded_run / "work" / "grid-registry-objects" / "data")
     error = load_errors(footage.errors_of("grid"))[0]
     number = find_frame(Frames.open(recorded_run / "work" / "grid-registry-objects"), error)
+    assert number is not None
     frame = data.frame(len(data) - 1)
     assert data.keys[number] == data.keys[len(data) - 1]
     sweep = footage.error_sweep("grid", 0)
@@ -68,10 +69,8 @@ def test_the_sweep_of_an_error_is_that_of_the_vehicle_that_made_it(footage, reco
     assert sweep["before"]["title"] == "pretrained"  # type: ignore
     assert sweep["before"]["found"] == [False] * len(sweep["targets"])  # type: ignore
     assert sweep["after"]["title"] == "after edge FL"  # type: ignore
-    found = detect_before_after(
-        *(recorded_run / "work" / name for name in ("pretrain-objects", "grid-edge-fl-objects")),
-        Frames(data, (number,), {}),
-    )
+    before, after = (recorded_run / "work" / name for name in ("pretrain-objects", "grid-edge-fl-objects"))
+    found = detect_before_after(before, after, Frames(data, (number,), {}))
     assert sweep["after"]["found"] == list(found.after.found)  # type: ignore
 
 

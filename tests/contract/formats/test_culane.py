@@ -41,6 +41,7 @@ class OnTheRoad(PaintedSource):
         rays = compute_pixel_rays(LENS).astype(np.float64) @ posed.world_from_sensor("front")[:3, :3].T
         with np.errstate(divide="ignore"):
             away = np.where(rays[:, 2] < 0, -posed.world_from_sensor("front")[2, 3] / rays[:, 2], np.inf)
+        assert image.semantic is not None
         depth = (away * compute_pixel_rays(LENS)[:, 2]).reshape(image.semantic.shape).astype(np.float32)
         ground = np.where(np.isfinite(depth), SEMANTICS["road"], SEMANTICS["sky"]).astype(np.uint8)
         street = replace(image, depth_m=depth, semantic=ground)
@@ -124,6 +125,8 @@ class Hidden(OnTheRoad):
         if not frame.images:
             return frame
         image = frame.images["front"]
+        assert image.semantic is not None
+        assert image.depth_m is not None
         semantic, depth = image.semantic.copy(), image.depth_m.copy()
         semantic[:, : LENS.width // 2], depth[:, : LENS.width // 2] = SEMANTICS["car"], 3.0
         return replace(frame, images={**frame.images, "front": replace(image, semantic=semantic, depth_m=depth)})

@@ -203,13 +203,10 @@ def test_errors_are_counted_by_kind_and_class() -> None:
 
 def test_bytes_are_those_of_a_vehicle_by_radio() -> None:
     book = Ledger(LinkMegabytes(1, 1))
-    for client, link, direction, count in (
-        ("astyx/car0", "wireless", "up", 100),
-        ("stretch003/car0", "wireless", "up", 10),
-        ("astyx/car0", "wireless", "down", 5),
-        ("astyx", "wireline", "up", 1000),
-    ):
-        book.enter(LedgerEntry("edge", "objects", link, direction, 1, client, count))
+    book.enter(LedgerEntry("edge", "objects", "wireless", "up", 1, "astyx/car0", 100))
+    book.enter(LedgerEntry("edge", "objects", "wireless", "up", 1, "stretch003/car0", 10))
+    book.enter(LedgerEntry("edge", "objects", "wireless", "down", 1, "astyx/car0", 5))
+    book.enter(LedgerEntry("edge", "objects", "wireline", "up", 1, "astyx", 1000))
     assert sum_bytes(book) == {("car0", "up"): 110, ("car0", "down"): 5}
 
 

@@ -33,7 +33,7 @@ def count_hits(found, wanted):
     totals = {
         order: sum(table[i][j] for i, j in enumerate(order)) for order in permutations(range(len(many)), len(few))
     }
-    best = max(totals, key=totals.get)
+    best = max(totals, key=lambda order: totals[order])
     return sum(table[i][j] > 0 for i, j in enumerate(best))
 
 

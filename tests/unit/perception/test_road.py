@@ -2,6 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -66,18 +67,21 @@ def test_the_ground_of_a_pole_is_below_its_mount():
     calibration = Calibration(
         {"camera": np.linalg.inv(pose(0, 0, 1.5)) @ MOUNT}, {"camera": LENS.intrinsics()}, {"camera": LENS.distortion()}
     )
-    frame = SimpleNamespace(assumed=calibration)
+    frame: Any = SimpleNamespace(assumed=calibration)
     ground = straight(1.0)
     assert np.allclose(GroundPlane.of(frame, "camera", 1.5).locate(project(ground)), ground)
 
 
 def test_lines_are_traced_with_kind_and_place_where_they_are_drawn():
     found = trace_lines(shares_of((straight(1.7), SOLID), (straight(-1.7), BROKEN), (straight(-4.8, 9), SOLID)), PLANE)
-    found.sort(key=lambda line: line.ground[0, 1])
+    grounds = [line.ground for line in found if line.ground is not None]
+    assert len(grounds) == len(found)
+    order = np.argsort([ground[0, 1] for ground in grounds])
+    found = [found[row] for row in order]
     assert [line.solid for line in found] == [True, False, True]
-    for line, y in zip(found, (-4.8, -1.7, 1.7), strict=True):
-        assert np.abs(line.ground[:, 1] - y).max() < 0.15
-        assert line.ground[-1, 0] > 33
+    for line, row, y in zip(found, order, (-4.8, -1.7, 1.7), strict=True):
+        assert np.abs(grounds[row][:, 1] - y).max() < 0.15
+        assert grounds[row][-1, 0] > 33
         assert (np.diff(line.pixels[:, 1]) < 0).all()
 
 
@@ -95,6 +99,7 @@ def test_a_gap_of_a_few_rows_is_bridged_and_a_line_across_is_none():
 
 def test_lines_end_at_the_reach_and_short_ones_are_left_out():
     (line,) = trace_lines(shares_of((straight(1.0, 5, 80), SOLID)), PLANE)
+    assert line.ground is not None
     assert np.hypot(*(line.ground - (0.5, 0)).T).max() <= 40
     assert trace_lines(shares_of((straight(1.0, 6, 9), SOLID)), PLANE) == []
     assert len(trace_lines(shares_of((straight(1.0, 6, 9), SOLID)))) == 1  # without a plane its length is unknown

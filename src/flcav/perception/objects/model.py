@@ -314,14 +314,6 @@ def pillars_config(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8
     )
 
 
-def users_config(classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist"), ground_z_m: float = -1.8) -> SecondConfig:
-    """Return the configuration of pillars for all road users: those of `pillars_config`, but 0.2 m wide.
-
-    Raises `InputError` for unknown classes.
-    """
-    return replace(pillars_config(classes, ground_z_m), voxel_m=(0.2, 0.2, 4))
-
-
 def second_tiny(classes: tuple[str, ...] = ("Car",), ground_z_m: float = -1.8) -> Second:
     """Return a new network of `tiny_config`."""
     return second(tiny_config(classes, ground_z_m))
@@ -413,7 +405,6 @@ def _anchors(classes: tuple[str, ...]) -> tuple[Anchor, ...]:
 
 CONFIGURATIONS = {  # the default first
     "pillars": pillars_config(),
-    "users": users_config(),
     "tiny": tiny_config(),
     "small": small_config(),
     "road": road_config(),
