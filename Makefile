@@ -11,7 +11,7 @@ BIN := .venv/bin
 help: # Print the targets with what they do
 	@sed -n 's/^\([a-z-]*\):[^#]*# /\1\t/p' $(MAKEFILE_LIST) | expand -t 14
 
-demo: $(STAMP) # Run the demo, 15 minutes: out/demo/report.html
+demo: $(STAMP) # Run the demo, 8 minutes: out/demo/report.html
 	$(BIN)/flcav demo --out out/demo
 
 test: $(STAMP) # Run the tests, 8 minutes on 2 cores

@@ -87,13 +87,13 @@ STEPS = (
     Step(
         "edge FL - pretraining in the cloud",
         SCHEME,
-        "runs/demo_seeds",
+        "runs/demo",
         Listed("grid and ring, objects: edge FL - pretrained"),
     ),
     Step(
         "edge FL - as many more steps of pretraining",
         CONTROL,
-        "runs/demo_seeds",
+        "runs/demo",
         Listed("grid and ring, objects: edge FL - central training (more)"),
     ),
     Step(
@@ -132,13 +132,13 @@ STEPS = (
     Step(
         "edge + cloud FL - edge FL, in grid",
         SCHEME,
-        "runs/demo_seeds",
+        "runs/demo",
         Listed("grid, objects: edge + cloud FL - edge FL"),
     ),
     Step(
         "edge + cloud FL - edge FL, in ring",
         SCHEME,
-        "runs/demo_seeds",
+        "runs/demo",
         Listed("ring, objects: edge + cloud FL - edge FL"),
     ),
     Step(

@@ -28,7 +28,8 @@ from flcav.storage.records import Record
 
 TASK, TOWN, DENSEST = "objects", "grid", "densest"
 FRESH = "fresh seeds"
-RUNS = ("retraining", "demo_avx2")  # committed runs with both poles
+EARLIER = Path("runs", "demo", "earlier")
+RUNS = {"retraining": "retraining", "demo_avx2": "avx2"}  # committed runs with both poles
 LEVEL = 1 - CONFIDENCE
 
 Differences = Mapping[int, float]  # in AP50 all over the town, VRCSP's pole minus the densest, by seed
@@ -91,7 +92,7 @@ def read_studies(reproductions: Path) -> dict[str, Study]:
         own["seed"]: own["ap"][TOWN]["edge FL, VRCSP pole"]["ap50"] - own["ap"][TOWN]["edge FL, densest pole"]["ap50"]
         for own in result("demo_arms")["seeds"]
     }
-    runs = {f"{name}, {TOWN}": read_runs([Run.load(reproductions / "runs" / name)]) for name in RUNS}
+    runs = {f"{name}, {TOWN}": read_runs([Run.load(reproductions / EARLIER / folder)]) for name, folder in RUNS.items()}
     return {
         f"distillation, {TOWN}": Study(TOWN, labels),
         f"demo_arms, {TOWN}": Study(TOWN, arms),

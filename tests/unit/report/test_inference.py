@@ -11,7 +11,7 @@ from flcav.perception.marks import Bars, CloudBoxes, Light, Mark, Mode, Paths, P
 from flcav.perception.objects.predict import ObjectsFound
 from flcav.perception.task import Finding
 from flcav.report import style
-from flcav.report.pictures.inference import DRAWERS, draw
+from flcav.report.pictures.inference import DRAWERS, SIDE, draw
 
 PICTURE = np.full((60, 90, 3), 128, np.uint8)
 CLOUD = np.random.default_rng(0).uniform((1, -9, -2, 0), (40, 9, 1, 1), (200, 4)).astype(np.float32)
@@ -53,4 +53,4 @@ def test_every_class_has_its_legend_whoever_named_it():
 
 
 def test_every_kind_of_mark_has_a_drawer():
-    assert set(DRAWERS) | {Bars} == set(Mark.__args__)
+    assert set(DRAWERS) | set(SIDE) == set(Mark.__args__)

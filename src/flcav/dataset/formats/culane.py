@@ -44,8 +44,8 @@ def export_culane(dataset: Dataset, out: Path, options: ExportOptions, progress:
     pictures = [(i, camera) for i in range(len(dataset)) for camera in dataset.cameras(i)]
     if not pictures:
         raise missing_data_error(dataset, "CULane", "camera images")
-    check_road_labels(dataset)
     split_of = split_with_validation(dataset, options, "CULane")
+    check_road_labels(dataset)
     exported = Exported(Counter({"images": 0, "lane lines": 0}))
     rows: dict[str, list[str]] = {}
     for done, (i, camera) in enumerate(pictures, start=1):

@@ -52,13 +52,13 @@ class RoadTask(RoadOutcomes):
             ),
             validation={**recipe, "seed": 317, "split": "validation", "scenes": 6},
             tests={
-                "held-out scenes": {**recipe, "seed": 417, "split": "test", "scenes": 8},
+                "held-out scenes": {**recipe, "seed": 417, "split": "test", "scenes": 10},
                 UNSEEN: {
                     **recipe,
                     "town": "ring",
                     "seed": 517,
                     "split": "test",
-                    "scenes": 8,
+                    "scenes": 10,
                     "weather": {"classes": list(BY_DAY), "turn_s": 6.0},
                 },
             },

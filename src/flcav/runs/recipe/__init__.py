@@ -414,7 +414,7 @@ def load_run_recipe(path: Path | str) -> RunRecipe:
     >>> import flcav
     >>> demo = flcav.load_run_recipe("recipes/runs/demo.yaml")
     >>> demo.budgets_mb.wireless, list(demo.arms)
-    (80.0, ['more'])
+    (60.0, ['more', 'sweeps'])
     """
     return parse_config(RunRecipe, read_yaml(Path(path)), str(path))
 
