@@ -17,7 +17,7 @@ from flcav.reproductions.real.networks import NETWORKS, TRACKS
 from flcav.reproductions.real.regions import ASTYX, CHOSE, KARLSRUHE, prepare_regions
 
 REAL = Path(os.environ.get("FLCAV_REAL_DATA", Path(__file__).parents[2].parent / "shared" / "data")) / "real"
-SPINS = 4
+SPINS = 8
 RECIPE = f"{{town: suburb, seed: 5, warmup_s: 30.0, every_s: 0.1, spins_per_scene: {SPINS}, vehicle_rig: kitti}}"
 ASTYX_FRAMES = (0, 1, 100, 101, 102, 103, 230, 231)
 
