@@ -50,7 +50,7 @@ def measure_drive(data: Sequence[Path], out: Path) -> DriveErrors:
     save_errors(errors, out / ERRORS)
     write_poles(poles, out / POLES)
     places = np.array([(each.x, each.y, each.z) for each in errors]).reshape(-1, 3)
-    placed = [place(places, poles, RANGE_M, count) for count in range(1, MOST + 1)]
+    placed = [place(places, poles, RANGE_M, count) for count in range(1, min(MOST, len(poles)) + 1)]
     return DriveErrors(
         sweeps=len(dataset),
         length_m=float(np.linalg.norm(np.diff(way, axis=0), axis=1).sum()),
