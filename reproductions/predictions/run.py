@@ -49,7 +49,7 @@ VISIBLE = "objects in sight"
 PREDICTORS = (COVERAGE, TRAFFIC, VISIBLE, EXPECTED)
 CORRELATION = "rank correlation"
 MOST = 0.999  # largest correlation that has a place on Fisher's scale
-PLANS, HISTORY = "demo_seeds", "tracks"  # runs of the plans, and the history of the curve that predicts them
+PLANS, HISTORY = "demo", "tracks"  # runs of the plans, and the history of the curve that predicts them
 
 Correlations = Mapping[str, Mapping[str, float]]  # rank correlation with the gain, by predictor and choice of frames
 

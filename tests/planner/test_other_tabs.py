@@ -64,7 +64,7 @@ def test_a_run_is_played_by_keys_and_names_the_round_that_gained_most(opened, re
     page.keyboard.press("Space")
     wait_for(page, "#moment", "cloud round 1")
     used = results["arms"]["main"]["links"]["wireless"]["used_mb"]
-    wait_for(page, ".replay .panel", f"{used:.1f} of 80 MB")
+    wait_for(page, ".replay .panel", f"{used:.1f} of 60 MB")
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
