@@ -23,7 +23,6 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import load_network
 from flcav.planner.placing import describe_town
-from flcav.report.pictures.loop import find_instant
 from flcav.report.pictures.sweep_scene import describe_sweep
 from flcav.runs.frames import DATA, Frames
 from flcav.runs.recipe import PRETRAIN
@@ -33,7 +32,7 @@ from flcav.runs.results.saved import ERRORS, WEIGHTS
 from flcav.runs.results.tests import SweepComparison
 from flcav.runs.stages.testing import LOOK, detect_before_after
 from flcav.sensors.frame import Frame
-from flcav.world.trace import Trace
+from flcav.world.trace import Trace, find_instant
 
 WORK = "work"  # folder of a run's steps
 MOST_SCENES = 4  # of a recording that are played

@@ -12,7 +12,7 @@ from typing import Annotated
 
 from flcav.config import InputError
 from flcav.interface.progress import DAMAGED
-from flcav.runs.arms import check_federations
+from flcav.runs.arm_checks import check_federations
 from flcav.runs.engine import Notify, Stale, Step, print_steps, run_steps
 from flcav.runs.frames import Frames
 from flcav.runs.provenance import Provenance, provenance

@@ -27,7 +27,8 @@ from flcav.perception.outcomes import score_network
 from flcav.perception.tasks import task_named
 from flcav.perception.weights import to_arrays
 from flcav.runs.allocation import PlanRequest, make_plan
-from flcav.runs.arms import Setting, check_federations, find_strategies
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import Setting, find_strategies
 from flcav.runs.frames import Frames, deal_frames, make_recording_recipe, record_frames
 from flcav.runs.recipe import CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, SPLITS_OF, Federation, RunRecipe
 from flcav.runs.registry import FORECASTS, load_all

@@ -10,7 +10,7 @@ from flcav.interface.notebook import resumable
 from flcav.runs.analysis.collect import collect_results
 from flcav.runs.analysis.histories import make_history_points
 from flcav.runs.analysis.summary import summarise
-from flcav.runs.arms import check_federations
+from flcav.runs.arm_checks import check_federations
 from flcav.runs.engine import Notify, Stale, Step, print_steps, run_side_by_side, run_steps, stopwatch
 from flcav.runs.recipe import RunRecipe, load_run_recipe
 from flcav.runs.results.run import Run, Summary

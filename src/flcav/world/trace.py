@@ -207,3 +207,12 @@ def empty_trace(town: str) -> Trace:
         light=words,
         light_state=np.zeros((1, 0), np.str_),
     )
+
+
+def find_instant(trace: Trace, track: str, at: Array | tuple[float, float]) -> int | None:
+    """Return the instant (row) at which a road user of a trace is nearest to x, y [m]; None where it is not there."""
+    rows = np.flatnonzero(trace.actor == track)
+    if not len(rows):
+        return None
+    far = np.hypot(*(trace.position[:, rows[0], :2] - np.asarray(at)[:2]).T)
+    return None if np.isnan(far).all() else int(np.nanargmin(far))

@@ -35,7 +35,8 @@ from flcav.reproductions.federation.exchange.run import (
     summarise,
     tables,
 )
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import CLOUD, EDGE, MAIN, PRETRAIN, Federation, load_run_recipe
 from flcav.sources.recipe import recipe_path
 from flcav.statistics.verdicts import HELD, NOT_HELD, UNDECIDED

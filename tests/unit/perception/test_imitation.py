@@ -21,7 +21,8 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network
 from flcav.perception.weights import from_arrays, to_arrays
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import RunRecipe
 
 CONFIG = CONFIGURATIONS["pillars"]

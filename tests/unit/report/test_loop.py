@@ -12,10 +12,10 @@ from flcav.config import InputError
 from flcav.report.pages import loop_film
 from flcav.report.pages.loop_film import list_rounds, save_frames
 from flcav.report.pictures.changes import GONE
-from flcav.report.pictures.loop import ACTS, SIZE, Loop, LoopRound, _View, draw_loop, find_instant, find_shares
+from flcav.report.pictures.loop import ACTS, SIZE, Loop, LoopRound, _View, draw_loop, find_shares
 from flcav.report.style import BLUE, ORANGE
 from flcav.runs.results.run import Run
-from flcav.world.trace import Trace
+from flcav.world.trace import Trace, find_instant
 
 DEMO = Path(__file__).parents[3] / "reproductions" / "runs" / "demo"
 

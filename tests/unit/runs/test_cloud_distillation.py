@@ -29,7 +29,8 @@ from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task, build_network
 from flcav.perception.weights import to_arrays
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import CloudDistillation, RunRecipe, Training
 from flcav.runs.stages.cloud import EnsembleDistillation, RoundWork
 from flcav.runs.stages.rounds import RegionStart

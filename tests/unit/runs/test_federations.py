@@ -27,7 +27,8 @@ from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import Task
 from flcav.perception.weather.task import WEATHER
 from flcav.perception.weights import from_arrays, to_arrays
-from flcav.runs.arms import check_federations, find_strategies
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import find_strategies
 from flcav.runs.driving import DrivenStage
 from flcav.runs.recipe import Federation, Training
 from flcav.runs.results.saved import LEDGER, WEIGHTS

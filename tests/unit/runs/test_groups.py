@@ -17,7 +17,8 @@ from flcav.federation.trainable import LocalUpdate
 from flcav.network.ledger import BudgetExceeded, Ledger, LinkMegabytes, pack_arrays
 from flcav.perception.weather.samples import Sample
 from flcav.perception.weather.task import WEATHER
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.extras.groups.choosing import (
     FULL,
     NOT_NEEDED,

@@ -11,7 +11,8 @@ from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.task import build_network
-from flcav.runs.arms import Names, check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import Names, resolve_settings
 from flcav.runs.labels.faults import change_labels, give_fault
 from flcav.runs.recipe import RunRecipe
 

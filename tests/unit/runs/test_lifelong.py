@@ -7,7 +7,7 @@ import pytest
 
 from flcav.config import InputError, parse_config
 from flcav.network.ledger import Ledger, LedgerEntry, LinkMegabytes
-from flcav.runs.arms import check_federations
+from flcav.runs.arm_checks import check_federations
 from flcav.runs.extras.groups.rows import CheckedNetwork, Group
 from flcav.runs.extras.lifelong.replay import NO_LIMIT, divide_memory, spread_evenly
 from flcav.runs.extras.lifelong.results import find_mended

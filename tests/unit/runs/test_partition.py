@@ -10,7 +10,7 @@ from matplotlib.patches import Rectangle
 
 from flcav.config import InputError, parse_config
 from flcav.report.charts.partition import draw_dealt
-from flcav.runs.arms import check_federations
+from flcav.runs.arm_checks import check_federations
 from flcav.runs.extras.partition.dealing import (
     deal_by_amount,
     deal_by_class,

@@ -11,7 +11,8 @@ from pydantic import ValidationError
 
 from flcav.config import InputError
 from flcav.fusion.distillation import Distillation
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.recipe import Arm
 
 

@@ -9,7 +9,8 @@ import pytest
 from flcav.config import InputError
 from flcav.geometry import Boxes, points_in_boxes, pose
 from flcav.perception.objects.model import pillars_config
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.extras.groups import roadside
 from flcav.runs.extras.groups.forming import find_units
 from flcav.runs.extras.groups.roadside import label_roadside, lower_sweep

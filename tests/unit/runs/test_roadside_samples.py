@@ -1,5 +1,7 @@
 """Samples of roadside units that train: in place, of their own sweeps and detector, and wired to the edge server."""
 
+import re
+
 import numpy as np
 import pytest
 
@@ -9,7 +11,8 @@ from flcav.geometry import points_in_boxes, pose, transform_points
 from flcav.interface.progress import ignore_progress
 from flcav.perception.objects.model import pillars_config
 from flcav.perception.objects.truth import choose_lidar
-from flcav.runs.arms import check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import resolve_settings
 from flcav.runs.frames import Frames, record_frames
 from flcav.runs.labels.pseudo_labels import road_views
 from flcav.runs.labels.roadside import label_roadside
@@ -60,8 +63,9 @@ def test_units_cannot_train_without_their_boxes() -> None:
     trains = recipe.federation.model_copy(update={"roadside_clients": True})
     settings = [*resolve_settings(recipe.model_copy(update={"federation": trains, "arms": {}})).values()]
     check_federations(recipe, settings)
-    bare = resolve_settings(
-        recipe.model_copy(update={"federation": trains, "arms": {}}), {"objects": "tracks+messages"}
-    ).values()
-    with pytest.raises(InputError, match="roadside_clients: labels 'tracks\\+messages' of 'objects' have no boxes"):
-        check_federations(recipe, bare)
+    for labels, told in (("tracks+messages", "have no boxes"), ("road-average", "are made for vehicles alone")):
+        bare = resolve_settings(
+            recipe.model_copy(update={"federation": trains, "arms": {}}), {"objects": labels}
+        ).values()
+        with pytest.raises(InputError, match=f"roadside_clients: labels '{re.escape(labels)}' of 'objects' {told}"):
+            check_federations(recipe, bare)

@@ -11,7 +11,8 @@ from flcav.fusion.distillation import Distillation
 from flcav.geometry import Boxes
 from flcav.perception.objects.truth import FrameTruth
 from flcav.runs.analysis.caveats import PLACED_BARE, list_caveats
-from flcav.runs.arms import Names, check_federations, resolve_settings
+from flcav.runs.arm_checks import check_federations
+from flcav.runs.arms import Names, resolve_settings
 from flcav.runs.extras.distillation import sizes
 from flcav.runs.extras.distillation.sizes import measure_messages
 from flcav.runs.frames import Frames

@@ -11,7 +11,6 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.font_manager import FontProperties, findfont
-from numpy.typing import NDArray
 from PIL import Image, ImageDraw, ImageFont
 from scipy.ndimage import gaussian_filter
 
@@ -19,7 +18,7 @@ from flcav.arrays import Array
 from flcav.report import style
 from flcav.report.pictures.changes import FALSE, GONE, ErrorChanges
 from flcav.report.pictures.maps import draw_town
-from flcav.world.trace import Trace
+from flcav.world.trace import Trace, find_instant
 
 WIDTH, HEIGHT, SIZE = 960, 540, 540  # of the picture, and of the square map in it [px]
 PER_SECOND = 12
@@ -345,12 +344,3 @@ def find_shares(traces: dict[str, Trace], scenes: Sequence[str], tracks: Sequenc
         if trace is not None and instant is not None:
             shares[row] = 0.95 * instant / max(len(trace.time_s) - 1, 1)
     return shares
-
-
-def find_instant(trace: Trace, track: str, at: NDArray[np.float64] | tuple[float, float]) -> int | None:
-    """Return the instant (row) at which a road user of a trace is nearest to x, y [m]; None where it is not there."""
-    rows = np.flatnonzero(trace.actor == track)
-    if not len(rows):
-        return None
-    far = np.hypot(*(trace.position[:, rows[0], :2] - np.asarray(at)[:2]).T)
-    return None if np.isnan(far).all() else int(np.nanargmin(far))

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, inverse
-from flcav.perception.metrics import match
-from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.metrics.detection import assign_targets, match_at_each
 from flcav.perception.objects.model import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
@@ -52,13 +51,14 @@ def measure_labels(
         targets.append(truth.targets)
         neutral.append(truth.neutral)
         returns += [] if truth.returns is None else [truth.returns]
-    by_class = [_count_class(name, found, targets, neutral) for name in config.classes]
+    counts = [_count_class(name, found, targets, neutral) for name in config.classes]
+    by_class = tuple(each for each, _ in counts)
     right, there, count = (
         sum(column) for column in zip(*((e.right, e.targets, e.labels) for e in by_class), strict=True)
     )
     quality = LabelQuality(
         *(round_, count, there, right / count if count else None, right / there if there else None),
-        by_class=tuple(by_class) if len(by_class) > 1 else None,
+        by_class=by_class if len(by_class) > 1 else None,
     )
     if not right:
         return quality
@@ -76,7 +76,7 @@ def measure_labels(
     size = np.abs(labels[:, 3:6] - objects[:, 3:6]).max(axis=1)
     return replace(
         quality,
-        tight=sum(_count_class(name, found, targets, neutral, TIGHT).right for name in config.classes) / right,
+        tight=sum(tight for _, tight in counts) / right,
         offset_m=float(np.median(offset)),
         size_m=float(np.median(size)),
         by_returns=_count_by_returns(np.concatenate(returns), met) if len(returns) == len(targets) else None,
@@ -84,12 +84,12 @@ def measure_labels(
 
 
 def _count_class(
-    name: str, found: Sequence[Boxes], targets: Sequence[Boxes], neutral: Sequence[Boxes], overlap: float = 0.5
-) -> ClassLabels:
-    """Count the labels of a class, those that match a target of it at this IoU in 3D, and its targets."""
+    name: str, found: Sequence[Boxes], targets: Sequence[Boxes], neutral: Sequence[Boxes]
+) -> tuple[ClassLabels, int]:
+    """Count the labels of a class, those that match a target of it and its targets; and the matches at `TIGHT`."""
     mine, asked = ([boxes[boxes.label == name] for boxes in sides] for sides in (found, targets))
-    matches = match(mine, asked, neutral, overlap)
-    return ClassLabels(name, len(matches.hit), int(matches.hit.sum()), int(matches.targets.sum()))
+    matches, tight = match_at_each(mine, asked, neutral, [("3d", 0.5), ("3d", TIGHT)])
+    return ClassLabels(name, len(matches.hit), int(matches.hit.sum()), int(matches.targets.sum())), int(tight.hit.sum())
 
 
 def _count_by_returns(returns: NDArray[np.int64], met: NDArray[np.bool_]) -> tuple[FoundTargets, ...]:

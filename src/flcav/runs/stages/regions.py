@@ -113,14 +113,14 @@ def label_samples(
     pretrained = Pretrained.load(work.inputs[inputs.pretrain])
     threshold = pretrained.track_threshold if kind.tracked else pretrained.threshold
     assert threshold is not None  # fixed wherever labels come from detections
-    units = {}
-    if settings.federation.roadside_clients:
-        spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
-        units = label_roadside(split, poles, inputs.region, frozen.config, spins)
     about = Labelling(split, frames, poles, frozen.config, threshold, inputs, book, stage)
     for label in load_all(LABELLERS):
         if (renewed := label(work, settings, about)) is not None:
             return LabelledSamples(renewed, poles)
+    units = {}
+    if settings.federation.roadside_clients:
+        spins = {(split.data.keys[i].scene, split.data.keys[i].index) for i in frames}
+        units = label_roadside(split, poles, inputs.region, frozen.config, spins)
     first = book if inputs.edge is None else None  # later labels are those of stage II
     where: Any = (split, frames, poles, inputs.region, work.report, first, kind.trained, settings.navigation)
     if inputs.tracks is not None:
