@@ -20,7 +20,10 @@ AIM_CLEAR, AIM_NIGHT = 7.0, 2.0
 
 
 def measure(scene: Scene, agent: str, names: list[str], repeats: int) -> dict[str, float]:
-    """Return the median CPU-ms of the bare trace ("bare") and of an image in each weather, taken in turns."""
+    """Return the median CPU-ms of the bare trace ("bare"), of an image in each weather, and of a clear "fine" one.
+
+    They are taken in turns.
+    """
     own, camera = int(np.flatnonzero(scene.trace.actor == agent)[0]), Camera()
     at = scene.world_from_actor(own) @ pose(0.8, 0.0, 1.5) @ BODY_FROM_OPTICAL
     works: list[Callable[[], object]] = [lambda: scene.cast(at, compute_pixel_rays(camera), far_m=FAR_M, hidden=own)]
@@ -28,7 +31,9 @@ def measure(scene: Scene, agent: str, names: list[str], repeats: int) -> dict[st
         works.append(
             lambda weather=WEATHERS[name]: photograph(scene, at, camera, weather, np.random.default_rng(0), hidden=own)
         )
-    return dict(zip(["bare", *names], cpu_ms(works, repeats)))
+    fine = Camera(look="fine")
+    works.append(lambda: photograph(scene, at, fine, WEATHERS["clear"], np.random.default_rng(0), hidden=own))
+    return dict(zip(["bare", *names, "fine"], cpu_ms(works, repeats)))
 
 
 def main() -> None:
@@ -47,6 +52,8 @@ def main() -> None:
     print(f"{town.name}, 640x384; CPU-ms, median of {arguments.repeats}; bare trace {row['bare']:.1f} ms")
     for name in arguments.weathers:
         print(f"{name:12} {row[name]:6.1f} ms, {row[name] / row['bare']:.2f} of bare (aim {AIM_CLEAR:.0f}, clear)")
+    if "clear" in arguments.weathers:
+        print(f"look fine over plain, clear: {row['fine'] / row['clear']:.2f}")
     if {"clear", "night"} <= set(arguments.weathers):
         print(f"night over clear: {row['night'] / row['clear']:.2f} (aim {AIM_NIGHT:.0f})")
 

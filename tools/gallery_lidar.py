@@ -4,11 +4,15 @@ import argparse
 from pathlib import Path
 
 import numpy as np
+from gallery_camera import busiest_drive
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import TwoSlopeNorm
+from matplotlib.colors import LinearSegmentedColormap, Normalize, TwoSlopeNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
-from flcav.geometry import Boxes, inverse, pose, transform_points
+from flcav.geometry import Boxes, inverse, points_in_boxes, pose, transform_points
 from flcav.report import style
+from flcav.report.pictures import perspective
 from flcav.report.pictures.birdseye import HEIGHT_COLOURS, HEIGHTS_M, BirdseyeView, draw_view
 from flcav.report.pictures.clouds import GROUND_M, draw_boxes, on_page
 from flcav.sensors.lidar.lidar import Lidar, scan
@@ -29,6 +33,15 @@ SHOWN: dict[str, Weather] = {
     "fog, visibility 120 m": WEATHERS["fog"],
     "dense fog, visibility 40 m": Weather(visibility_m=40.0, wetness=0.2),
 }
+DARK_HEIGHTS = LinearSegmentedColormap.from_list(
+    "heights on dark", ["#3d6ea8", "#35b0d8", "#37d0a8", "#b4e05c", "#ffd23f", "#ff7b3d"]
+)
+KINDS = {  # of boxes: words, labels and colour on dark
+    "cars and vans": (("car", "van"), "#ff5ca8"),
+    "trucks and buses": (("truck", "bus"), "#c58bff"),
+    "pedestrians": (("pedestrian",), "#ffffff"),
+    "bicycles and motorcycles": (("bicycle", "motorcycle"), "#ffd23f"),
+}
 
 
 def busy_scene() -> tuple[Scene, int]:
@@ -40,7 +53,7 @@ def busy_scene() -> tuple[Scene, int]:
 
 def truth(scene: Scene, own: int) -> Boxes:
     """Return the boxes of all other actors in the carrier's frame."""
-    others = np.flatnonzero(scene.trace.present[0] & (np.arange(len(scene.trace.actor)) != own))
+    others = np.flatnonzero(scene.trace.present[scene.index] & (np.arange(len(scene.trace.actor)) != own))
     x, y, z, yaw = scene.poses()[others].T
     size = scene.trace.size[others]
     center = np.column_stack((x, y, z + size[:, 2] / 2))
@@ -53,6 +66,34 @@ def sweep(scene: Scene, own: int, lidar: Lidar, weather: Weather | None = None) 
     at = scene.world_from_actor(own) @ ROOF
     points = scan(scene, at, lidar, np.random.default_rng(0), own, weather).points
     return transform_points(ROOF, points[:, :3])
+
+
+@style.styled
+def lidar_in_perspective(scene: Scene, own: int, path: Path) -> None:
+    """Draw one sweep from behind and above its vehicle, 1280 x 720: returns by height, boxes by kind of road user.
+
+    Boxes are those of road users with a return.
+    """
+    figure = Figure(figsize=(12.8, 7.2), facecolor=perspective.NIGHT)
+    axes = figure.add_axes((0, 0, 1, 1))
+    axes.set(xlim=(-0.86, 0.86), ylim=(-0.5675, 0.40), facecolor=perspective.NIGHT)
+    style.hide_axes(axes)
+    points = sweep(scene, own, Lidar(beams="pandar128"))
+    boxes = truth(scene, own)
+    returns = points_in_boxes(points, boxes).sum(axis=1)
+    ahead = boxes[(returns > 0) & (boxes.center[:, 0] > -4.0) & (boxes.center[:, 0] < 90.0)]
+    shown = points[points[:, 0] > perspective.EYE[0] + 2]
+    perspective.draw_returns(axes, shown, 0.0, DARK_HEIGHTS, Normalize(0.0, 8.0), 36.0)
+    handles = []
+    for name, (kinds, colour) in KINDS.items():
+        chosen = ahead[np.isin(ahead.label, kinds)]
+        perspective.draw_boxes(axes, chosen, 0.0, colour, 1.4)
+        if len(chosen):
+            handles.append(Line2D([], [], color=colour, linewidth=2, label=f"{name}: {len(chosen)}"))
+    style.key(axes, handles, loc="lower left", labelcolor=perspective.TEXT, ncols=1)
+    title = f"One sweep of 128 beams: {len(points):,} returns, coloured by height above ground, 0 to 8 m"
+    axes.text(0.012, 0.965, title, transform=axes.transAxes, color=perspective.TEXT, va="top", fontsize=13)
+    figure.savefig(path, dpi=100, pil_kwargs={"quality": 90, "method": 6})
 
 
 @style.styled
@@ -135,6 +176,7 @@ def main() -> None:
     out = parser.parse_args().out
     out.mkdir(parents=True, exist_ok=True)
     scene, own = busy_scene()
+    lidar_in_perspective(*busiest_drive("grid")[:2], out / "lidar_perspective.webp")
     lidar_in_weather(scene, own, out / "lidar_weather.png")
     radar_over_lidar(scene, own, out / "radar.png")
     rolling(scene, own, out / "lidar_rolling.png")

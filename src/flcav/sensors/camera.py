@@ -4,7 +4,7 @@ Tone mapping applies exposure, a filmic curve and the sRGB transfer function by 
 """
 
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -28,6 +28,7 @@ class Camera(Lens):
 
     noise: float = Field(default=0.8, ge=0, le=20)  # standard deviation of a colour value, 0 to 255
     drops: bool = True  # rain leaves drops on the lens
+    look: Literal["plain", "fine"] = "plain"  # fine: worn paint, dark kerbs, dull grass, a skyline, clouds in mirrors
 
 
 class Exposure(NamedTuple):
@@ -55,7 +56,8 @@ def photograph(
     axes `world_from_sensor @ BODY_FROM_OPTICAL`. The same arguments and state of `rng` give the same bytes, with any
     number of `threads`.
     """
-    picture = render_radiance(scene, world_from_camera, camera, weather, rng, hidden=hidden, threads=threads)
+    fine = camera.look == "fine"
+    picture = render_radiance(scene, world_from_camera, camera, weather, rng, hidden=hidden, threads=threads, fine=fine)
     shape = (camera.height, camera.width)
     if camera.drops and weather.rain_mm_h > 0:
         add_drops(picture.radiance.reshape(*shape, 3), weather.rain_mm_h, rng)

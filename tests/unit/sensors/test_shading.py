@@ -11,6 +11,7 @@ from shapely.geometry import MultiPolygon, Point, Polygon
 from flcav.geometry import pose
 from flcav.machine import threads
 from flcav.sensors.camera import Camera, develop, grain, photograph
+from flcav.sensors.frame import SEMANTICS
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, compute_pixel_rays
 from flcav.sensors.rendering import render
 from flcav.sensors.rendering.appearance import build_appearance
@@ -139,3 +140,33 @@ def test_memory_is_kept_only_where_the_library_can(monkeypatch: pytest.MonkeyPat
     threads.keep_freed_memory.__wrapped__()
     assert len(set_to) == calls
     assert all(size in (threads.KEPT_BYTES, threads.LARGEST_BYTES) for _, size in set_to)
+
+
+def test_the_fine_look_darkens_kerbs_dulls_grass_and_has_a_skyline_and_the_labels_stay(street: Scene):
+    """Against the look `plain`, by the classes of its pixels."""
+    shots = {}
+    for look in ("plain", "fine"):
+        camera = Camera(width=320, height=192, noise=0, look=look)
+        shots[look] = photograph(street, AHEAD, camera, WEATHERS["overcast"], np.random.default_rng(0))
+    plain, fine = shots["plain"], shots["fine"]
+    assert (plain.semantic == fine.semantic).all()
+    assert (plain.instance == fine.instance).all()
+    grass, sky = plain.semantic == SEMANTICS["terrain"], plain.semantic == SEMANTICS["sky"]
+    colourful = {look: np.ptp(shot.rgb[grass].astype(int), axis=1).mean() for look, shot in shots.items()}
+    assert colourful["fine"] < 0.8 * colourful["plain"]
+    sidewalk = plain.semantic == SEMANTICS["sidewalk"]
+    darker = fine.rgb[sidewalk].mean(axis=1) / plain.rgb[sidewalk].mean(axis=1)
+    kerb = darker < 0.95
+    assert 0.05 < kerb.mean() < 0.6
+    assert np.median(darker[kerb]) < 0.85
+    assert (darker[~kerb] > 0.99).mean() > 0.95
+    other = np.abs(plain.rgb.astype(int) - fine.rgb).max(axis=2) > 2
+    rows = np.flatnonzero((other & sky).any(axis=1))
+    assert len(rows)
+    horizon = 95.5 - 160 * np.tan(np.radians(4.0))
+    assert rows.min() > horizon  # houses and hills are low, and clouds as they were
+    walls = plain.semantic == SEMANTICS["building"]
+    assert walls.any()
+    assert not np.median(
+        np.abs(plain.rgb.astype(int) - fine.rgb)[walls]
+    )  # only window panes differ: they mirror clouds

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
-from matplotlib.colors import LinearSegmentedColormap, Normalize
+from matplotlib.colors import Colormap, LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
 from flcav.arrays import Array, Array32, Mask
 from flcav.geometry import Boxes
@@ -66,10 +65,12 @@ def draw_sweep(axes: Axes, sweep: ComparedSweep, found: MatchedDetections) -> No
     axes.set(facecolor=NIGHT, xlim=WINDOW[:2], ylim=WINDOW[2:], xticks=[], yticks=[])
     for spine in axes.spines.values():
         spine.set_visible(False)
-    _draw_returns(axes, sweep.points, sweep.ground_m)
-    _draw_boxes(axes, sweep.targets[~found.found], sweep.ground_m, MISSED, 1.8)
-    _draw_boxes(axes, found.boxes[found.hit], sweep.ground_m, FOUND, 1.5)
-    _draw_boxes(axes, found.boxes[~found.hit], sweep.ground_m, FALSE, 1.5, DASHES)
+    ahead, aside = sweep.points[:, 0], np.abs(sweep.points[:, 1])
+    near = (ahead > EYE[0] + 2) & (ahead < REACH_M) & (aside < ASIDE_M)
+    draw_returns(axes, sweep.points[near], sweep.ground_m, HEIGHTS, Normalize(0.0, TO_M))
+    draw_boxes(axes, sweep.targets[~found.found], sweep.ground_m, MISSED, 1.8)
+    draw_boxes(axes, found.boxes[found.hit], sweep.ground_m, FOUND, 1.5)
+    draw_boxes(axes, found.boxes[~found.hit], sweep.ground_m, FALSE, 1.5, DASHES)
     text = f"{found.title}: {found.found.sum()} of {len(found.found)} found, {count_false(found.hit)} false"
     axes.text(0.015, 0.955, text, transform=axes.transAxes, color=TEXT, va="top", fontweight="bold")
 
@@ -79,17 +80,21 @@ def count_false(hit: Mask) -> int:
     return int((~hit).sum())
 
 
-def _draw_returns(axes: Axes, points: NDArray[np.float32], ground_m: float) -> None:
-    """Draw the returns from far to near, larger where they are near, lighter where they are high."""
-    shown = points[(points[:, 0] > EYE[0] + 2) & (points[:, 0] < REACH_M) & (np.abs(points[:, 1]) < ASIDE_M)]
-    at, depth = project(shown[:, :3], ground_m)
+def draw_returns(
+    axes: Axes, points: Array | Array32, ground_m: float, colours: Colormap, heights_m: Normalize, size: float = 26.0
+) -> None:
+    """Draw returns (N, 3 or more) from far to near, larger where they are near, coloured by height above the ground.
+
+    `size` is the area of a return at a metre [pt^2].
+    """
+    at, depth = project(points[:, :3], ground_m)
     order = np.argsort(-depth)
-    size = np.clip(26.0 / np.maximum(depth[order], NEAR_M), 0.25, 2.5)
-    colours = HEIGHTS(Normalize(0.0, TO_M)(shown[order, 2] - ground_m))
-    axes.scatter(*at[order].T, s=size, c=colours, linewidths=0, rasterized=True)
+    area = np.clip(size / np.maximum(depth[order], NEAR_M), 0.25, 2.5)
+    colour = colours(heights_m(points[order, 2] - ground_m))
+    axes.scatter(*at[order].T, s=area, c=colour, linewidths=0, rasterized=True)
 
 
-def _draw_boxes(axes: Axes, boxes: Boxes, ground_m: float, colour: str, width: float, dash: Any = "-") -> None:
+def draw_boxes(axes: Axes, boxes: Boxes, ground_m: float, colour: str, width: float, dash: Any = "-") -> None:
     """Draw the edges of boxes, and their footprints filled."""
     if not len(boxes):
         return

@@ -76,6 +76,7 @@ class Appearance(NamedTuple):
     facades: Facades
     plates: Plates
     noise: Array32  # see `make_noise`
+    fine: np.bool_ = np.bool_(False)  # the fine look: see `Camera.look`
 
 
 _AS = {"van": "car", "prop": "static"}  # categories without a semantic class

@@ -72,14 +72,16 @@ def render_radiance(
     *,
     hidden: int | None,
     threads: int = 1,
+    fine: bool = False,
 ) -> RadianceImage:
     """Render the radiance of the pixels of `lens` at the scene's instant: see `camera.photograph`.
 
     `world_from_camera` (4, 4) [m] is the pose of the optical frame, `hidden` the actor that is left out (the carrier);
-    `rng` draws the rain. Rays are cast and shaded by `threads` threads.
+    `rng` draws the rain. Rays are cast and shaded by `threads` threads. `fine`: see `Camera.look`.
     """
     keep_freed_memory()
     rays, light, appearance = compute_pixel_rays(lens), compute_light(weather), build_appearance(scene)
+    appearance = appearance._replace(fine=np.bool_(fine))
     state = compute_lamp_state(scene, float(light.lamps), low_sight=bool(light.extinction > LOW_SIGHT))
     angle = np.float32(1 / lens.intrinsics()[0, 0])
     lamps = collect_lamps(scene, state) if light.lamps > 0 else no_lamps()

@@ -7,10 +7,11 @@ air attenuates radiance by exp(-extinction * distance), and adds airlight.
 
 import numpy as np
 
-from flcav.machine.compiled import inlined, kernel
+from flcav.machine.compiled import kernel
 from flcav.sensors.rendering.facade import sample_sign, shade_facade
 from flcav.sensors.rendering.ground import asphalt, grass, paving, sample_paint, wear
 from flcav.sensors.rendering.noise import fade, hash_pair, sample_noise
+from flcav.sensors.rendering.sky import add_skyline, compute_environment, compute_sky
 from flcav.sensors.rendering.state import AMBER, GREEN, RED
 from flcav.world.materials import Material
 from flcav.world.static import TownPart
@@ -25,6 +26,7 @@ BUILDING, CLUTTER = int(TownPart.BUILDING), int(TownPart.CLUTTER)
 LENS_RADIANCE = 2.2  # of a lit signal lens
 LOW_SUN = 0.4  # sine of the sun's elevation below which dry roads have a sheen towards the sun
 SHEEN, SHEEN_GLOSS = 0.28, 22.0  # strength and exponent of that sheen
+FINE_WORN, FINE_KERB, FINE_GRASS = 0.45, 0.6, 0.4  # fine look: wear of paint, tone of kerbs, share of grey in grass
 ROAD_LINE = 0.5  # painted share of a pixel above which its class is road marking
 
 
@@ -61,6 +63,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         painted[ray] = False
         if row < 0:
             red, green, blue = compute_sky(dx, dy, dz, light, table)
+            if appearance.fine:
+                red, green, blue = add_skyline(red, green, blue, dx, dy, dz, pixel_angle, light, table)
             radiance[ray, 0], radiance[ray, 1], radiance[ray, 2] = red, green, blue
             continue
         instance = survey.instance[ray]
@@ -89,8 +93,9 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                 painted[ray] = share > ROAD_LINE
                 worn = np.float32(0.72) + np.float32(0.28) * sample_noise(table, x * 1.7, y * 1.7)
                 share *= min(worn + np.float32(0.25) * tone, np.float32(1))
-                if appearance.markings.worn > 0:
-                    share *= wear(x, y, appearance.markings.worn, table)
+                worn = max(appearance.markings.worn, np.float32(FINE_WORN if appearance.fine else 0))
+                if worn > 0:
+                    share *= wear(x, y, worn, table)
                 colour = appearance.markings.colour
                 red += share * (colour[piece, 0] * tone - red)
                 green += share * (colour[piece, 1] * tone - green)
@@ -105,6 +110,8 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
                 tone = paving(x, y, slant, table)
             else:
                 tone = np.float32(0.95) + np.float32(0.25) * sample_noise(table, (x + y) * 1.3, z * 2.0)
+                if appearance.fine:
+                    tone *= np.float32(FINE_KERB)
             red, green, blue = red * tone, green * tone, blue * tone
         elif instance > 0:
             if material == HEADLAMP:
@@ -120,6 +127,11 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             red = (red + np.float32(0.045) * dry) * tone
             green = (green + np.float32(0.020) * dry) * tone
             blue = blue * tone
+            if appearance.fine:
+                grey = (red + green + blue) / np.float32(3)
+                red += np.float32(FINE_GRASS) * (grey - red)
+                green += np.float32(FINE_GRASS) * (grey - green)
+                blue += np.float32(FINE_GRASS) * (grey - blue)
         elif material == WALL and appearance.part[row] == BUILDING:
             red, green, blue, glass, window = shade_facade(
                 appearance.part_row[row], x, y, z, nx, ny, across, slant, appearance.facades, table
@@ -208,7 +220,7 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
             mirror += (1 - mirror) * grazing * np.float32(0.8)
             turned = 2 * facing
             rx, ry, rz = dx + turned * nx, dy + turned * ny, dz + turned * nz
-            env_r, env_g, env_b = compute_environment(rx, ry, rz, light, table)
+            env_r, env_g, env_b = compute_environment(rx, ry, rz, light, table, appearance.fine)
             if gloss > 0 and sunny > 0:
                 toward_sun = rx * light.to_sun[0] + ry * light.to_sun[1] + rz * light.to_sun[2]
                 if toward_sun > np.float32(0.6):
@@ -226,72 +238,3 @@ def shade(survey, light, appearance, state, lit, lamplight, open_sky, pixel_angl
         radiance[ray, 0] = light.air[0] + kept * (red - light.air[0])
         radiance[ray, 1] = light.air[1] + kept * (green - light.air[1])
         radiance[ray, 2] = light.air[2] + kept * (blue - light.air[2])
-
-
-SKYLINE = 0.16  # sine of the elevation up to which houses hide the sky in reflections
-TOP_OF_FOG_M = 500.0  # height of the fog layer
-
-
-@inlined
-def compute_clear_sky(x, y, z, light):
-    """Return red, green, blue of the sky without clouds and solar disc in the unit direction x, y, z, world frame."""
-    low = 1 - max(z, np.float32(0))
-    low = low * low * low
-    low *= low * np.float32(0.55) + np.float32(0.45)
-    red = light.zenith[0] * (1 - low) + light.horizon[0] * low
-    green = light.zenith[1] * (1 - low) + light.horizon[1] * low
-    blue = light.zenith[2] * (1 - low) + light.horizon[2] * low
-    off_sun = 1 - (x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2])
-    if off_sun < np.float32(0.6):
-        halo = np.float32(0.012) / (off_sun + np.float32(0.012)) * np.float32(0.16) * (1 - off_sun / np.float32(0.6))
-        red += halo * light.sun[0]
-        green += halo * light.sun[1]
-        blue += halo * light.sun[2]
-    return red, green, blue
-
-
-@inlined
-def compute_sky(x, y, z, light, table):
-    """Return red, green, blue of a ray that hits nothing, in the unit direction x, y, z: sky, sun, clouds and air."""
-    red, green, blue = compute_clear_sky(x, y, z, light)
-    cosine = x * light.to_sun[0] + y * light.to_sun[1] + z * light.to_sun[2]
-    sun = min(max((cosine - np.float32(0.99992)) / np.float32(0.00004), np.float32(0)), np.float32(1)) * np.float32(30)
-    if z > np.float32(0.01) and light.cover > 0.02:
-        far = 1 / (z + np.float32(0.06))
-        u, v = x * far * np.float32(16), y * far * np.float32(16)
-        shape = sample_noise(table, u, v) * np.float32(0.72) + sample_noise(
-            table, u * 4.1 + 31.0, v * 4.1
-        ) * np.float32(0.28)
-        edge = np.float32(0.86 - 0.80 * light.cover)
-        thick = min(max((shape - edge) / np.float32(0.22), np.float32(0)), np.float32(1))
-        thick *= min(z * 9, np.float32(1))
-        lit = sample_noise(table, u + light.to_sun[0] * 2.2, v + light.to_sun[1] * 2.2)
-        bright = np.float32(0.72) + np.float32(0.62) * max(np.float32(0), 1 - thick * np.float32(0.55)) * (
-            1 - lit * np.float32(0.5)
-        )
-        red += thick * (light.cloud[0] * bright - red)
-        green += thick * (light.cloud[1] * bright - green)
-        blue += thick * (light.cloud[2] * bright - blue)
-        sun *= 1 - thick
-    red += sun * light.sun[0]
-    green += sun * light.sun[1]
-    blue += sun * light.sun[2]
-    hidden = 1 - np.exp(-np.float32(light.extinction) * TOP_OF_FOG_M / (max(z, np.float32(0)) + np.float32(0.06)))
-    red += hidden * (light.air[0] - red)
-    green += hidden * (light.air[1] - green)
-    blue += hidden * (light.air[2] - blue)
-    return red, green, blue
-
-
-@inlined
-def compute_environment(x, y, z, light, table):
-    """Return red, green, blue of the environment map in the unit direction x, y, z: sky, dim houses, ground."""
-    red, green, blue = compute_clear_sky(x, y, abs(z), light)
-    height = np.float32(SKYLINE) * (np.float32(0.4) + np.float32(1.2) * sample_noise(table, x * 9.0, y * 9.0))
-    above = min(max((z - height) * np.float32(25), np.float32(0)), np.float32(1))
-    level = min(max(z * np.float32(25), np.float32(0)), np.float32(1))  # houses above, ground below the horizon
-    dim = np.float32(1) + np.float32(0.7) * level
-    red = dim * light.bounce[0] + above * (red - dim * light.bounce[0])
-    green = dim * light.bounce[1] + above * (green - dim * light.bounce[1])
-    blue = dim * light.bounce[2] + above * (blue - dim * light.bounce[2])
-    return red, green, blue
