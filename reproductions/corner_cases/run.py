@@ -174,7 +174,8 @@ def is_rare(boxes: Boxes) -> NDArray[np.bool_]:
 
 def draw_corner_cases(results: CornerCaseResult) -> bytes:
     """Return the forest plot of the AP50 of rare kinds, a panel per town, as a PNG."""
-    return style.png(figures.arms(results.rare, "AP50 of rare kinds (95 % interval)"))
+    towns = {town: {name: results.rare[town][name] for name in names} for town, names in TOWNS.items()}
+    return style.png(figures.arms(towns, "AP50 of rare kinds"))
 
 
 def corner_case_tables(results: CornerCaseResult) -> dict[str, str]:

@@ -46,6 +46,7 @@ TASK, TOWN = "objects", "grid"
 MORE = ", four times the steps"
 SWEEPS = "uploaded sweeps"
 FLOAT32, INT8, INT4, TOP_K = (f"edge FL in {form}" for form in ("float32", "int8", "int4", "top-k"))
+SHOWN = (FLOAT32, INT8, INT4, TOP_K, INT8 + MORE, SWEEPS, SWEEPS + MORE)  # lines of the picture
 REMEDIES: Mapping[str, str] = {  # against the drift of more local steps, by name: arm
     f"{INT8}{MORE}, server momentum": "momentum",
     f"{INT8}{MORE}, decaying rate": "decaying",
@@ -226,14 +227,15 @@ def draw_megabytes(results: MegabytesResult) -> bytes:
     """
     held = sum(seed.boxes for seed in results.seeds.values()) / len(results.seeds)
     sent, boxes = {}, {}
-    for name, points in ((name, points) for name, points in results.curves.items() if name not in REMEDIES):
+    for name in SHOWN:
+        points = results.curves[name]
         reached = [[point.ap50 for point in seed.curves[name]] for seed in results.seeds.values()]
         ranges = [Estimate(sum(own) / len(own), min(own), max(own)) for own in zip(*reached, strict=True)]
         sent[name] = [(point.mb, ap50) for point, ap50 in zip(points[1:], ranges[1:], strict=True)]
         last = 1 if name.startswith(SWEEPS) else -1
         boxes[name] = [(point.boxes or held, own) for point, own in zip(points[last:], ranges[last:], strict=True)]
     costs = {"wireless uplink [MB]": sent, "annotated boxes": boxes}
-    label = "AP50 (mean and range over seeds)"
+    label = f"AP50 (mean and range of {len(results.seeds)} seeds)"
     return style.png(figures.by_costs(costs, results.curves[FLOAT32][0].ap50.mean, label))
 
 

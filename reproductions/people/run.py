@@ -122,8 +122,13 @@ def tabulate_classes(results: PeopleResult) -> dict[str, str]:
 def _run(out: Path, options: Options) -> Outcome[PeopleResult]:
     recipe = options.load("people", shrink_recipe)
     results = compare_classes(recipe, options.run_seeds(recipe, out))
-    picture = style.png(figures.arms({CLASSES[kind]: of for kind, of in results.ap50.items()}))
-    return Outcome(results, {"arms.png": picture}, results.sentences())
+    return Outcome(results, {"arms.png": draw_people(results)}, results.sentences())
+
+
+def draw_people(results: PeopleResult) -> bytes:
+    """Return the forest plot of AP50 by arm, a panel per class, as a PNG."""
+    ap50 = {CLASSES[kind]: {arm: results.ap50[kind][arm] for arm in ARMS} for kind in CLASSES}
+    return style.png(figures.arms(ap50))
 
 
 EXPERIMENT = Experiment(PeopleResult, _run, tabulate_classes, seeds=3)

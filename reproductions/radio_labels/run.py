@@ -113,8 +113,13 @@ def tabulate_labels(results: RadioLabelsResult) -> dict[str, str]:
 def _run(out: Path, options: Options) -> Outcome[RadioLabelsResult]:
     recipe = options.load("radio_labels", shrink_recipe)
     results = compare_labels(recipe, options.run_seeds(recipe, out))
-    picture = style.png(figures.arms({TOWN: results.ap50}))
+    picture = draw_labels(results)
     return Outcome(results, {"arms.png": picture}, results.sentences())
+
+
+def draw_labels(results: RadioLabelsResult) -> bytes:
+    """Return the forest plot of AP50 by arm as a PNG."""
+    return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))
 
 
 EXPERIMENT = Experiment(RadioLabelsResult, _run, tabulate_labels, seeds=5)

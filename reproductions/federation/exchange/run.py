@@ -26,6 +26,7 @@ from flcav.network.clock.rounds import NetworkSettings, RoundRules, time_round
 from flcav.network.ledger import Ledger, LedgerEntry
 from flcav.network.radio.links import RadioLinks
 from flcav.report import style
+from flcav.report.charts.runs import name_measure
 from flcav.report.cloud_rounds import format_divergence, span_divergence
 from flcav.runs.arms import name_steps
 from flcav.runs.driving import link_scenes
@@ -430,7 +431,7 @@ def draw_exchanges(marks: Sequence[Mark], measure: str) -> Figure:
         label.set_color(COLOURS[groups.index(mark.group) % len(COLOURS)])
     left.set_ylim(rows[-1] + 0.7, -0.7)
     shown = "own region ●" + (", unseen region ○" if any(mark.unseen for mark in marks) else "")
-    left.set_xlabel(f"{measure} (95 % interval): {shown}")
+    left.set_xlabel(f"{name_measure(measure, [mark.own for mark in marks])}:\n{shown}")
     sent = [mark.up_mb for mark in marks if mark.up_mb > 0]
     right.set(xscale="log", xlabel="wireless uplink, stages II and III [MB]", xlim=(min(sent) / 1.6, max(sent) * 3))
     right.xaxis.set_major_formatter(FuncFormatter(lambda mb, _: f"{mb:g}"))

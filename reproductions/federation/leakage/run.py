@@ -31,6 +31,7 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.weather.task import WEATHER
 from flcav.report import style
+from flcav.report.charts.runs import name_measure
 from flcav.reproductions.federation.drives import (
     HIDDEN,
     Drives,
@@ -250,11 +251,11 @@ def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSee
         for x, mean in enumerate(line):
             style.interval(axes, x, mean, color=colour, linewidth=1)
     axes.axhline(0.5, color=style.MUTED, linewidth=0.8, linestyle=(0, (4, 3)))
-    axes.annotate("chance of membership", (1, 0.5), (0, -10), xycoords=axes.get_yaxis_transform(), ha="right",
+    axes.annotate("chance of membership", (0.22, 0.5), (0, -11), xycoords=axes.get_yaxis_transform(), ha="center",
                   textcoords="offset points", color=style.MUTED, fontsize=style.SMALL)  # fmt: skip
     axes.set_xticks(range(len(levels)), levels)
     axes.set(xlabel="noise of each vehicle, as a multiple of the clipping norm; below: ε", ylim=(-0.02, 1.04))
-    axes.set(ylabel="share, mean over seeds (95 % interval)", xlim=(-0.2, len(levels) - 0.8))
+    axes.set(ylabel=name_measure("share", (mean for line in lines.values() for mean in line)), xlim=(-0.2, len(levels) - 0.8))
     axes.grid(axis="y")
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=2)
     return figure

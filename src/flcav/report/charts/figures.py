@@ -75,22 +75,24 @@ def gains(costs: Sequence[ArmCost], between: Mapping[tuple[str, str], tuple[floa
 
 
 @style.styled
-def arms(towns: Mapping[str, Mapping[str, Estimate]], label: str = "AP50 (95 % interval)") -> Figure:
-    """Return a forest plot of a measure, named by `label`, by arm, with a panel per town."""
+def arms(towns: Mapping[str, Mapping[str, Estimate]], measure: str = "AP50") -> Figure:
+    """Return a forest plot of a measure by arm, with a panel per town."""
     figure = style.canvas(6.4, 0.9 + 0.32 * sum(map(len, towns.values())))
-    panels = figure.subplots(len(towns), sharex=True, squeeze=False)[:, 0]
+    heights = [len(rows) + 0.5 for rows in towns.values()]
+    panels = figure.subplots(len(towns), sharex=True, squeeze=False, height_ratios=heights)[:, 0]
     for axes, (town, rows) in zip(panels, towns.items(), strict=True):
         runs.draw_arms(axes, town, rows)
         axes.set_title(town, fontweight="bold")
-    figure.axes[-1].set_xlabel(label)
+    every = [estimate for rows in towns.values() for estimate in rows.values()]
+    figure.supxlabel(runs.name_measure(measure, every), fontsize=style.TEXT)
     return figure
 
 
 @style.styled
 def arms_by_question(
-    panels: Mapping[str, Mapping[str, Estimate]], marks: Mapping[str, float], label: str = "AP50 (95 % interval)"
+    panels: Mapping[str, Mapping[str, Estimate]], marks: Mapping[str, float], measure: str = "AP50"
 ) -> Figure:
-    """Return forest plots of a measure, named by `label`, by arm: a panel per title, two abreast.
+    """Return forest plots of a measure by arm: a panel per title, two abreast.
 
     `marks`: values by name that all panels have as vertical lines.
     """
@@ -104,8 +106,9 @@ def arms_by_question(
         axes.set_ylim(max(heights[list(panels).index(title) // 2], len(arms_)) - 0.5, -0.5)
         for (name, value), dash in zip(marks.items(), ((0, (1, 1.5)), (0, (4, 2))), strict=False):
             axes.axvline(value, color=style.MUTED, linewidth=1, linestyle=dash, label=name, zorder=0)
+    every = [estimate for rows in panels.values() for estimate in rows.values()]
     for axes in drawn[-1]:
-        axes.set_xlabel(label)
+        axes.set_xlabel(runs.name_measure(measure, every))
     style.key(figure, [line for line in drawn[0, 0].get_lines() if line.get_label() in marks])
     return figure
 
@@ -138,7 +141,9 @@ def seeds(panels: Mapping[str, Mapping[str, Estimate]]) -> Figure:
 def by_megabytes(lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Figure:
     """Return AP50 against uplink megabytes, with intervals: a line per name."""
     figure = style.canvas(1.6 * WIDTH, 0.9 * WIDTH)
-    runs.draw_by_megabytes(figure.add_subplot(), lines)
+    axes = figure.add_subplot()
+    runs.draw_by_megabytes(axes, lines)
+    style.key(figure, axes.get_legend_handles_labels()[0], ncols=2)
     return figure
 
 

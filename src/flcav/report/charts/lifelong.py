@@ -6,6 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from flcav.report import style
+from flcav.report.charts.runs import name_measure
 from flcav.runs.extras.lifelong.rows import LifelongArm
 from flcav.runs.results.run import Run
 from flcav.statistics.estimates import Estimate
@@ -72,6 +73,7 @@ def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measu
         panel.set_xticks(range(len(conditions) + 1), ["start", *conditions], rotation=40, ha="right")
         panel.set(title=f"tested in {condition}")
         panel.grid(axis="y")
-    panels[0].set(ylabel=f"{measure} (95 % interval)")
+    every = [estimate for arms in found.values() for means in arms.values() for estimate in means]
+    panels[0].set(ylabel=name_measure(measure, every))
     style.key(figure, panels[0].get_legend_handles_labels()[0])
     return figure

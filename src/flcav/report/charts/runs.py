@@ -2,16 +2,19 @@
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from itertools import cycle
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
+from matplotlib.transforms import offset_copy
 
 from flcav.report import style
 from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN
 from flcav.runs.results.run import ArmCost
 from flcav.runs.results.table import Row
 from flcav.statistics.estimates import Estimate
+from flcav.statistics.seeds import MeanOverSeeds
 from flcav.storage.records import select
 
 LINE, TALL = 0.07, 0.13  # height of a name as a fraction of the axis: in charts of rounds, and of tests
@@ -56,11 +59,20 @@ def draw_tested(axes: Axes, tested: Sequence[Row], measure: str, name_height: fl
         for x, estimate in reached.items():
             _draw_interval(axes, x, estimate, colours[town])
         ends[town] = points[-1]
-    axes.set(xlim=(0, max(len(stages), 1) + 0.12), xlabel="test frames", ylabel=measure)
+    axes.set(xlim=(0, max(len(stages), 1) + 0.12), xlabel="test frames, with 95 % intervals", ylabel=measure)
     axes.set_ylim(0, None)
     _name_ends(axes, ends, colours, name_height)
     axes.set_xticks([place + 0.5 for place in range(len(stages))], [STAGES[stage] for stage in stages])
     axes.grid(axis="y")
+
+
+def name_measure(measure: str, estimates: Iterable[Estimate]) -> str:
+    """Return the label of an axis of means with intervals, such as "AP50 (mean of 8 seeds, 95 % interval)"."""
+    counts = sorted({estimate.seeds for estimate in estimates if isinstance(estimate, MeanOverSeeds)})
+    if not counts or counts[-1] == 1:
+        return f"{measure} (95 % interval)"
+    seeds = f"{counts[-1]}" if len(counts) == 1 else f"{counts[0]} to {counts[-1]}"
+    return f"{measure} (mean of {seeds} seeds, 95 % interval)"
 
 
 def _name_ends(
@@ -70,22 +82,20 @@ def _name_ends(
     height: float,
     column: Callable[[float], float] = int,
 ) -> None:
-    """Write the name of each line next to its end (x, y), without overlaps within a column of x, such as a stage."""
+    """Write the name of each line next to its end (x, y), without overlaps within a column of x, such as a stage.
+
+    A thin line joins the end with its name.
+    """
     low, top = axes.get_ylim()
     for at in dict.fromkeys(column(x) for x, _ in ends.values()):
         near = {name: end for name, end in ends.items() if column(end[0]) == at}
         right = max(x for x, _ in near.values())
         places = style.keep_apart([y for _, y in near.values()], height * (top - low), top)
-        for name, place in zip(near, places, strict=True):
-            axes.annotate(
-                name,
-                (right, place),
-                (9, 0),
-                textcoords="offset points",
-                color=colours[name],
-                va="center",
-                fontweight="bold",
-            )
+        aside = offset_copy(axes.transData, axes.figure.get_figure(root=True), x=13, y=0, units="points")
+        for (name, end), place in zip(near.items(), places, strict=True):
+            line = {"arrowstyle": "-", "color": colours[name], "linewidth": 0.7, "shrinkA": 0, "shrinkB": 3}
+            look: dict[str, Any] = {"color": colours[name], "va": "center", "fontweight": "bold", "arrowprops": line}
+            axes.annotate(name, end, (right, place), textcoords=aside, annotation_clip=False, **look)
 
 
 def _colour(town: str, towns: Iterable[str]) -> str:
@@ -192,8 +202,8 @@ def draw_by_megabytes(axes: Axes, lines: Mapping[str, Sequence[tuple[float, Esti
         axes.plot([x for x, _ in points], [ap.mean for _, ap in points], "o-", color=colour, label=name, markersize=4)
         for x, ap in points:
             style.interval(axes, x, ap, color=colour, linewidth=0.8)
-    axes.set(xlabel="wireless uplink [MB]", ylabel="AP50 (95 % interval)", xlim=(0, None))
-    axes.legend(loc="lower right", frameon=False)
+    label = name_measure("AP50", (ap for points in lines.values() for _, ap in points))
+    axes.set(xlabel="wireless uplink [MB]", ylabel=label, xlim=(0, None))
     axes.grid(axis="y")
 
 

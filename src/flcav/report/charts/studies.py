@@ -11,11 +11,12 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from flcav.report import style
+from flcav.report.charts.runs import name_measure
 from flcav.statistics.seeds import MeanOverSeeds
 
 SHADES = LinearSegmentedColormap.from_list("shares", ["white", style.BLUE])
 SIDE_IN, LABELS_IN = 3.6, 1.1
-PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 0.9
+PANEL_IN, ROW_IN, HEAD_IN = 4.2, 0.27, 1.0
 ABREAST = 3  # greatest number of panels side by side
 PREDICTOR_COLOURS = (style.RULE, style.BLUE, style.SKY)
 THICK = 0.26
@@ -58,7 +59,10 @@ class Bar:
 
 @style.styled
 def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precision at IoU 0.5") -> Figure:
-    """Return a panel per title with a bar per figure and a dot per seed; axes span [0, 1] and all values."""
+    """Return a panel per title with a bar per figure and a dot per seed; axes span [0, 1] and all values.
+
+    The label says what bars, dots and numbers in brackets are.
+    """
     every = [value for bars in panels.values() for bar in bars for value in (bar.mean, *bar.seeds)]
     rows = max(len(bars) for bars in panels.values())
     columns = min(len(panels), ABREAST)
@@ -70,14 +74,19 @@ def precisions(panels: Mapping[str, Sequence[Bar]], label: str = "average precis
     for axes, (title, bars) in zip(drawn, panels.items()):
         for row, bar in enumerate(bars):
             axes.barh(row, bar.mean, height=0.7, color=style.BLUE if bar.targets is None else style.SKY)
-            axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3, clip_on=False)
+            if bar.seeds:
+                axes.plot(bar.seeds, [row] * len(bar.seeds), "o", color=style.INK, markersize=3, clip_on=False)
         names = [bar.name if bar.targets is None else f"{bar.name} ({bar.targets})" for bar in bars]
         axes.set_yticks(range(len(bars)), names)
         axes.set_ylim(rows - 0.4, -0.6)
         axes.set_xlim(min(0, *every), max(1, *every))
-        axes.set_xlabel(label)
         axes.set_title(title)
         axes.grid(axis="x")
+    every_bar = [bar for bars in panels.values() for bar in bars]
+    seeds = max(len(bar.seeds) for bar in every_bar)
+    told = [label, "bars: means", "dots: the seed" if seeds == 1 else f"dots: {seeds} seeds"]
+    told += ["(n): targets"] * any(bar.targets is not None for bar in every_bar)
+    figure.supxlabel("; ".join(told), fontsize=style.TEXT)
     return figure
 
 
@@ -126,7 +135,7 @@ def path_errors(panels: Panels) -> Figure:
     for number, (axes, (test, slices)) in enumerate(zip(axes_of, panels.items(), strict=True)):
         _draw(axes, slices)
         axes.set_title(test)
-        axes.set_xlabel("final error after 3 s [m]")
+        axes.set_xlabel("final error after 3 s [m]; dots: seeds")
         if number == 0:
             bars = next(iter(slices.values()))
             handles = [
@@ -175,7 +184,7 @@ def costs(
             axes.annotate(text, (x, mean.mean), (6, 0), textcoords="offset points", va="center", color=colour)
         axes.set_xlim(0, None)
         axes.set_xlabel(cost)
-        axes.set_ylabel(f"{measure} (95 % interval)")
+        axes.set_ylabel(name_measure(measure, (mean for _, mean in points.values())))
         axes.set_title(title)
         axes.grid(axis="y")
     names = [f"{number}: {name}" for number, name in enumerate(next(iter(panels.values())), start=1)]

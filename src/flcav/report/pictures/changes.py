@@ -83,8 +83,8 @@ def draw_changed(axes: Axes, changes: ErrorChanges) -> None:
             axes.plot(x, y, "o", markersize=13, color=style.BLUE, markeredgecolor="white", zorder=9)
             axes.text(x, y, name, ha="center", va="center_baseline", color="white", fontsize=style.SMALL, zorder=10)
         else:
-            axes.plot(x, y, "o", markersize=4, color="white", markeredgecolor=style.INK, zorder=4)
-            look = {"fontsize": style.SMALL, "color": style.MUTED, "path_effects": HALO, "zorder": 4}
+            axes.plot(x, y, "o", markersize=4, color="white", markeredgecolor=style.INK, zorder=7)
+            look = {"fontsize": style.SMALL, "color": style.MUTED, "path_effects": HALO, "zorder": 8}
             axes.annotate(name, (x, y), (4, 3), textcoords="offset points", **look)
 
 
