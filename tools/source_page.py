@@ -17,9 +17,15 @@ from numpy.typing import NDArray
 from flcav.dataset.recording.recorder import open_source, record
 from flcav.dataset.store import Dataset
 from flcav.report import style
+from flcav.sensors.camera import Camera, photograph
+from flcav.sensors.frame import Frame
 from flcav.sources.recipe import parse_recipe
 from flcav.storage.files import write_bytes
 from flcav.storage.markdown import format_table
+from flcav.world.map.town import load_town
+from flcav.world.scene import Scene
+from flcav.world.traffic.traffic import simulate
+from flcav.world.weather import WEATHERS
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGE, PICTURE = DOCS / "carla-source.md", DOCS / "carla-source.png"
@@ -62,6 +68,16 @@ def measure(data: Dataset) -> Mapping[str, NDArray[np.float64]]:
     return {name: np.concatenate(each) for name, each in zip(names, (away, returns, ranges, pole))}
 
 
+def photograph_alike(frame: Frame) -> NDArray[np.uint8]:
+    """Return the picture (H, W, 3) of the built-in simulator from where a frame's camera stands, in its own traffic."""
+    town, seed = load_town(RECIPE["town"]), RECIPE["seed"]
+    times = np.array([RECIPE["warmup_s"]])
+    scene = Scene(town, simulate(town, seed=seed, cavs=0, times_s=times))
+    camera = Camera(**RECIPE["vehicle_rig"]["cameras"]["camera"]["settings"])
+    at = frame.world_from_sensor("camera")
+    return photograph(scene, at, camera, WEATHERS["clear"], np.random.default_rng(0)).rgb
+
+
 @style.styled
 def draw(data: Mapping[str, Dataset], found: Mapping[str, Mapping[str, NDArray[np.float64]]]) -> Figure:
     """Return points per car, shares of ranges, and a picture of each source."""
@@ -77,10 +93,12 @@ def draw(data: Mapping[str, Dataset], found: Mapping[str, Mapping[str, NDArray[n
     ranges.set(xlim=(0, 80), ylim=(0, None), xlabel="range of a point [m]", ylabel="share of the points")
     for axes in (objects, ranges):
         axes.grid()
-    for axes, (name, own) in zip(pictures, data.items()):
-        number = next(i for i in range(len(own)) if own.cameras(i))
-        axes.imshow(own.frame(number).images["camera"].rgb)
-        axes.set_title(f"{name}: {own.keys[number].agent}, {own.keys[number].time_s:.0f} s")
+    served = data["CARLA's protocol"]
+    frame = next(served.frame(i) for i in range(len(served)) if served.cameras(i))
+    shown = photograph_alike(frame), frame.images["camera"].rgb
+    for axes, name, picture in zip(pictures, SOURCES, shown, strict=True):
+        axes.imshow(picture)
+        axes.set_title(f"{name}: from the same place")
         style.hide_axes(axes)
     style.key(figure, list(ranges.get_lines()))
     return figure

@@ -257,7 +257,8 @@ def draw_worth(results: WorthResult) -> bytes:
     left.axvline(0, color=style.RULE, linewidth=0.8)
     left.set_yticks(range(len(shown)), [*shown])
     left.invert_yaxis()
-    left.set(xlim=(-1.05, 1.05), xlabel="rank correlation with the loss that a vehicle saves:\ncircles: seeds, dots: means, 95 % interval")
+    label = "rank correlation with the loss that a vehicle saves:\ncircles: seeds, dots: means, 95 % interval"
+    left.set(xlim=(-1.05, 1.05), xlabel=label)
     for fleet, colour in zip(results.seeds.values(), _colours(len(results.seeds)), strict=True):
         right.plot(fleet.score(TOTAL), fleet.worth(), "o", color=colour, markersize=4)
     right.axhline(0, color=style.RULE, linewidth=0.8)

@@ -255,7 +255,8 @@ def draw_leakage(levels: Sequence[str], lines: Mapping[str, Sequence[MeanOverSee
                   textcoords="offset points", color=style.MUTED, fontsize=style.SMALL)  # fmt: skip
     axes.set_xticks(range(len(levels)), levels)
     axes.set(xlabel="noise of each vehicle, as a multiple of the clipping norm; below: ε", ylim=(-0.02, 1.04))
-    axes.set(ylabel=name_measure("share", (mean for line in lines.values() for mean in line)), xlim=(-0.2, len(levels) - 0.8))
+    share = name_measure("share", (mean for line in lines.values() for mean in line))
+    axes.set(ylabel=share, xlim=(-0.2, len(levels) - 0.8))
     axes.grid(axis="y")
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=2)
     return figure

@@ -4,6 +4,7 @@ import importlib
 import re
 from typing import Any
 
+import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.text import Text
@@ -79,8 +80,8 @@ def test_a_forest_plot_draws_every_interval_and_says_of_how_many_seeds(
 ) -> None:
     ((figure,), _) = draw(name, monkeypatch)
     for axes in figure.axes:
-        spans = [line.get_xdata() for line in axes.get_lines() if len(set(line.get_ydata())) == 1]  # pyright: ignore
-        spans = [(float(span[0]), float(span[1])) for span in spans if len(span) == 2]
+        drawn = [np.c_[line.get_xdata(), line.get_ydata()] for line in axes.get_lines()]
+        spans = [tuple(ends[:, 0]) for ends in drawn if len(ends) == 2 and ends[0, 1] == ends[1, 1]]
         rows = [label.get_text() for label in axes.get_yticklabels()]
         assert len(spans) == len(rows)
         written = [text.get_text() for text in axes.texts if "–" in text.get_text()]
