@@ -27,6 +27,7 @@ ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "docs" / "commands.md"
 GROUPS = INDEX.with_suffix("")  # the folder of the groups' pages
 WIDEST = 1000  # pixels of a picture
+HEAD, TAIL = 9, 2  # lines of a longer output that are shown
 INTRO = """\
 # Commands
 
@@ -38,7 +39,7 @@ and nothing else. Terms are in the [glossary](glossary.md).
 MADE = """\
 These pages are made by `python tools/commands_page.py`, which runs the examples of `src/flcav/cli/commands.yaml` in the
 order of the pages in one folder, with a copy of the repository's `recipes/` in it: an example may read files of an
-earlier one. In their output `...` stands for the folder that flcav is installed in.
+earlier one. In their output, which is shortened, `...` stands for the folder that flcav is installed in.
 """
 
 
@@ -187,7 +188,13 @@ def output_of(line: str, folder: Path) -> str:
     if done.returncode:
         raise RuntimeError(f"{line}: exit code {done.returncode}\n{done.stdout}")
     told = done.stdout.replace(str(Path(flcav.__file__).parent), "...")
-    return "".join(f"{each.rstrip()}\n" for each in told.splitlines())
+    return "".join(f"{each.rstrip()}\n" for each in shorten(told.splitlines()))
+
+
+def shorten(lines: list[str]) -> list[str]:
+    """Return the first and last lines of an output of more than HEAD + TAIL + 1, and between them how many are left out."""
+    left = len(lines) - HEAD - TAIL
+    return lines if left <= 1 else [*lines[:HEAD], f"[{left} more lines]", *lines[-TAIL:]]
 
 
 if __name__ == "__main__":
