@@ -27,7 +27,7 @@ ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "docs" / "commands.md"
 GROUPS = INDEX.with_suffix("")  # the folder of the groups' pages
 WIDEST = 1000  # pixels of a picture
-HEAD, TAIL = 9, 2  # lines of a longer output that are shown
+HEAD, TAIL = 7, 2  # lines of a longer output that are shown
 INTRO = """\
 # Commands
 
