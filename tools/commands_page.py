@@ -89,7 +89,7 @@ def pages(printed: Mapping[str, str]) -> dict[Path, str]:
 
 
 def index_page(known: Mapping[str, click.Command]) -> str:
-    """Return the list of all commands by group, each with the first sentence of its help."""
+    """Return the list of all commands by group, each with the beginning of its help."""
     parts = [INTRO]
     for section in sections():
         rows = (
@@ -102,8 +102,9 @@ def index_page(known: Mapping[str, click.Command]) -> str:
 
 
 def summary(command: click.Command) -> str:
-    """Return the first paragraph of a command's help."""
-    return " ".join((command.help or "").split("\n\n")[0].split())
+    """Return what a command's help begins with, up to the first colon, semicolon or full stop."""
+    said = " ".join((command.help or "").split("\n\n")[0].split())
+    return re.split(r"[:;.](?= |$)", said)[0]
 
 
 def group_page(section: Section, known: Mapping[str, click.Command], printed: Mapping[str, str]) -> str:
@@ -137,8 +138,9 @@ def row(parameter: click.Parameter) -> tuple[str, str, str]:
     none = value is None or value is False or value == []
     default = "required" if parameter.required else "" if none else f"`{value}`"
     said = " ".join(getattr(parameter, "help", None or "").split())
-    if isinstance(parameter.type, click.Choice) and not argument:
-        said = f"{said} One of {', '.join(f'`{each}`' for each in parameter.type.choices)}."
+    choices = parameter.type.choices if isinstance(parameter.type, click.Choice) and not argument else ()
+    if any(not re.search(rf"\b{re.escape(each)}\b", said) for each in choices):
+        said = f"{said} One of {', '.join(f'`{each}`' for each in choices)}."
     return f"`{name}`", said.replace("|", "\\|").replace("[", "\\["), default
 
 

@@ -19,13 +19,13 @@ THREADS = typer.Option(
     1,
     "--threads",
     min=1,
-    help="Threads to compute on; part of what a seed reproduces: another number gives other weights.",
+    help="Threads to compute on; another number gives other weights.",
 )
 AGENTS = typer.Option(
     None,
     "--agents",
-    help="Whose frames of a dataset: vehicles, poles, all, or names with commas between them. By default those whose "
-    "sensors stand as the network expects: docs/tasks.md.",
+    help="Whose frames: vehicles, poles, all, or names with commas between them; by default those whose sensors stand as "
+    "the network expects (docs/tasks.md).",
 )
 AROUND = typer.Option(
     False,
@@ -91,8 +91,8 @@ ENGINE = typer.Option(EngineName.processes, "--engine", help="Backend: processes
 STALE = typer.Option(
     Stale.refuse,
     "--stale",
-    help="Steps in the folder that were done by other code or, after an edit of the recipe, by other settings, and "
-    "those built on them: refuse the folder, redo these steps alone, or keep those of other code.",
+    help="Steps that were done by other code or settings, and those built on them: refuse the folder, redo these steps, "
+    "or keep those of other code.",
 )
 
 
