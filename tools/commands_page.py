@@ -121,7 +121,7 @@ def group_page(section: Section, known: Mapping[str, click.Command], printed: Ma
 def described(name: str, command: click.Command, printed: str) -> str:
     """Return the part of a page about a command."""
     said = "\n\n".join(" ".join(each.split()) for each in (command.help or "").split("\n\n"))
-    options = format_table(("option", "description", "default"), map(row, command.params))
+    options = format_table(("option", "description"), map(row, command.params))
     return f"## flcav {name}\n\n{said}\n\n{options}\n\n{printed}\n"
 
 
@@ -130,18 +130,18 @@ def picture_of(name: str) -> Path:
     return GROUPS / f"{name.replace(' ', '-')}.png"
 
 
-def row(parameter: click.Parameter) -> tuple[str, str, str]:
-    """Return an option's or an argument's name, help and default."""
+def row(parameter: click.Parameter) -> tuple[str, str]:
+    """Return an option's or an argument's name, and its help with the default."""
     argument = isinstance(parameter, click.Argument)
     name = parameter.make_metavar(click.Context(click.Command(""))) if argument else ", ".join(parameter.opts)
     value = parameter.default
     none = value is None or value is False or value == []
-    default = "required" if parameter.required else "" if none else f"`{value}`"
+    default = " Required." if parameter.required else "" if none else f" Default: `{value}`."
     said = " ".join(getattr(parameter, "help", None or "").split())
     choices = parameter.type.choices if isinstance(parameter.type, click.Choice) and not argument else ()
     if any(not re.search(rf"\b{re.escape(each)}\b", said) for each in choices):
         said = f"{said} One of {', '.join(f'`{each}`' for each in choices)}."
-    return f"`{name}`", said.replace("|", "\\|").replace("[", "\\["), default
+    return f"`{name}`", said.replace("|", "\\|").replace("[", "\\[") + default
 
 
 def examples_in(text: str) -> dict[str, str]:

@@ -40,7 +40,7 @@ from flcav.world.weather import WEATHER_CLASSES, WEATHERS, Keyframe, Weather, We
 
 PAGE = Path(__file__).parents[1] / "docs" / "recipes.md"
 TEMPLATE = Path(__file__).with_name("recipes.md.j2")
-HEADER = ("field", "unit", "value", "default", "description")
+HEADER = ("field", "value", "default", "description")
 UNITS = {  # by suffix of a field's name
     **{"mm_h": "mm/h", "m_s": "m/s", "ms": "ms", "m": "m", "s": "s"},
     **{"deg": "°", "rad": "rad", "px": "px", "hz": "Hz", "k": "K"},
@@ -101,7 +101,7 @@ def fields_of(model: type[Config], without: type[Config] = Config) -> str:
     for name, field in model.model_fields.items():
         if name not in without.model_fields:
             text, unit = said_and_unit(name, said[name])
-            rows.append((f"`{name}`", unit, value_of(field), default_of(field), text))
+            rows.append((f"`{name}`", value_of(field) + (f" [{unit}]" if unit else ""), default_of(field), text))
     return format_table(HEADER, rows)
 
 

@@ -53,13 +53,13 @@ def test_names_that_recipes_know_are_on_it():
 
 def test_units_values_and_defaults_are_those_of_the_fields():
     for row in (
-        "| `range_m` | m | number, ",
-        "| `rain_mm_h` | mm/h | number, 0 to 300 | `0` | rain rate |",
-        "| `force_noise` | m/s^2 / sqrt(Hz) | number, ",
-        "| `channels` | | whole number, 1 to 256 | `32` | number of beams, one above the other |",
-        "| `drops` | | true, false | `true` |",
-        "| `vehicle_rig` | | [rig](#rigs) | `lidar32` |",
-        "| `town` | | text | **required** |",
+        "| `range_m` | number, 0.1 to 1000 [m] | `80` |",
+        "| `rain_mm_h` | number, 0 to 300 [mm/h] | `0` | rain rate |",
+        "| `force_noise` | number, 0 to 1000 [m/s^2 / sqrt(Hz)] |",
+        "| `channels` | whole number, 1 to 256 | `32` | number of beams, one above the other |",
+        "| `drops` | true, false | `true` |",
+        "| `vehicle_rig` | [rig](#rigs) | `lidar32` |",
+        "| `town` | text | **required** |",
     ):
         assert row in PAGE
 
