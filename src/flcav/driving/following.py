@@ -120,10 +120,10 @@ class Following:
         network: TrajectoryNetwork | None,
         roads: RoadMap | None,
         spread: PathSpread = CERTAIN,
-        confirmed: Confirmed | None = None,
+        confirmed: Confirmed = CONFIRMED,
     ) -> None:
         """Take the trajectory network, the road map, the calibrated uncertainty, and the confirmation rule."""
-        self._tracker = Tracker(confirm=1 if confirmed else 2)
+        self._tracker = Tracker(confirm=1)  # `confirmed` is the stricter rule
         self._known = dict[int, _Known]()
         self._network, self._roads = network, roads
         self._spread, self._confirmed = spread, confirmed
@@ -147,9 +147,7 @@ class Following:
         return self._report(time_s)
 
     def _report(self, time_s: float) -> FollowedTracks:
-        numbers = sorted(self._known)
-        if self._confirmed is not None:
-            numbers = [n for n in numbers if self._confirmed.holds(self._known[n].past, time_s)]
+        numbers = [n for n in sorted(self._known) if self._confirmed.holds(self._known[n].past, time_s)]
         rows = [self._known[n] for n in numbers]
         if not rows:
             none = np.zeros((0, len(TIMES_S)))
@@ -157,8 +155,7 @@ class Following:
                 Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none, ()
             )
         boxes, velocity = concatenate([track.box for track in rows]), np.array([track.velocity for track in rows])
-        if self._confirmed is not None:
-            velocity[[not self._confirmed.moves(track.past, str(track.box.label[0])) for track in rows]] = 0.0
+        velocity[[not self._confirmed.moves(track.past, str(track.box.label[0])) for track in rows]] = 0.0
         path, yaw = predict_motion(boxes, velocity)
         late = time_s - np.array([track.seen_s for track in rows])
         path += (late[:, None] * velocity)[:, None]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from flcav.driving.following import CERTAIN, CONFIRMED, Confirmed, FollowedTracks, Following, PathSpread
+from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
@@ -132,16 +132,15 @@ class NetworkPerception:
         *,
         spread: PathSpread = CERTAIN,
         road: RoadUnits | None = None,
-        confirmed: Confirmed | None = CONFIRMED,
     ) -> None:
-        """Take a drive and its seed, the calibrated uncertainty, roadside units if any, and the confirmation rule."""
+        """Take a drive and its seed, the calibrated uncertainty, and roadside units if any."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
         drawn = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
         self.weather = staged.scenario.sky or drawn
         self.lights = LightReader(staged.town)
-        self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread, confirmed)
+        self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
@@ -189,8 +188,3 @@ class NetworkPerception:
 def sense_networks(staged: StagedScenario, seed: int) -> NetworkPerception:
     """Return the perception by the networks of the package, as a `loop.Sensing`."""
     return NetworkPerception(staged, seed)
-
-
-def sense_unconfirmed(staged: StagedScenario, seed: int) -> NetworkPerception:
-    """Return the perception by the networks of the package, which reports every track of two detections."""
-    return NetworkPerception(staged, seed, confirmed=None)
