@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.layout import FrameKey
+from flcav.driving.obstacles import OBSTACLE
 from flcav.driving.seen import TIMES_S, predict_motion
 from flcav.geometry import Array, Boxes, concatenate, heading_vectors, wrap_angle
 from flcav.perception.tracking import Tracker
@@ -31,7 +32,7 @@ SLOW_MPS = 0.5  # below it the heading of a track is kept
 MOVED_M = 1.0  # in two seconds: a track that moves less counts as standing, despite a noisy velocity
 WALKS = "Pedestrian"
 MOTIONS = ("stands", "drives", "forecast", "walks")  # kinds of paths by their error; "forecast" is by the network
-CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
+CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle", OBSTACLE: "truck"}
 
 
 def name_motion(label: str, velocity: Array, forecast: bool) -> str:

@@ -1,6 +1,7 @@
 """Perception by the networks of the package: LiDAR at 10 Hz and a camera at 2 Hz on the ego vehicle of a live world.
 
-`objects` detects road users in the sweep, which are tracked, and `trajectory` forecasts them; `signs` detects lights in
+`objects` detects road users in the sweep, which are tracked together with what stands on the lanes and has no class
+(`obstacles`), and `trajectory` forecasts them; `signs` detects lights in
 the picture, which are matched with the projected signal heads of the map; `weather` gives the share of the speed limit.
 Speed limit signs and stop signs are detected but not used: a route has its limits from the map.
 """
@@ -12,10 +13,12 @@ from typing import NamedTuple
 import numpy as np
 
 from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
+from flcav.driving.obstacles import find_obstacles
+from flcav.driving.passing import join_lanes
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
-from flcav.geometry import Boxes, heading_vectors, inverse, transform_points
+from flcav.geometry import Boxes, concatenate, heading_vectors, inverse, transform_points
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
@@ -144,8 +147,9 @@ class NetworkPerception:
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
-        # detections of the last look in the world frame: by the vehicle alone, and with those of roadside units
-        self.own = self.found = Boxes.empty()
+        self._town, self._lanes = staged.town, join_lanes(staged.town)
+        # of the last look in the world frame: the vehicle's detections, those with roadside units', what has no class
+        self.own = self.found = self.obstacles = Boxes.empty()
         self.followed: FollowedTracks | None = None
 
     def look(self, snapshot: Snapshot) -> Seen:
@@ -163,8 +167,11 @@ class NetworkPerception:
         self.own = self.found = detections.transform(frame.assumed_world_from_sensor(LIDAR))
         if self._road is not None:
             self.found = merge_detections(self.own, self._road.receive(self.scene, snapshot))
+        pose = frame.assumed_world_from_sensor(LIDAR)
+        points = transform_points(pose, frame.lidar[LIDAR][:, :3])
+        self.obstacles = find_obstacles(points, pose[:2, 3], self.found, self._lanes, self._town)
         closed, amber = self.lights.closed(snapshot.time_s)
-        tracks = self._following.step(self.found, snapshot.time_s, closed)
+        tracks = self._following.step(concatenate([self.found, self.obstacles]), snapshot.time_s, closed)
         self.followed = tracks
         return Seen(
             tracks.boxes,
