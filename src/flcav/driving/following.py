@@ -32,6 +32,7 @@ SLOW_MPS = 0.5  # below it the heading of a track is kept
 MOVED_M = 1.0  # in two seconds: a track that moves less counts as standing, despite a noisy velocity
 WALKS = "Pedestrian"
 MOTIONS = ("stands", "drives", "forecast", "walks")  # kinds of paths by their error; "forecast" is by the network
+AFOOT_M = 1.2  # length below which a box may be of somebody on foot
 CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle", OBSTACLE: "truck"}
 
 
@@ -72,17 +73,17 @@ class Confirmed:
     sweeps: int = 5
     sweep_s: float = 0.1  # between two sweeps
     drove_m: float = 1.5  # a partly occluded box shifts by less without moving
-    walked_m: float = 0.5  # for pedestrians
+    walked_m: float = 0.5  # for pedestrians, and for what is as small
 
     def holds(self, past: Past, time_s: float) -> bool:
         """Return whether a track is confirmed at `time_s` [s]."""
         since = time_s - (self.sweeps - 0.5) * self.sweep_s
         return sum(report[0] > since for report in past) >= self.hits
 
-    def moves(self, past: Past, label: str) -> bool:
-        """Return whether a track has moved far enough to count as moving."""
+    def moves(self, past: Past, box: Boxes) -> bool:
+        """Return whether a track whose last box is `box` (1,) has moved far enough to count as moving."""
         moved = float(np.hypot(past[-1][1] - past[0][1], past[-1][2] - past[0][2]))
-        return moved > (self.walked_m if label == WALKS else self.drove_m)
+        return moved > (self.walked_m if box.label[0] == WALKS or box.size[0, :2].max() < AFOOT_M else self.drove_m)
 
 
 CONFIRMED = Confirmed()
@@ -156,7 +157,7 @@ class Following:
                 Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none, ()
             )
         boxes, velocity = concatenate([track.box for track in rows]), np.array([track.velocity for track in rows])
-        velocity[[not self._confirmed.moves(track.past, str(track.box.label[0])) for track in rows]] = 0.0
+        velocity[[not self._confirmed.moves(track.past, track.box) for track in rows]] = 0.0
         path, yaw = predict_motion(boxes, velocity)
         late = time_s - np.array([track.seen_s for track in rows])
         path += (late[:, None] * velocity)[:, None]

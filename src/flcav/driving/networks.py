@@ -11,6 +11,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 
 from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
 from flcav.driving.obstacles import find_obstacles
@@ -43,6 +44,7 @@ from flcav.world.weather import draw_weather
 SCORE = 0.3  # least score of detected objects
 LIGHT_SCORE = 0.25  # least score of detected lights
 CAMERA_STEPS = 5  # of 0.1 s between two pictures
+BESIDE_M = 1.0  # of the lanes, where obstacles of no class are looked for, too
 LIGHTS_M = 70.0  # range of lights
 BESIDE_PX = 6.0  # greatest distance from the projected head to the box of a detection
 REMEMBERED_S = 3.0  # for which the last state of a light is kept
@@ -147,7 +149,8 @@ class NetworkPerception:
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
-        self._town, self._lanes = staged.town, join_lanes(staged.town)
+        self._town, self._lanes = staged.town, join_lanes(staged.town).buffer(BESIDE_M)
+        shapely.prepare(self._lanes)
         # of the last look in the world frame: the vehicle's detections, those with roadside units', what has no class
         self.own = self.found = self.obstacles = Boxes.empty()
         self.followed: FollowedTracks | None = None

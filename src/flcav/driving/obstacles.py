@@ -20,9 +20,9 @@ REACH_M = 35.0  # beyond it returns of one object are far apart
 LOW_M, HIGH_M = 0.5, 2.5  # heights above the ground: above kerbs and spray, below crowns of trees
 EXPLAINED_M = 0.7  # around a detection, whose returns are its own
 CELL_M = 0.5  # of the grid; returns in adjacent cells are of one obstacle
-LEAST = 8  # returns of an obstacle
+LEAST = 5  # returns of an obstacle
 DENSE = 300.0  # least returns of an obstacle in a cell, times its squared distance [m^2]: drops of rain give fewer
-LEAST_M = 0.5  # length of an obstacle, and least width of its box
+LEAST_M = 0.5  # length and width of the smallest box
 ANGLES = np.linspace(0, np.pi / 2, 45, endpoint=False)  # orientations that are tried [rad]
 CLOSEST_M = 0.05  # to a side of the rectangle, so that single returns do not decide
 SIGMA_M = 0.3  # standard deviation of a box, since the side that is seen moves with the vehicle
@@ -41,10 +41,10 @@ def find_obstacles(points: Array, sensor: Array, detected: Boxes, lanes: BaseGeo
     near, above = near[kept], above[kept]
     rows = []
     for of_one in _cluster(near[:, :2], np.hypot(*(near[:, :2] - sensor).T)):
-        x, y, length, width, yaw = _fit_rectangle(near[of_one, :2])
-        if len(of_one) >= LEAST and length >= LEAST_M:
+        if len(of_one) >= LEAST:
+            x, y, length, width, yaw = _fit_rectangle(near[of_one, :2])
             height, ground = above[of_one].max(), near[of_one[0], 2] - above[of_one[0]]
-            rows.append((x, y, ground + height / 2, length, max(width, LEAST_M), height, yaw))
+            rows.append((x, y, ground + height / 2, max(length, LEAST_M), max(width, LEAST_M), height, yaw))
     boxes = Boxes.from_array(np.array(rows).reshape(-1, 7), OBSTACLE, np.ones(len(rows)))
     return replace(boxes, variance=np.full((len(rows), 7), SIGMA_M**2))
 

@@ -104,8 +104,12 @@ def test_a_track_is_believed_after_three_of_five_sweeps() -> None:
     assert [bool(each) for each in told] == oracle
 
 
+CAR_BOX = Boxes.from_array(np.array([[0.0, 0.0, 0.8, 4.5, 1.8, 1.6, 0.0]]), "Car")
+SOMEBODY = Boxes.from_array(np.array([[0.0, 0.0, 0.9, 0.6, 0.6, 1.8, 0.0]]), "Pedestrian")
+
+
 @pytest.mark.parametrize(("mps", "tick", "moves"), [(0.3, 15, False), (5.0, 9, True), (1.0, 20, True)])
 def test_a_car_stands_until_it_has_gone_farther_than_a_box_shifts(mps: float, tick: int, moves: bool) -> None:
     past = deque((i / 10, mps * i / 10, 0.0, 0.0, mps) for i in range(tick + 1))
-    assert CONFIRMED.moves(past, "Car") == moves == (mps * tick / 10 > Confirmed.drove_m)
-    assert CONFIRMED.moves(deque([(0.0, 0.0, 0.0, 0.0, 1.0), (0.5, 0.6, 0.0, 0.0, 1.0)]), "Pedestrian")
+    assert CONFIRMED.moves(past, CAR_BOX) == moves == (mps * tick / 10 > Confirmed.drove_m)
+    assert CONFIRMED.moves(deque([(0.0, 0.0, 0.0, 0.0, 1.0), (0.5, 0.6, 0.0, 0.0, 1.0)]), SOMEBODY)
