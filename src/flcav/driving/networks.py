@@ -171,7 +171,8 @@ class NetworkPerception:
         if self._road is not None:
             self.found = merge_detections(self.own, self._road.receive(self.scene, snapshot))
         pose = frame.assumed_world_from_sensor(LIDAR)
-        points = transform_points(pose, frame.lidar[LIDAR][:, :3])
+        sweep = frame.lidar[LIDAR]
+        points = np.column_stack((transform_points(pose, sweep[:, :3]), sweep[:, 3]))
         self.obstacles = find_obstacles(points, pose[:2, 3], self.found, self._lanes, self._town)
         closed, amber = self.lights.closed(snapshot.time_s)
         tracks = self._following.step(concatenate([self.found, self.obstacles]), snapshot.time_s, closed)

@@ -1,7 +1,9 @@
 """Obstacles of no class: returns that stand on the lanes and that no detection explains, such as those of trucks.
 
 The detector has the classes cars, pedestrians and cyclists; a vehicle has to stop before anything. Returns above the
-ground of the map, on the lanes, are clustered on a grid in plan (connected components); each cluster is a box.
+ground of the map, on the lanes, are clustered on a grid in plan (connected components); each cluster is a box. Returns
+of fog and rain are left out by intensity (Park, Kim, Kim, "Fast and accurate desnowing algorithm for LiDAR point
+clouds", IEEE Access 8, 2020) and by density.
 """
 
 from dataclasses import replace
@@ -21,6 +23,7 @@ LOW_M, HIGH_M = 0.5, 2.5  # heights above the ground: above kerbs and spray, bel
 EXPLAINED_M = 0.7  # around a detection, whose returns are its own
 CELL_M = 0.5  # of the grid; returns in adjacent cells are of one obstacle
 LEAST = 5  # returns of an obstacle
+AIR_M, FAINT = 16.0, 0.002  # nearer returns of this intensity or less are of fog and drops (Park et al., 2020)
 DENSE = 300.0  # least returns of an obstacle in a cell, times its squared distance [m^2]: drops of rain give fewer
 LEAST_M = 0.5  # length and width of the smallest box
 ANGLES = np.linspace(0, np.pi / 2, 45, endpoint=False)  # orientations that are tried [rad]
@@ -31,10 +34,12 @@ SIGMA_M = 0.3  # standard deviation of a box, since the side that is seen moves 
 def find_obstacles(points: Array, sensor: Array, detected: Boxes, lanes: BaseGeometry, town: Town) -> Boxes:
     """Return boxes of obstacles on the lanes within `REACH_M` of a LiDAR, labelled `OBSTACLE`; all in the world frame.
 
-    points: (N, 3) of a sweep [m]; sensor: x, y of the LiDAR [m]; `lanes`: the area of the driving lanes of `town`. A
-    box is a rectangle in plan around the returns of a cluster: of the sides that the LiDAR sees.
+    points: (N, 4) x, y, z [m] and intensity (0 to 1) of a sweep; sensor: x, y of the LiDAR [m]; `lanes`: the area of
+    the driving lanes of `town`. A box is a rectangle in plan around the returns of a cluster: of the sides that the
+    LiDAR sees.
     """
-    near = points[np.hypot(*(points[:, :2] - sensor).T) < REACH_M]
+    away = np.hypot(*(points[:, :2] - sensor).T)
+    near = points[(away < REACH_M) & ((away > AIR_M) | (points[:, 3] > FAINT))]
     near = near[shapely.contains_xy(lanes, near[:, 0], near[:, 1])]
     above = near[:, 2] - town.grounds(near[:, 0], near[:, 1])
     kept = (above > LOW_M) & (above < HIGH_M) & ~points_in_boxes(near, detected, EXPLAINED_M).any(axis=0)
