@@ -7,6 +7,7 @@ Speed limit signs and stop signs are detected but not used: a route has its limi
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -14,7 +15,7 @@ import numpy as np
 import shapely
 
 from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
-from flcav.driving.obstacles import find_obstacles
+from flcav.driving.obstacles import clear_air, find_obstacles
 from flcav.driving.passing import join_lanes
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
@@ -166,13 +167,13 @@ class NetworkPerception:
         if pictured:
             self.heads = self.lights.read(frame, self.networks.signs, snapshot.time_s)
             self.named, self.lights_read_s = self.name_weather(frame), snapshot.time_s
+        frame = replace(frame, lidar={LIDAR: clear_air(frame.lidar[LIDAR])})
         detections = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
         self.own = self.found = detections.transform(frame.assumed_world_from_sensor(LIDAR))
         if self._road is not None:
             self.found = merge_detections(self.own, self._road.receive(self.scene, snapshot))
         pose = frame.assumed_world_from_sensor(LIDAR)
-        sweep = frame.lidar[LIDAR]
-        points = np.column_stack((transform_points(pose, sweep[:, :3]), sweep[:, 3]))
+        points = transform_points(pose, frame.lidar[LIDAR][:, :3])
         self.obstacles = find_obstacles(points, pose[:2, 3], self.found, self._lanes, self._town)
         closed, amber = self.lights.closed(snapshot.time_s)
         tracks = self._following.step(concatenate([self.found, self.obstacles]), snapshot.time_s, closed)

@@ -2,7 +2,7 @@
 
 The detector has the classes cars, pedestrians and cyclists; a vehicle has to stop before anything. Returns above the
 ground of the map, on the lanes, are clustered on a grid in plan (connected components); each cluster is a box. Returns
-of fog and rain are left out by intensity (Park, Kim, Kim, "Fast and accurate desnowing algorithm for LiDAR point
+of fog and rain are told apart by intensity (Park, Kim, Kim, "Fast and accurate desnowing algorithm for LiDAR point
 clouds", IEEE Access 8, 2020) and by density.
 """
 
@@ -13,7 +13,7 @@ import shapely
 from scipy import ndimage
 from shapely.geometry.base import BaseGeometry
 
-from flcav.arrays import Array, Ints
+from flcav.arrays import Array, Array32, Ints
 from flcav.geometry import Boxes, points_in_boxes, rotate, wrap_angle
 from flcav.world.map.town import Town
 
@@ -31,15 +31,19 @@ CLOSEST_M = 0.05  # to a side of the rectangle, so that single returns do not de
 SIGMA_M = 0.3  # standard deviation of a box, since the side that is seen moves with the vehicle
 
 
+def clear_air(sweep: Array32) -> Array32:
+    """Return a sweep (N, 4) in the LiDAR's frame, x, y, z [m] and intensity, without the returns of fog and drops."""
+    return sweep[(np.linalg.norm(sweep[:, :3], axis=1) > AIR_M) | (sweep[:, 3] > FAINT)]
+
+
 def find_obstacles(points: Array, sensor: Array, detected: Boxes, lanes: BaseGeometry, town: Town) -> Boxes:
     """Return boxes of obstacles on the lanes within `REACH_M` of a LiDAR, labelled `OBSTACLE`; all in the world frame.
 
-    points: (N, 4) x, y, z [m] and intensity (0 to 1) of a sweep; sensor: x, y of the LiDAR [m]; `lanes`: the area of
-    the driving lanes of `town`. A box is a rectangle in plan around the returns of a cluster: of the sides that the
-    LiDAR sees.
+    points: (N, 3) of a sweep [m]; sensor: x, y of the LiDAR [m]; `lanes`: the area of the driving lanes of `town`. A
+    box is a rectangle in plan around the returns of a cluster: of the sides that the LiDAR sees.
     """
     away = np.hypot(*(points[:, :2] - sensor).T)
-    near = points[(away < REACH_M) & ((away > AIR_M) | (points[:, 3] > FAINT))]
+    near = points[away < REACH_M, :3]
     near = near[shapely.contains_xy(lanes, near[:, 0], near[:, 1])]
     above = near[:, 2] - town.grounds(near[:, 0], near[:, 1])
     kept = (above > LOW_M) & (above < HIGH_M) & ~points_in_boxes(near, detected, EXPLAINED_M).any(axis=0)

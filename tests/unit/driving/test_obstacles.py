@@ -8,7 +8,7 @@ import shapely
 import shapely.affinity
 
 from flcav.driving.errors import load_error_model
-from flcav.driving.obstacles import FAINT, LEAST, OBSTACLE, REACH_M, find_obstacles
+from flcav.driving.obstacles import LEAST, OBSTACLE, REACH_M, clear_air, find_obstacles
 from flcav.driving.studies.error_measurement import _outside
 from flcav.geometry import Array, Boxes
 from flcav.world.map.town import load_town
@@ -32,9 +32,8 @@ def truck(x: float, y: float, yaw: float) -> Array:
     return np.column_stack((plan.T + np.array([x, y]), np.concatenate([up.ravel(), high.ravel()])))
 
 
-def found(points: Array, detected: Boxes | None = None, intensity: float = 0.1) -> Boxes:
-    sweep = np.column_stack((points, np.full(len(points), intensity)))
-    return find_obstacles(sweep, SENSOR, detected or Boxes.empty(), LANES, TOWN)
+def found(points: Array, detected: Boxes | None = None) -> Boxes:
+    return find_obstacles(points, SENSOR, detected or Boxes.empty(), LANES, TOWN)
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.3, -0.2])
@@ -55,8 +54,6 @@ def test_nothing_is_found_off_the_lanes_far_away_low_high_or_in_a_detection() ->
     for moved in ((0.0, 20.0, 0.0), (REACH_M + 10.0, 0.0, 0.0), (0.0, 0.0, 3.0), (0.0, 0.0, -3.0)):
         assert not len(found(points + moved))
     assert not len(found(points, seen))
-    assert not len(found(points - np.array([5.0, 0.0, 0.0]), intensity=FAINT))  # fog
-    assert len(found(points + np.array([10.0, 0.0, 0.0]), intensity=FAINT))  # far and faint
     standing = points[points[:, 2] > 0.6][: LEAST - 1]
     assert not len(found(standing))
 
@@ -65,6 +62,11 @@ def test_two_obstacles_apart_are_two_and_points_on_a_line_are_one() -> None:
     assert len(found(np.concatenate([truck(12.0, 0.0, 0.0), truck(25.0, 0.0, 0.0)]))) == 2
     wall = np.column_stack((np.full(400, 10.0), np.linspace(-1, 1, 400), np.full(400, 1.0)))
     assert found(wall).size[0, :2] == pytest.approx((2.0, 0.5), abs=0.02)
+
+
+def test_faint_returns_that_are_near_are_air() -> None:
+    sweep = np.array([[5, 0, 0, 0.001], [5, 0, 0, 0.1], [30, 0, 0, 0.001], [0, 0, -1.8, 0.0]], np.float32)
+    np.testing.assert_array_equal(clear_air(sweep), sweep[1:3])
 
 
 def test_drops_of_rain_around_the_vehicle_are_no_obstacle() -> None:
