@@ -99,7 +99,7 @@ def drive(
             raise InputError("--out: writes the report of drives, without --pole and --measure")
         check_writable(out)
     sensed = Sensed(perception.value, read_model(perception, errors))
-    loop = Loop(DriverSettings(margin, sigmas, passes=True), lasts)
+    loop = Loop(DriverSettings(margin, sigmas), lasts)
     if measure is not None:
         with show_progress("measure") as report:
             found = measure_errors(chosen, numbers, loop, jobs, report)

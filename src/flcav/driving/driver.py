@@ -6,14 +6,14 @@ each of its long sides; they are closer to each other than the corridor is wide,
 
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
-corridor at the time at which the vehicle would be there. If its settings allow it, it passes standing vehicles
-(`passing`). Where more than `EMERGENCY_MPS2` is needed to avoid a collision, it brakes fully. Steering is pure pursuit
-(Coulter, CMU-RI-TR-92-01, 1992).
+corridor at the time at which the vehicle would be there. Standing vehicles are passed (`passing`). Where
+more than `EMERGENCY_MPS2` is needed to avoid a collision, it brakes fully. Steering is pure pursuit (Coulter,
+CMU-RI-TR-92-01, 1992).
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,6 @@ from shapely.geometry.base import BaseGeometry
 from flcav.driving.passing import CREEPS_MPS, SLIM_M, ReferenceLine, find_standing, list_lines
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
-from flcav.storage.records import WHERE_TRUE
 from flcav.world.commands import Controls
 from flcav.world.dynamics.vehicle import BodyBlueprint
 from flcav.world.map.roads import Route
@@ -112,12 +111,11 @@ FARTHEST_GAP_M = 1e3
 
 @dataclass(frozen=True)
 class DriverSettings:
-    """Settings of a driver: its safety margins, fixed and by the uncertainty of perception, and whether it passes."""
+    """Settings of a driver: its safety margins, fixed and by the uncertainty of perception."""
 
     margin_m: float = 0.4  # fixed part of the margin
     sigmas: float = 0.0  # multiple of the standard deviation of predicted positions that is added to it
     most_m: float = 3.0  # upper limit of the margin
-    passes: Annotated[bool, WHERE_TRUE] = False  # plans a path around standing vehicles
 
 
 DEFAULT = DriverSettings()
@@ -199,7 +197,7 @@ def _choose_line(
     """
     here = judge(route, margin)
     standing = find_standing(seen.velocity, seen.boxes.label)
-    if not settings.passes or lanes is None or not isinstance(here[1], int) or not standing[here[1]]:
+    if lanes is None or not isinstance(here[1], int) or not standing[here[1]]:
         return route, here
     free = min(_approach_speed(ego.speed, wanted), 0.5)
     if here[0] > free:

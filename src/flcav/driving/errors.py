@@ -18,6 +18,7 @@ from flcav.config import InputError, read_json
 from flcav.driving.following import MOTIONS, Following, PathSpread
 from flcav.driving.loop import Sensing
 from flcav.driving.networks import LIGHTS_M, load_networks, load_road_map
+from flcav.driving.obstacles import OBSTACLE
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import (
     EGO,
@@ -40,7 +41,7 @@ from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 
 EDGES_M = (0.0, 15.0, 30.0, 52.0)  # distances between which errors are measured
-CLASSES = ("Car", "Pedestrian", "Cyclist")
+CLASSES = ("Car", "Pedestrian", "Cyclist", OBSTACLE)
 SHIPPED = Path(__file__).parent / "shipped" / "errors.json"
 MODELLED = "the model of errors"
 HELD_S = 1.0  # for which an actor stays detected or missed
@@ -52,7 +53,8 @@ class ErrorModel(Record):
     """Error model of the perception networks, as measured."""
 
     detected: Mapping[str, tuple[float, ...]]  # by class: recall of those in sight in each distance bin of `EDGES_M`
-    sd: Mapping[str, tuple[float, float, float]]  # by class: of x, y [m] in the ego frame, and yaw [rad]
+    # by class: of x, y [m] in the ego frame, and yaw [rad]; of obstacles outwards from their outline
+    sd: Mapping[str, tuple[float, float, float]]
     false_positives: float  # per frame
     lights: tuple[float, float]  # share of the lights in the picture that are read correctly, and wrongly
     weather: Mapping[str, Mapping[str, float]]  # by true class: share of each predicted class
@@ -70,11 +72,10 @@ class ErrorModel(Record):
 def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], Boxes, Array]:
     """Return the road users in the detector's field and line of sight: rows of the trace, boxes, ego-frame positions.
 
-    Boxes are in the world frame, labelled with detection classes; positions (N, 2) [m] are ahead and to the left of the
-    ego vehicle.
+    Boxes are in the world frame, labelled with detection classes, and those of no class, such as trucks, as `OBSTACLE`;
+    positions (N, 2) [m] are ahead and to the left of the ego vehicle.
     """
     rows = find_around(snapshot, float(np.hypot(*FIELD_M)))
-    rows = rows[np.isin(snapshot.trace.category[rows], list(DETECTION_CLASS))]
     boxes, _, _ = read_actors(snapshot, rows)
     ego = snapshot.row(EGO)
     at, yaw = snapshot.trace.position[0, ego], float(snapshot.trace.yaw[0, ego])
@@ -82,7 +83,7 @@ def find_in_field(snapshot: Snapshot, scene: Scene) -> tuple[NDArray[np.int64], 
     within = (x > 0) & (x < FIELD_M[0]) & (np.abs(y) < FIELD_M[1])
     rows, boxes, local = rows[within], boxes[within], np.stack((x, y), axis=1)[within]
     visible = share_seen(scene, at + np.array((0.0, 0.0, EYE_M)), boxes, ego) > 0
-    labels = np.array([DETECTION_CLASS[label] for label in boxes.label[visible].tolist()], np.str_)
+    labels = np.array([DETECTION_CLASS.get(label, OBSTACLE) for label in boxes.label[visible].tolist()], np.str_)
     kept = boxes[visible]
     return rows[visible], Boxes(kept.center, kept.size, kept.yaw, labels), local[visible]
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from flcav.dataset.layout import FrameKey
+from flcav.driving.obstacles import OBSTACLE
 from flcav.driving.seen import TIMES_S, predict_motion
 from flcav.geometry import Array, Boxes, concatenate, heading_vectors, wrap_angle
 from flcav.perception.tracking import Tracker
@@ -31,7 +32,8 @@ SLOW_MPS = 0.5  # below it the heading of a track is kept
 MOVED_M = 1.0  # in two seconds: a track that moves less counts as standing, despite a noisy velocity
 WALKS = "Pedestrian"
 MOTIONS = ("stands", "drives", "forecast", "walks")  # kinds of paths by their error; "forecast" is by the network
-CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle"}
+AFOOT_M = 1.2  # length below which a box may be of somebody on foot
+CATEGORY = {"Car": "car", "Pedestrian": "pedestrian", "Cyclist": "bicycle", OBSTACLE: "truck"}
 
 
 def name_motion(label: str, velocity: Array, forecast: bool) -> str:
@@ -71,17 +73,17 @@ class Confirmed:
     sweeps: int = 5
     sweep_s: float = 0.1  # between two sweeps
     drove_m: float = 1.5  # a partly occluded box shifts by less without moving
-    walked_m: float = 0.5  # for pedestrians
+    walked_m: float = 0.5  # for pedestrians, and for what is as small
 
     def holds(self, past: Past, time_s: float) -> bool:
         """Return whether a track is confirmed at `time_s` [s]."""
         since = time_s - (self.sweeps - 0.5) * self.sweep_s
         return sum(report[0] > since for report in past) >= self.hits
 
-    def moves(self, past: Past, label: str) -> bool:
-        """Return whether a track has moved far enough to count as moving."""
+    def moves(self, past: Past, box: Boxes) -> bool:
+        """Return whether a track whose last box is `box` (1,) has moved far enough to count as moving."""
         moved = float(np.hypot(past[-1][1] - past[0][1], past[-1][2] - past[0][2]))
-        return moved > (self.walked_m if label == WALKS else self.drove_m)
+        return moved > (self.walked_m if box.label[0] == WALKS or box.size[0, :2].max() < AFOOT_M else self.drove_m)
 
 
 CONFIRMED = Confirmed()
@@ -120,10 +122,10 @@ class Following:
         network: TrajectoryNetwork | None,
         roads: RoadMap | None,
         spread: PathSpread = CERTAIN,
-        confirmed: Confirmed | None = None,
+        confirmed: Confirmed = CONFIRMED,
     ) -> None:
         """Take the trajectory network, the road map, the calibrated uncertainty, and the confirmation rule."""
-        self._tracker = Tracker(confirm=1 if confirmed else 2)
+        self._tracker = Tracker(confirm=1)  # `confirmed` is the stricter rule
         self._known = dict[int, _Known]()
         self._network, self._roads = network, roads
         self._spread, self._confirmed = spread, confirmed
@@ -147,9 +149,7 @@ class Following:
         return self._report(time_s)
 
     def _report(self, time_s: float) -> FollowedTracks:
-        numbers = sorted(self._known)
-        if self._confirmed is not None:
-            numbers = [n for n in numbers if self._confirmed.holds(self._known[n].past, time_s)]
+        numbers = [n for n in sorted(self._known) if self._confirmed.holds(self._known[n].past, time_s)]
         rows = [self._known[n] for n in numbers]
         if not rows:
             none = np.zeros((0, len(TIMES_S)))
@@ -157,8 +157,7 @@ class Following:
                 Boxes.empty(), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros((0, len(TIMES_S), 2)), none, none, ()
             )
         boxes, velocity = concatenate([track.box for track in rows]), np.array([track.velocity for track in rows])
-        if self._confirmed is not None:
-            velocity[[not self._confirmed.moves(track.past, str(track.box.label[0])) for track in rows]] = 0.0
+        velocity[[not self._confirmed.moves(track.past, track.box) for track in rows]] = 0.0
         path, yaw = predict_motion(boxes, velocity)
         late = time_s - np.array([track.seen_s for track in rows])
         path += (late[:, None] * velocity)[:, None]

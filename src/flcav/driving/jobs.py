@@ -3,19 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 from flcav.driving.errors import ErrorModel, sense_model
 from flcav.driving.film import Film, FilmCamera
 from flcav.driving.loop import LOOP, Loop, Sensing, drive_scenario, drive_staged, sense_truth
 from flcav.driving.measures import DriveResult
-from flcav.driving.networks import Networks, name_network, sense_networks, sense_unconfirmed
+from flcav.driving.networks import Networks, name_network, sense_networks
 from flcav.driving.scenarios import DrivingScenario, StagedScenario
 from flcav.driving.seen import Coupling, Perception, Without
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.storage.kept import hash_request, keep, read_kept
-from flcav.storage.records import WHERE_TRUE, Record, to_json
+from flcav.storage.records import Record, to_json
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,6 @@ class Sensed(Record):
 
     kind: str  # "truth", "networks", "model"
     model: ErrorModel | None = None
-    unconfirmed: Annotated[bool, WHERE_TRUE] = False  # of networks: tracks need no confirmation, see `Confirmed`
 
     def make(self) -> Sensing:
         """Return the constructor of the perception; raises `ValueError` for a modelled perception without its model."""
@@ -33,7 +31,7 @@ class Sensed(Record):
                 raise ValueError("a modelled perception needs its model")
             return sense_model(self.model)
         if self.kind == "networks":
-            return sense_unconfirmed if self.unconfirmed else sense_networks
+            return sense_networks
         return sense_truth
 
     def line(self) -> str:

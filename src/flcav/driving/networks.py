@@ -1,21 +1,26 @@
 """Perception by the networks of the package: LiDAR at 10 Hz and a camera at 2 Hz on the ego vehicle of a live world.
 
-`objects` detects road users in the sweep, which are tracked, and `trajectory` forecasts them; `signs` detects lights in
+`objects` detects road users in the sweep, which are tracked together with what stands on the lanes and has no class
+(`obstacles`), and `trajectory` forecasts them; `signs` detects lights in
 the picture, which are matched with the projected signal heads of the map; `weather` gives the share of the speed limit.
 Speed limit signs and stop signs are detected but not used: a route has its limits from the map.
 """
 
 from collections.abc import Iterator
+from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
+import shapely
 
-from flcav.driving.following import CERTAIN, CONFIRMED, Confirmed, FollowedTracks, Following, PathSpread
+from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
+from flcav.driving.obstacles import clear_air, find_obstacles
+from flcav.driving.passing import join_lanes
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
-from flcav.geometry import Boxes, heading_vectors, inverse, transform_points
+from flcav.geometry import Boxes, concatenate, heading_vectors, inverse, transform_points
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
@@ -40,6 +45,7 @@ from flcav.world.weather import draw_weather
 SCORE = 0.3  # least score of detected objects
 LIGHT_SCORE = 0.25  # least score of detected lights
 CAMERA_STEPS = 5  # of 0.1 s between two pictures
+BESIDE_M = 1.0  # of the lanes, where obstacles of no class are looked for, too
 LIGHTS_M = 70.0  # range of lights
 BESIDE_PX = 6.0  # greatest distance from the projected head to the box of a detection
 REMEMBERED_S = 3.0  # for which the last state of a light is kept
@@ -132,21 +138,22 @@ class NetworkPerception:
         *,
         spread: PathSpread = CERTAIN,
         road: RoadUnits | None = None,
-        confirmed: Confirmed | None = CONFIRMED,
     ) -> None:
-        """Take a drive and its seed, the calibrated uncertainty, roadside units if any, and the confirmation rule."""
+        """Take a drive and its seed, the calibrated uncertainty, and roadside units if any."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
         drawn = draw_weather(staged.scenario.weather, stream(seed, "weather", self._name))
         self.weather = staged.scenario.sky or drawn
         self.lights = LightReader(staged.town)
-        self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread, confirmed)
+        self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread)
         self._step = 0
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
-        # detections of the last look in the world frame: by the vehicle alone, and with those of roadside units
-        self.own = self.found = Boxes.empty()
+        self._town, self._lanes = staged.town, join_lanes(staged.town).buffer(BESIDE_M)
+        shapely.prepare(self._lanes)
+        # of the last look in the world frame: the vehicle's detections, those with roadside units', what has no class
+        self.own = self.found = self.obstacles = Boxes.empty()
         self.followed: FollowedTracks | None = None
 
     def look(self, snapshot: Snapshot) -> Seen:
@@ -160,12 +167,16 @@ class NetworkPerception:
         if pictured:
             self.heads = self.lights.read(frame, self.networks.signs, snapshot.time_s)
             self.named, self.lights_read_s = self.name_weather(frame), snapshot.time_s
+        frame = replace(frame, lidar={LIDAR: clear_air(frame.lidar[LIDAR])})
         detections = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
         self.own = self.found = detections.transform(frame.assumed_world_from_sensor(LIDAR))
         if self._road is not None:
             self.found = merge_detections(self.own, self._road.receive(self.scene, snapshot))
+        pose = frame.assumed_world_from_sensor(LIDAR)
+        points = transform_points(pose, frame.lidar[LIDAR][:, :3])
+        self.obstacles = find_obstacles(points, pose[:2, 3], self.found, self._lanes, self._town)
         closed, amber = self.lights.closed(snapshot.time_s)
-        tracks = self._following.step(self.found, snapshot.time_s, closed)
+        tracks = self._following.step(concatenate([self.found, self.obstacles]), snapshot.time_s, closed)
         self.followed = tracks
         return Seen(
             tracks.boxes,
@@ -189,8 +200,3 @@ class NetworkPerception:
 def sense_networks(staged: StagedScenario, seed: int) -> NetworkPerception:
     """Return the perception by the networks of the package, as a `loop.Sensing`."""
     return NetworkPerception(staged, seed)
-
-
-def sense_unconfirmed(staged: StagedScenario, seed: int) -> NetworkPerception:
-    """Return the perception by the networks of the package, which reports every track of two detections."""
-    return NetworkPerception(staged, seed, confirmed=None)

@@ -8,15 +8,12 @@ import pytest
 import shapely
 from test_closed_loop import CAR, at, see, straight
 
-from flcav.driving.driver import DriverSettings, decide_controls
+from flcav.driving.driver import decide_controls
 from flcav.driving.following import CERTAIN, CONFIRMED, Confirmed, Following
-from flcav.driving.jobs import DriveJob, Sensed
 from flcav.driving.passing import CREEPS_MPS, SLIM_M, Beside, join_lanes, list_lines
-from flcav.driving.scenarios import list_scenarios
 from flcav.geometry import Boxes
 from flcav.world.map.town import load_town
 
-PASSING = DriverSettings(passes=True)
 WIDE, NARROW = shapely.box(0.0, -1.75, 300.0, 5.25), shapely.box(0.0, -1.75, 300.0, 1.75)
 
 
@@ -28,7 +25,7 @@ def parked(aside_m: float) -> float:
 def test_a_parked_car_that_reaches_into_the_margin_is_passed_further_left() -> None:
     beside = see((50.0, parked(0.3), 0.0, 0.0, 0.0))
     stops = decide_controls(straight(), at(36.0, 8.0), beside, CAR)
-    goes = decide_controls(straight(), at(36.0, 8.0), beside, CAR, PASSING, WIDE)
+    goes = decide_controls(straight(), at(36.0, 8.0), beside, CAR, lanes=WIDE)
     assert stops.acceleration < -1.0
     assert (stops.cause, stops.controls.steer) == (0, 0.0)
     assert goes.acceleration > 0
@@ -38,11 +35,11 @@ def test_a_parked_car_that_reaches_into_the_margin_is_passed_further_left() -> N
 def test_without_room_who_stands_is_passed_slowly_and_who_is_in_the_way_not_at_all() -> None:
     narrow, closed = (see((40.0, parked(gap), 0.0, 0.0, 0.0)) for gap in (SLIM_M + 0.1, -1.0))
     for speed, goes in ((0.0, True), (CREEPS_MPS - 0.5, True), (8.0, False)):
-        told = decide_controls(straight(), at(36.0, speed), narrow, CAR, PASSING, NARROW)
+        told = decide_controls(straight(), at(36.0, speed), narrow, CAR, lanes=NARROW)
         assert (told.acceleration > 0) == goes, speed
-    assert decide_controls(straight(), at(36.0, 0.0), closed, CAR, PASSING, NARROW).acceleration <= 0.3
+    assert decide_controls(straight(), at(36.0, 0.0), closed, CAR, lanes=NARROW).acceleration <= 0.3
     ahead = see((46.0, 0.0, 0.0, 0.0, 0.0))
-    told = decide_controls(straight(), at(36.0, 6.0), ahead, CAR, PASSING, NARROW)
+    told = decide_controls(straight(), at(36.0, 6.0), ahead, CAR, lanes=NARROW)
     assert told.acceleration < -1.0
     assert told.cause == 0
 
@@ -51,7 +48,7 @@ def test_without_room_who_stands_is_passed_slowly_and_who_is_in_the_way_not_at_a
 def test_nobody_squeezes_past_somebody_on_foot(label: str) -> None:
     beside = see((42.0, parked(0.3), 0.0, 0.0, 0.0))
     afoot = replace(beside, boxes=replace(beside.boxes, label=np.array([label])))
-    told = decide_controls(straight(), at(36.0, 6.0), afoot, CAR, PASSING, WIDE)
+    told = decide_controls(straight(), at(36.0, 6.0), afoot, CAR, lanes=WIDE)
     assert (told.acceleration, told.controls.steer) == (
         decide_controls(straight(), at(36.0, 6.0), afoot, CAR).acceleration,
         0.0,
@@ -62,7 +59,7 @@ def test_oncoming_traffic_keeps_the_vehicle_in_its_lane() -> None:
     beside = (50.0, parked(0.0), 0.0, 0.0, 0.0)
     oncoming = (70.0, 2.5, np.pi, -8.0, 0.0)
     free, met = (
-        decide_controls(straight(), at(36.0, 8.0), see(*rows), CAR, PASSING, WIDE)
+        decide_controls(straight(), at(36.0, 8.0), see(*rows), CAR, lanes=WIDE)
         for rows in ((beside,), (beside, oncoming))
     )
     assert free.controls.steer > 0.0
@@ -107,16 +104,12 @@ def test_a_track_is_believed_after_three_of_five_sweeps() -> None:
     assert [bool(each) for each in told] == oracle
 
 
+CAR_BOX = Boxes.from_array(np.array([[0.0, 0.0, 0.8, 4.5, 1.8, 1.6, 0.0]]), "Car")
+SOMEBODY = Boxes.from_array(np.array([[0.0, 0.0, 0.9, 0.6, 0.6, 1.8, 0.0]]), "Pedestrian")
+
+
 @pytest.mark.parametrize(("mps", "tick", "moves"), [(0.3, 15, False), (5.0, 9, True), (1.0, 20, True)])
 def test_a_car_stands_until_it_has_gone_farther_than_a_box_shifts(mps: float, tick: int, moves: bool) -> None:
     past = deque((i / 10, mps * i / 10, 0.0, 0.0, mps) for i in range(tick + 1))
-    assert CONFIRMED.moves(past, "Car") == moves == (mps * tick / 10 > Confirmed.drove_m)
-    assert CONFIRMED.moves(deque([(0.0, 0.0, 0.0, 0.0, 1.0), (0.5, 0.6, 0.0, 0.0, 1.0)]), "Pedestrian")
-
-
-def test_drives_of_another_planner_or_other_tracks_are_kept_apart_and_former_ones_keep_their_names() -> None:
-    job, sensed = DriveJob(list_scenarios()[0], 1), Sensed("networks")
-    passing = replace(job, loop=replace(job.loop, driver=PASSING))
-    names = {job.key(sensed), passing.key(sensed), job.key(replace(sensed, unconfirmed=True))}
-    assert len(names) == 3
-    assert "passes" not in str(job.as_json())
+    assert CONFIRMED.moves(past, CAR_BOX) == moves == (mps * tick / 10 > Confirmed.drove_m)
+    assert CONFIRMED.moves(deque([(0.0, 0.0, 0.0, 0.0, 1.0), (0.5, 0.6, 0.0, 0.0, 1.0)]), SOMEBODY)

@@ -171,3 +171,12 @@ def test_a_run_without_the_claim_has_no_answer() -> None:
     ]
     differences, findings = zip(*others, strict=True)
     assert tell_answer(replace(run, differences=differences, findings=findings)) is None
+
+
+def test_recordings_of_anybody_are_regions_and_no_towns() -> None:
+    run = Run.load(RUNS / "demo/earlier/float32", RESULTS)
+    regions = {**run.recipe.regions, "ring": run.recipe.regions["ring"].model_copy(update={"data": "drive"})}
+    answer = tell_answer(replace(run, recipe=run.recipe.model_copy(update={"regions": regions})))
+    assert answer is not None
+    assert answer.sentences[0].startswith("In two unseen regions: ")
+    assert answer.sentences[1].startswith("One network for all regions, ")

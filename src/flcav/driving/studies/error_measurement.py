@@ -14,9 +14,10 @@ from flcav.driving.following import MOTIONS
 from flcav.driving.jobs import begin_worker
 from flcav.driving.loop import Loop, drive_scenario
 from flcav.driving.networks import NetworkPerception
+from flcav.driving.obstacles import OBSTACLE
 from flcav.driving.scenarios import DrivingScenario, StagedScenario
 from flcav.driving.seen import EGO, TIMES_S, Seen, TruePerception, find_around
-from flcav.geometry import Array, rotate, wrap_angle
+from flcav.geometry import Array, concatenate, rotate, wrap_angle
 from flcav.interface.progress import Report, ignore_progress
 from flcav.machine.processes import process_pool
 from flcav.world.snapshot import Snapshot
@@ -77,22 +78,26 @@ class Comparing:
 
     def _compare(self, snapshot: Snapshot) -> None:
         _, boxes, local = find_in_field(snapshot, self._networks.scene)
-        found = self._networks.found
+        found = concatenate([self._networks.found, self._networks.obstacles])
         yaw = float(snapshot.trace.yaw[0, snapshot.row(EGO)])
         free = np.ones(len(found), np.bool_)
         for row in np.argsort(np.hypot(*local.T)).tolist():
-            away = np.hypot(*(found.center[:, :2] - boxes.center[row, :2]).T)
-            same = free & (found.label == boxes.label[row]) & (away < MATCH_M)
             label, distance = str(boxes.label[row]), float(np.hypot(*local[row]))
+            apart = found.center[:, :2] - boxes.center[row, :2]
+            if label == OBSTACLE:  # whose box is of the side that is seen
+                apart = _outside(apart, boxes.size[row, :2], float(boxes.yaw[row]))
+            away = np.hypot(*apart.T)
+            same = free & (found.label == label) & (away < MATCH_M)
             if not same.any():
                 self._tally.pairs.append((label, distance, False, 0.0, 0.0, 0.0))
                 continue
             best = int(np.argmin(np.where(same, away, np.inf)))
             free[best] = False
-            apart_x, apart_y = (found.center[best, :2] - boxes.center[row, :2]).tolist()
-            x, y = rotate(apart_x, apart_y, -yaw)
-            # Errors of heading are modulo pi: tracking corrects boxes that are detected the wrong way round.
-            turn = float(wrap_angle(2 * (found.yaw[best] - boxes.yaw[row]))) / 2
+            x, y = rotate(float(apart[best, 0]), float(apart[best, 1]), -yaw)
+            # Errors of heading are modulo pi: tracking corrects boxes that are detected the wrong way round. Those of
+            # obstacles are modulo pi / 2: the side that is seen may be the short one.
+            sides = 4 if label == OBSTACLE else 2
+            turn = float(wrap_angle(sides * (found.yaw[best] - boxes.yaw[row]))) / sides
             self._tally.pairs.append((label, distance, True, float(x), float(y), turn))
         rows = find_around(snapshot, 80.0)
         everyone = snapshot.trace.position[0, rows, :2]
@@ -123,6 +128,17 @@ class Comparing:
             places = [self._places.get((name, tick)) for tick in ticks]
             if all(place is not None for place in places):
                 self._tally.tracks.append((motion, variance, path - np.array(places)))
+
+
+def _outside(apart: Array, size: Array, yaw: float) -> Array:
+    """Return the displacements (N, 2) [m] from the outline of a box to points; 0 within it.
+
+    apart: (N, 2) from the box's centre [m]; size: its length and width [m].
+    """
+    along, across = rotate(apart[:, 0], apart[:, 1], -yaw)
+    local = np.stack((along, across), axis=1)
+    local -= np.clip(local, -size / 2, size / 2)
+    return np.stack(rotate(local[:, 0], local[:, 1], yaw), axis=1)
 
 
 def measure_errors(

@@ -1,6 +1,6 @@
 """The answer of a run to its question, whether vehicles can teach a network towns that it has never seen."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -106,9 +106,15 @@ def _tell_edge(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str
             means = [_average(run, task, stage, places) for stage in (PRETRAIN, EDGE)]
             right = f"{_measure(run, task)} of {task} {means[0]:.3f} → {means[1]:.3f}"
         told.append(f"{right}, for {_sent(run, task, EDGE, ('wireless',)):.0f} MB of radio")
-    most = max(len(places) for places in regions.values())
-    towns = f"{NUMBERS[most] if most < len(NUMBERS) else most} unseen town{'' if most == 1 else 's'}"
-    yield f"In {towns}: {'; '.join(told)}."
+    places = max(regions.values(), key=len)
+    count = NUMBERS[len(places)] if len(places) < len(NUMBERS) else len(places)
+    noun = f"{_name_places(run, places)}{'' if len(places) == 1 else 's'}"
+    yield f"In {count} unseen {noun}: {'; '.join(told)}."
+
+
+def _name_places(run: Run, regions: Iterable[str]) -> str:
+    """Return what regions are: towns, unless one of them has recordings of its own."""
+    return "region" if any(run.recipe.regions[name].data for name in regions) else "town"
 
 
 def _tell_cloud(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str]:
@@ -124,7 +130,8 @@ def _tell_cloud(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[st
         else:
             told.append(f"has {_measure(run, task)} {_average(run, task, CLOUD, places):.3f}")
     if told:
-        yield f"One network for all towns, averaged by the cloud for {sent:.0f} MB more, {', '.join(told)}."
+        everywhere = f"One network for all {_name_places(run, run.recipe.regions)}s"
+        yield f"{everywhere}, averaged by the cloud for {sent:.0f} MB more, {', '.join(told)}."
 
 
 def _tell_home(home: Sequence[HomeCost]) -> Iterator[str]:
