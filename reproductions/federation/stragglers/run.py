@@ -21,7 +21,7 @@ from flcav.dataset.store import Dataset
 from flcav.experiments.comparison import average_arms, mean_difference
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.federation.links.in_process import update_bytes
-from flcav.federation.links.metered import Account
+from flcav.federation.links.metered import Account, Outage
 from flcav.federation.loop import Schedule, federate
 from flcav.federation.rules import Rules
 from flcav.federation.selection import Selection
@@ -213,9 +213,9 @@ def follow(way: Way, begun: Begun) -> Followed:
     rules, outages = driven.rules, driven.outages
     rounds = min(ROUNDS, 1 + int(np.sum(np.cumsum(driven.seconds) <= HORIZON_S)))
     if way.drawn is not None:
-        rounds = ROUNDS  # times follow from who is drawn
         rules = Rules(selection=Selection(rule="importance", clients=way.drawn))
         outages = {key: each for key, each in outages.items() if each.sent_bytes is None}  # those not asked
+        rounds = bound_drawn(begun.fleet, outages)  # times follow from who is drawn
     numbers = range(1, rounds + 1)
     book, state, weights = Ledger(LinkMegabytes(1e6, 0.0)), FederationState(), [begun.start]
     federate(
@@ -244,6 +244,18 @@ def follow(way: Way, begun: Begun) -> Followed:
         [sum(entry.bytes for entry in entries if entry.direction == "up") for entries in messages],
         [len(record.clients) for record in state.records],
     )
+
+
+def bound_drawn(fleet: Fleet, outages: Mapping[tuple[int, str], Outage]) -> int:
+    """Return a number of rounds of importance selection that the horizon does not have time for, at most `ROUNDS`.
+
+    A round lasts at least as long as the training of the slowest vehicle that is asked.
+    """
+    least_s = min(
+        max((fleet.work(name).compute_s for name in fleet.clients if (number, name) not in outages), default=TRAIN_S)
+        for number in range(1, ROUNDS + 1)
+    )
+    return min(ROUNDS, 1 + int(HORIZON_S / least_s))
 
 
 def time_drawn(fleet: Fleet, links: RadioLinks, number: int, entries: Sequence[LedgerEntry]) -> float:
