@@ -115,9 +115,9 @@ def plan_tasks(weights: Mapping[str, float], curves: Mapping[str, OwnCurve], bud
     budgets = Budgets(wireless=budget_mb, wireline=budget_mb)
     tasks = allocate_tasks(posed.model_copy(update={"budgets_mb": budgets}))[0]
     plan = {task.name: (task.samples, task.edge_rounds, task.cloud_rounds) for task in tasks}
-    most = {task: load_known_history(task).resources.max(axis=0).tolist() for task in TASKS}
+    most = {task: load_known_history(task).resources.max(axis=0).tolist() for task in TASKS}  # counts
     accuracy = {task: 1 - float(curves[task].error(*plan[task], 1)) for task in TASKS}
-    best = {task: 1 - float(curves[task].error(*most[task][:3], 1)) for task in TASKS}
+    best = {task: 1 - float(curves[task].error(*most[task], k=1)) for task in TASKS}
     return Planned(weights, plan, accuracy, {task: accuracy[task] / best[task] for task in TASKS})
 
 
