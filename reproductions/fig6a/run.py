@@ -177,6 +177,24 @@ STEPS = (
         "federation/exchange",
         Stored(("differences", "uniform, 2", "own region")),
     ),
+    Step(
+        "with stragglers, in equal seconds: those in time - all, who wait",
+        SCHEME,
+        "federation/stragglers",
+        Stored(("primary",)),
+    ),
+    Step(
+        "with stragglers, in equal seconds: importance of those in time - all, who wait",
+        SCHEME,
+        "federation/stragglers",
+        Stored(("others", "vehicles alike: importance, 4 of those in time - all, waits")),
+    ),
+    Step(
+        "with stragglers, in equal seconds: by chance - all, who wait",
+        CONTROL,
+        "federation/stragglers",
+        Stored(("others", "vehicles alike: chance, 7 - all, waits")),
+    ),
 )
 
 

@@ -348,7 +348,7 @@ def asynchrony_tables(results: AsynchronyResult) -> dict[str, str]:
     return {"accuracy": format_table(heads, accuracy), "differences": compared}
 
 
-COLOURS = (style.INK, style.POINT, style.BLUE, style.GREEN, style.VERMILLION)
+COLOURS = (style.INK, style.POINT, style.BLUE, style.GREEN, style.VERMILLION, style.PURPLE)
 
 
 class Reached(Protocol):
