@@ -126,4 +126,4 @@ def _run(out: Path, options: Options) -> Outcome[PeopleResult]:
     return Outcome(results, {"arms.png": picture}, results.sentences())
 
 
-EXPERIMENT = Experiment(PeopleResult, _run, tabulate_classes, seeds=3)
+EXPERIMENT = Experiment(PeopleResult, _run, tabulate_classes, seeds=3, recipe="people")

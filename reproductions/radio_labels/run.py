@@ -117,4 +117,4 @@ def _run(out: Path, options: Options) -> Outcome[RadioLabelsResult]:
     return Outcome(results, {"arms.png": picture}, results.sentences())
 
 
-EXPERIMENT = Experiment(RadioLabelsResult, _run, tabulate_labels, seeds=5)
+EXPERIMENT = Experiment(RadioLabelsResult, _run, tabulate_labels, seeds=5, recipe="radio_labels")
