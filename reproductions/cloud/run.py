@@ -216,4 +216,4 @@ def _run(out: Path, options: Options) -> Outcome[CloudResult]:
     return Outcome(results, {"arms.png": draw_cloud(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(CloudResult, _run, cloud_tables)
+EXPERIMENT = Experiment(CloudResult, _run, cloud_tables, recipe="cloud")

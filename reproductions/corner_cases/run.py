@@ -217,4 +217,4 @@ def _run(out: Path, options: Options) -> Outcome[CornerCaseResult]:
     return Outcome(results, {"arms.png": draw_corner_cases(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(CornerCaseResult, _run, corner_case_tables, seeds=8)
+EXPERIMENT = Experiment(CornerCaseResult, _run, corner_case_tables, seeds=8, recipe="corner_cases")

@@ -362,4 +362,4 @@ def _run(out: Path, options: Options) -> Outcome[ArmsResult]:
     return Outcome(results, {"arms.png": draw_arms(results)}, describe_arms(results.summary))
 
 
-EXPERIMENT = Experiment(ArmsResult, _run, tables, seeds=5)
+EXPERIMENT = Experiment(ArmsResult, _run, tables, seeds=5, recipe="arms")

@@ -157,4 +157,4 @@ def _run(out: Path, options: Options) -> Outcome[DistillationResult]:
     return Outcome(results, {"arms.png": draw_labels(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(DistillationResult, _run, tables)
+EXPERIMENT = Experiment(DistillationResult, _run, tables, recipe="distillation")

@@ -313,4 +313,4 @@ def _run(out: Path, options: Options) -> Outcome[GapResult]:
     return Outcome(results, pictures, results.sentences())
 
 
-EXPERIMENT = Experiment(GapResult, _run, gap_tables)
+EXPERIMENT = Experiment(GapResult, _run, gap_tables, recipe="gap")

@@ -196,4 +196,4 @@ def _run(out: Path, options: Options) -> Outcome[LifelongResult]:
     return Outcome(results, {"lifelong.png": draw_lifelong(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(LifelongResult, _run, lifelong_tables, seeds=5)
+EXPERIMENT = Experiment(LifelongResult, _run, lifelong_tables, seeds=5, recipe="lifelong")

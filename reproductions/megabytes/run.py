@@ -247,4 +247,4 @@ def _run(out: Path, options: Options) -> Outcome[MegabytesResult]:
     return Outcome(results, {"megabytes.png": draw_megabytes(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(MegabytesResult, _run, megabytes_tables)
+EXPERIMENT = Experiment(MegabytesResult, _run, megabytes_tables, recipe="megabytes")

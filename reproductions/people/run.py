@@ -131,4 +131,4 @@ def draw_people(results: PeopleResult) -> bytes:
     return style.png(figures.arms(ap50))
 
 
-EXPERIMENT = Experiment(PeopleResult, _run, tabulate_classes, seeds=3)
+EXPERIMENT = Experiment(PeopleResult, _run, tabulate_classes, seeds=3, recipe="people")

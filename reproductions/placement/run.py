@@ -449,4 +449,4 @@ def _run(out: Path, options: Options) -> Outcome[PlacementProof]:
     return Outcome(results, draw_proof(results), sentences)
 
 
-EXPERIMENT = Experiment(PlacementProof, _run, tables, seeds=8)
+EXPERIMENT = Experiment(PlacementProof, _run, tables, seeds=8, recipe="placement")

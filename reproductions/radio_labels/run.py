@@ -122,4 +122,4 @@ def draw_labels(results: RadioLabelsResult) -> bytes:
     return style.png(figures.arms({TOWN: {name: results.ap50[name] for name in ARMS}}))
 
 
-EXPERIMENT = Experiment(RadioLabelsResult, _run, tabulate_labels, seeds=5)
+EXPERIMENT = Experiment(RadioLabelsResult, _run, tabulate_labels, seeds=5, recipe="radio_labels")

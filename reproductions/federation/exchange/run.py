@@ -456,4 +456,4 @@ def run_exchange(name: str, out: Path, options: Options) -> Outcome[ExchangeResu
     return Outcome(results, {"exchange.png": draw_results(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(ExchangeResult, partial(run_exchange, "exchange"), tables, seeds=8)
+EXPERIMENT = Experiment(ExchangeResult, partial(run_exchange, "exchange"), tables, seeds=8, recipe="exchange")

@@ -91,14 +91,45 @@ class Experiment(Generic[Results]):
     tables: Callable[[Results], Mapping[str, str]]
     seeds: int = 3  # without `--seeds`
     takes: tuple[str, ...] = STUDY  # supported options, of `OPTIONS`
+    recipe: str | None = (
+        None  # name of the package's recipe of runs that `results` have as their `recipe`, as committed
+    )
 
     def encode(self, results: Results) -> Json:
         """Return results as a JSON value."""
         return to_json(results, self.results)
 
     def tabulate(self, values: Json, origin: str) -> Mapping[str, str]:
-        """Return the tables of encoded results, by name; raises `InputError`, naming `origin`, for invalid ones."""
+        """Return the tables of encoded results, by name.
+
+        Raises `InputError`, naming `origin`, for invalid ones, and for those of another recipe.
+        """
+        if self.recipe is not None:
+            check_recipe(values, self.recipe, origin)
         return self.tables(from_json(self.results, values, origin))
+
+
+def check_recipe(values: Json, name: str, origin: str) -> None:
+    """Raise `InputError` where results are of other settings than the package's recipe `runs/NAME` states.
+
+    Fields that the recipe leaves to their defaults are not compared: results keep those of their day.
+    """
+    recipe = load_run_recipe(recipe_path(f"runs/{name}"))
+    stated = recipe.model_dump(mode="json", exclude={"seed"}, exclude_unset=True)
+    held = values.get("recipe") if isinstance(values, Mapping) else None
+    if (differs := _find_difference(stated, held, "")) is not None:
+        raise InputError(f"{origin}: of another recipe than recipes/runs/{name}.yaml, which has {differs}")
+
+
+def _find_difference(stated: Json, held: Json, field: str) -> str | None:
+    """Return the first stated field that is not held with the same value, in words; None where all are."""
+    if not isinstance(stated, Mapping):
+        return None if stated == held else f"{field.removeprefix('.')}: {stated}, and not {held}"
+    for name, value in stated.items():
+        inside = held.get(name) if isinstance(held, Mapping) else None
+        if (differs := _find_difference(value, inside, f"{field}.{name}")) is not None:
+            return differs
+    return None
 
 
 def load_experiment(name: str) -> Experiment:

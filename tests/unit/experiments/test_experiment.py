@@ -89,3 +89,19 @@ def test_each_experiment_of_the_checkout_is_found_by_its_folder_and_by_its_name(
     assert len(folders) == len(list_experiments()) > 30
     found = load_experiment(str(root / "federation" / "groups"))
     assert found is load_experiment("federation-groups")
+
+
+def test_results_of_another_recipe_are_refused_by_its_name() -> None:
+    experiment = load_experiment("gap")
+    path = list_experiments()["gap"] / "result.json"
+    held = json.loads(path.read_text())
+    assert "differences" in experiment.tabulate(held, "result.json")
+    steps = held["recipe"]["training"]["steps"]
+    held["recipe"]["training"]["steps"] = 7
+    with pytest.raises(
+        InputError, match=rf"result\.json: of another recipe than recipes/runs/gap\.yaml, .*{steps}, and not 7"
+    ):
+        experiment.tabulate(held, "result.json")
+    del held["recipe"]
+    with pytest.raises(InputError, match="of another recipe than recipes/runs/gap"):
+        experiment.tabulate(held, "result.json")
