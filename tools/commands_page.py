@@ -194,9 +194,11 @@ def output_of(line: str, folder: Path) -> str:
 
 
 def shorten(lines: list[str]) -> list[str]:
-    """Return the first and last lines of an output of more than HEAD + TAIL + 1, and between them how many are left out."""
-    left = len(lines) - HEAD - TAIL
-    return lines if left <= 1 else [*lines[:HEAD], f"[{left} more lines]", *lines[-TAIL:]]
+    """Return the first and last lines of a long output, and between them how many are left out; no end of a table."""
+    if len(lines) <= HEAD + TAIL + 1:
+        return lines
+    last = [line for line in lines[-TAIL:] if not line.startswith(("│", "└"))]
+    return [*lines[:HEAD], f"[{len(lines) - HEAD - len(last)} more lines]", *last]
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ THREADS = typer.Option(
 AGENTS = typer.Option(
     None,
     "--agents",
-    help="Whose frames: vehicles, poles, all, or names with commas between them; by default those whose sensors stand as "
-    "the network expects (docs/tasks.md).",
+    help="Whose frames: vehicles, poles, all, or names with commas between them; by default those whose sensors stand "
+    "as the network expects (docs/tasks.md).",
 )
 AROUND = typer.Option(
     False,
@@ -91,8 +91,8 @@ ENGINE = typer.Option(EngineName.processes, "--engine", help="Backend: processes
 STALE = typer.Option(
     Stale.refuse,
     "--stale",
-    help="Steps that were done by other code or settings, and those built on them: refuse the folder, redo these steps, "
-    "or keep those of other code.",
+    help="Steps that were done by other code or settings, and those built on them: refuse the folder, redo these "
+    "steps, or keep those of other code.",
 )
 
 
