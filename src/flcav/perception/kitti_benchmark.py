@@ -33,8 +33,9 @@ from flcav.perception.errors import THRESHOLD
 from flcav.perception.images import kitti_view
 from flcav.perception.metrics.detection import interval_words
 from flcav.perception.metrics.operating_point import FoundAtDistance, describe_counts
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.evaluate import Score, count_objects, score_detections
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_moved
 from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import FrameTruth, level_mount

@@ -17,7 +17,6 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.perception.agents import frame_reader
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import (
     FoundCars,
@@ -34,7 +33,9 @@ from flcav.perception.metrics import (
 )
 from flcav.perception.metrics.operating_point import DISTANCES_M, FoundAtDistance, count_by_distance, describe_counts
 from flcav.perception.metrics.tracks import TracksEvaluation
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.modalities import frames_beside
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import OVERLAP, Reliability, detect_frames
 from flcav.perception.objects.truth import (
     QUARTERS,
@@ -315,7 +316,7 @@ class ObjectsOutcomes:
         asked: the classes and the range that count, see `detect_frames`; None: the network's. Raises `InputError`
         where there are no frames, or one has no LiDAR.
         """
-        read = frame_reader(data, network.config.foreground)
+        read = frames_beside(data, network.config, frames)
         found, truths = detect_frames(network, map(read, frames), asked, total=len(frames), progress=progress)
         classes = (asked or network.config).classes
         if not truths:
