@@ -49,6 +49,7 @@ from flcav.perception.objects.samples import (
     unpack_sample,
 )
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range, target_criteria
+from flcav.perception.objects.velocities import measure_velocities
 from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, KnownLidar, Practice
 from flcav.sensors.frame import Frame
@@ -264,6 +265,7 @@ class ObjectsTask(ObjectsOutcomes):
             counts=count_objects(found, truths, classes),
             slices=break_down(found, truths, classes),
             trust=measure_reliability(found, truths, classes),
+            velocities=measure_velocities(found, truths, classes) or None,
         )
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:

@@ -246,12 +246,13 @@ class TargetCriteria:
     min_returns: int  # LiDAR returns from it
     confidence: float  # in (0, 1)
     around: Annotated[bool | None, LEFT_OUT] = None  # whether the range also extends to the sides and behind
+    echoes: Annotated[bool | None, LEFT_OUT] = None  # whether a radar's echoes count as returns
 
     def lines(self) -> list[str]:
         """Return the criteria in words: a line on targets, a line on intervals."""
         return [
             f"targets: centre {_extent(self.range_m, around=bool(self.around))}, "
-            f"{self.min_returns} LiDAR returns or more; "
+            f"{self.min_returns} LiDAR returns{' and radar echoes' if self.echoes else ''} or more; "
             "others are neutral, and so are trucks and buses beside cars",
             f"intervals: {100 * self.confidence:g} %, over scenes",
         ]
@@ -259,7 +260,9 @@ class TargetCriteria:
 
 def target_criteria(config: SecondConfig) -> TargetCriteria:
     """Return the target criteria of an evaluation of a network of `config`."""
-    return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE, config.around or None)
+    return TargetCriteria(
+        tuple(config.range_m), MIN_RETURNS, CONFIDENCE, config.around or None, config.beside == "radar" or None
+    )
 
 
 def _extent(range_m: tuple[float, ...], *, around: bool = False) -> str:
