@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from flcav.config import Json
+from flcav.config import InputError, Json
 from flcav.experiments.comparison import average_arms, mean_difference, tabulate_verdicts
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.experiments.study import record_split
@@ -70,15 +70,16 @@ TESTS: Mapping[str, Mapping[str, Json]] = {
         **COMMON,
         "town": "suburb",
         "seed": 171 + i,
+        "scenes": 10,
         "spins_per_scene": 4,
         "split": "test",
         "weather": {"classes": [condition]},
     }
     for i, condition in enumerate(CONDITIONS)
 }
-SCENES = 2  # of each test recording, for a seed
+MOST_SEEDS, SCENES = 5, 2  # seeds, and scenes of each test recording for each of them
 STEPS = 400  # of each training, of two samples
-PLANNED = 2  # seeds, the first ones, with trainings for the plan
+PLANNED = 1  # seeds, the first ones, with trainings for the plan
 LITTLE_MB, SOME_MB = 45.0, 90.0  # uploads that the curves begin with, and those of the plan's budget
 ALONE, MUCH = "all", None  # every sample of the recordings
 Training = tuple[str, float | None, bool]  # arm, megabytes of samples, whether annotators are quick
@@ -100,7 +101,7 @@ class SeedOfModalities:
 
     tests: Mapping[str, Tested]  # by arm
     trained: Mapping[str, Trained]  # by network and megabytes
-    validated: Mapping[str, float]  # AP50 on the validation frames, likewise
+    validated: Mapping[str, float]  # AP50 on the validation frames, likewise; of the first `PLANNED` seeds
 
 
 @dataclass(frozen=True)
@@ -124,42 +125,47 @@ class ModalitiesResult(Record):
 
 
 def list_steps(seeds: Sequence[int], quick: bool) -> list[Step]:
-    """Return the steps: recordings, trainings, their validation, and the tests of each seed."""
+    """Return the steps: recordings, trainings, their validation, and the tests of each seed.
+
+    Raises `InputError` for more seeds than have test scenes of their own.
+    """
+    if len(seeds) > MOST_SEEDS:
+        raise InputError(f"modalities: {len(seeds)} seeds, and {MOST_SEEDS} at most have test scenes of their own")
     few: Mapping[str, Json] = {"scenes": 4, "spins_per_scene": 1} if quick else {}
     mixed: Mapping[str, Json] = {"weather": {"classes": [*CONDITIONS]}}
     recordings = {name: {**fields, **mixed, **few} for name, fields in {**TRAIN, **VALIDATION}.items()}
-    recordings |= {name: {**fields, "scenes": SCENES * len(seeds)} for name, fields in TESTS.items()}
+    recordings |= TESTS
     steps = [Step(name, record_split, {"recipe": fields}) for name, fields in recordings.items()]
-    trainings = [(seed, training) for seed in seeds for training in list_trainings(seed)]
-    order = [*NETWORKS]
-    trainings.sort(key=lambda each: (each[1][1:] != (MUCH, False), order.index(each[1][0])))
-    for seed, training in trainings:
-        steps += _train(seed, training, quick)
-    for place, seed in enumerate(seeds):
+    for seed in seeds:
+        full, *_ = list_trainings(seed)
+        steps += [_train(seed, training, quick) for training in full]
         trained = {arm: name_step(seed, arm, MUCH, False) for arm in NETWORKS}
-        asked = {"trained": trained, "tests": [*TESTS], "scenes": [SCENES * place, SCENES * (place + 1)]}
+        asked = {"trained": trained, "tests": [*TESTS], "scenes": [SCENES * (seed - 1), SCENES * seed]}
         needs = (*trained.values(), *TESTS, *VALIDATION)
         steps.append(Step(f"tested-{seed}", test_arms, {**asked, "validate_on": [*VALIDATION]}, needs))
+    for seed in seeds[:PLANNED]:
+        full, less = list_trainings(seed)
+        steps += [_train(seed, training, quick) for training in less]
+        for training in (*full, *less):
+            name = name_step(seed, *training)
+            validate = {"trained": name, "validate_on": [*VALIDATION]}
+            steps.append(Step(f"{name}-validated", validate_arm, validate, (name, *VALIDATION)))
     return steps
 
 
-def _train(seed: int, training: Training, quick: bool) -> list[Step]:
-    """Return the steps of a training and of its validation."""
+def _train(seed: int, training: Training, quick: bool) -> Step:
+    """Return the step of a training."""
     (arm, mb, careless), name = training, name_step(seed, *training)
     sent_mb = mb / 20 if quick and mb is not None else mb
     asked = {"arm": arm, "mb": sent_mb, "quick": careless, "seed": seed, "steps": 4 if quick else STEPS}
-    validate = {"trained": name, "validate_on": [*VALIDATION]}
-    return [
-        Step(name, train_arm, {**asked, "train_on": [*TRAIN]}, (*TRAIN,)),
-        Step(f"{name}-validated", validate_arm, validate, (name, *VALIDATION)),
-    ]
+    return Step(name, train_arm, {**asked, "train_on": [*TRAIN]}, (*TRAIN,))
 
 
-def list_trainings(seed: int) -> list[Training]:
-    """Return the trainings of a seed."""
+def list_trainings(seed: int) -> tuple[list[Training], list[Training]]:
+    """Return the trainings of a seed: on all samples, and those for the plan."""
     full: list[Training] = [(arm, MUCH, False) for arm in NETWORKS]
     less: list[Training] = [(arm, mb, False) for mb in (LITTLE_MB, SOME_MB) for arm in NETWORKS]
-    return [*full, *less, (LIDAR, MUCH, True)] if seed <= PLANNED else full
+    return full, [*less, (LIDAR, MUCH, True)] if seed <= PLANNED else []
 
 
 def name_training(arm: str, mb: float | None, careless: bool) -> str:
@@ -176,11 +182,11 @@ def compare(values: Mapping[str, Any], seeds: Sequence[int]) -> ModalitiesResult
     """Return the results, of the values of the steps."""
     found: dict[str, SeedOfModalities] = {}
     for seed in seeds:
-        steps = {name_training(*each): name_step(seed, *each) for each in list_trainings(seed)}
+        steps = {name_training(*each): name_step(seed, *each) for part in list_trainings(seed) for each in part}
         found[str(seed)] = SeedOfModalities(
             {arm: Tested(**each) for arm, each in values[f"tested-{seed}"].items()},
             {name: Trained(**values[step]) for name, step in steps.items()},
-            {name: values[f"{step}-validated"] for name, step in steps.items()},
+            {name: values[each] for name, step in steps.items() if (each := f"{step}-validated") in values},
         )
     tests = {seed: each.tests for seed, each in found.items()}
 
@@ -218,7 +224,7 @@ def _choices(seeds: Mapping[str, SeedOfModalities]) -> dict[str, Choice]:
     """Return what the plan knows of every network, means over seeds, and what the retraining reached."""
 
     def mean(name: str, of: str, field: str = "") -> float:
-        rows = [getattr(seed, of)[name] for seed in seeds.values() if name in seed.trained]
+        rows = [getattr(seed, of)[name] for seed in seeds.values() if name in seed.validated]
         return float(np.mean([getattr(row, field) if field else row for row in rows]))
 
     choices = {}

@@ -38,20 +38,20 @@ SENSOR = {"radar": "radar", "painted": "camera"}
 def frames_beside(data: Dataset, config: SecondConfig, numbers: Sequence[int]) -> Callable[[int], Frame]:
     """Return the function that reads a frame as a network of `config` sees it, see `frame_reader`.
 
-    Raises `InputError` where none of the frames `numbers` has the network's second modality, or where a sensor of it
-    triggers more than `SPIN_MS` from the LiDAR. Frames that lack it, as those of a vehicle without that sensor, are
-    seen as if it had failed.
+    Raises `InputError` where no frame of the dataset has the network's second modality, or where a sensor of it
+    triggers more than `SPIN_MS` from the LiDAR in one of `numbers`. Frames that lack it, as those of a vehicle without
+    that sensor, are seen as if it had failed.
     """
     if config.beside:
         sensors_of = data.radars if config.beside == "radar" else data.cameras
-        if len(numbers) and not any(sensors_of(number) for number in numbers):
+        if not any(sensors_of(number) for number in range(len(data))):
             kind = SENSOR[config.beside]
             raise InputError(f"{data.folder}: no {kind} in its frames, which the network reads beside the LiDAR")
         for agent, number in {data.keys[number].agent: number for number in numbers}.items():
             triggers = data.calibrations[agent].assumed.offset_ms
             spin_ms = max((triggers.get(lidar, 0.0) for lidar in data.lidars(number)[:1]), default=0.0)
             for sensor in sensors_of(number):
-                if (away_ms := triggers.get(sensor, 0.0) - spin_ms) and not abs(away_ms) <= SPIN_MS:
+                if not abs(away_ms := triggers.get(sensor, 0.0) - spin_ms) <= SPIN_MS:
                     raise InputError(
                         f"{data.folder}: clocks disagree: {agent}'s '{sensor}' is {away_ms:g} ms after its LiDAR, "
                         f"and a spin takes {SPIN_MS:g} ms"
