@@ -36,7 +36,7 @@ EPOCHS, SEED = 30, 0
 
 def main() -> None:
     """Record, train, test, and write the weights."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(description="train the network that paints points")
     parser.add_argument("--out", type=Path, required=True, help="folder of the recordings and of the weights")
     out = parser.parse_args().out
     torch.set_num_threads(1)

@@ -79,7 +79,6 @@ TESTS: Mapping[str, Mapping[str, Json]] = {
 }
 MOST_SEEDS, SCENES = 5, 2  # seeds, and scenes of each test recording for each of them
 STEPS = 400  # of each training, of two samples
-PLANNED = 1  # seeds, the first ones, with trainings for the plan
 LITTLE_MB, SOME_MB = 45.0, 90.0  # uploads that the curves begin with, and those of the plan's budget
 ALONE, MUCH = "all", None  # every sample of the recordings
 Training = tuple[str, float | None, bool]  # arm, megabytes of samples, whether annotators are quick
@@ -101,7 +100,7 @@ class SeedOfModalities:
 
     tests: Mapping[str, Tested]  # by arm
     trained: Mapping[str, Trained]  # by network and megabytes
-    validated: Mapping[str, float]  # AP50 on the validation frames, likewise; of the first `PLANNED` seeds
+    validated: Mapping[str, float]  # AP50 on the validation frames, likewise
 
 
 @dataclass(frozen=True)
@@ -133,18 +132,20 @@ def list_steps(seeds: Sequence[int], quick: bool) -> list[Step]:
         raise InputError(f"modalities: {len(seeds)} seeds, and {MOST_SEEDS} at most have test scenes of their own")
     few: Mapping[str, Json] = {"scenes": 4, "spins_per_scene": 1} if quick else {}
     mixed: Mapping[str, Json] = {"weather": {"classes": [*CONDITIONS]}}
-    recordings = {name: {**fields, **mixed, **few} for name, fields in {**TRAIN, **VALIDATION}.items()}
-    recordings |= TESTS
+    recordings: dict[str, Mapping[str, Json]] = {
+        **{name: {**fields, **mixed, **few} for name, fields in {**TRAIN, **VALIDATION}.items()},
+        **TESTS,
+    }
     steps = [Step(name, record_split, {"recipe": fields}) for name, fields in recordings.items()]
     for seed in seeds:
-        full, *_ = list_trainings(seed)
+        full, _ = list_trainings()
         steps += [_train(seed, training, quick) for training in full]
         trained = {arm: name_step(seed, arm, MUCH, False) for arm in NETWORKS}
         asked = {"trained": trained, "tests": [*TESTS], "scenes": [SCENES * (seed - 1), SCENES * seed]}
         needs = (*trained.values(), *TESTS, *VALIDATION)
         steps.append(Step(f"tested-{seed}", test_arms, {**asked, "validate_on": [*VALIDATION]}, needs))
-    for seed in seeds[:PLANNED]:
-        full, less = list_trainings(seed)
+    for seed in seeds:
+        full, less = list_trainings()
         steps += [_train(seed, training, quick) for training in less]
         for training in (*full, *less):
             name = name_step(seed, *training)
@@ -161,11 +162,11 @@ def _train(seed: int, training: Training, quick: bool) -> Step:
     return Step(name, train_arm, {**asked, "train_on": [*TRAIN]}, (*TRAIN,))
 
 
-def list_trainings(seed: int) -> tuple[list[Training], list[Training]]:
-    """Return the trainings of a seed: on all samples, and those for the plan."""
+def list_trainings() -> tuple[list[Training], list[Training]]:
+    """Return the trainings of every seed: on all samples, and those for the plan."""
     full: list[Training] = [(arm, MUCH, False) for arm in NETWORKS]
     less: list[Training] = [(arm, mb, False) for mb in (LITTLE_MB, SOME_MB) for arm in NETWORKS]
-    return full, [*less, (LIDAR, MUCH, True)] if seed <= PLANNED else []
+    return full, [*less, (LIDAR, MUCH, True)]
 
 
 def name_training(arm: str, mb: float | None, careless: bool) -> str:
@@ -182,11 +183,11 @@ def compare(values: Mapping[str, Any], seeds: Sequence[int]) -> ModalitiesResult
     """Return the results, of the values of the steps."""
     found: dict[str, SeedOfModalities] = {}
     for seed in seeds:
-        steps = {name_training(*each): name_step(seed, *each) for part in list_trainings(seed) for each in part}
+        steps = {name_training(*each): name_step(seed, *each) for part in list_trainings() for each in part}
         found[str(seed)] = SeedOfModalities(
             {arm: Tested(**each) for arm, each in values[f"tested-{seed}"].items()},
             {name: Trained(**values[step]) for name, step in steps.items()},
-            {name: values[each] for name, step in steps.items() if (each := f"{step}-validated") in values},
+            {name: values[f"{step}-validated"] for name, step in steps.items()},
         )
     tests = {seed: each.tests for seed, each in found.items()}
 
@@ -224,19 +225,19 @@ def _choices(seeds: Mapping[str, SeedOfModalities]) -> dict[str, Choice]:
     """Return what the plan knows of every network, means over seeds, and what the retraining reached."""
 
     def mean(name: str, of: str, field: str = "") -> float:
-        rows = [getattr(seed, of)[name] for seed in seeds.values() if name in seed.validated]
+        rows = [getattr(seed, of)[name] for seed in seeds.values()]
         return float(np.mean([getattr(row, field) if field else row for row in rows]))
 
     choices = {}
     for arm in NETWORKS:
         little, some, much = (name_training(arm, mb, False) for mb in (LITTLE_MB, SOME_MB, MUCH))
-        measured = [(mean(name, "trained", "samples"), 1 - mean(name, "validated")) for name in (little, much)]
+        few, all_ = ((mean(name, "trained", "samples"), 1 - mean(name, "validated")) for name in (little, much))
         careless = name_training(arm, MUCH, True)
         choices[arm] = Choice(
             sample_mb=mean(much, "trained", "sample_mb"),
-            measured=tuple(measured),
+            measured=(few, all_),
             retrained=1 - mean(some, "validated"),
-            quick=1 - mean(careless, "validated") if careless in next(iter(seeds.values())).validated else None,
+            quick=1 - mean(careless, "validated") if arm == LIDAR else None,
         )
     return choices
 

@@ -74,7 +74,7 @@ def test_a_limit_of_annotation_chooses_the_way_and_the_samples() -> None:
 
 @pytest.mark.parametrize("model", ["effective", "additive"])
 def test_both_choices_together_are_the_best_of_all_plans(model: str) -> None:
-    values = one_task(annotations=WAYS, boxes=2.0) | {"annotation_s": 500.0}
+    values: dict[str, Any] = one_task(annotations=WAYS, boxes=2.0) | {"annotation_s": 500.0}
     if model == "effective":
         curve = {"model": "effective", "floor": 0.1, "a": 1.0, "b": 0.5, "alpha": 0.8, "beta": 0.5, "group_samples": 9}
         values["tasks"][0] |= {"curve": curve, "alternatives": []}

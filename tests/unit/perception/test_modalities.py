@@ -54,11 +54,11 @@ def test_the_own_velocity_is_that_by_which_most_echoes_stand(velocity: tuple[flo
     assert (estimate_velocity(*(each[:5] for each in echoes_of(true))) == 0).all()
 
 
-def with_radar(echoes: np.ndarray, objects: tuple = (("a", "car", 20.0, 4.0, 0),)) -> Frame:
+def with_radar(echoes: np.ndarray) -> Frame:
     """Return a frame with a radar .5 m above the ground, 2 m ahead of the origin and turned to the left by .5 rad."""
-    plain = frame([*objects], points=np.array([[5.0, 0, -1.8, 0.4]], np.float32))
+    plain = frame([("a", "car", 20.0, 4.0, 0)], points=np.array([[5.0, 0, -1.8, 0.4]], np.float32))
     mounts = Calibration({**plain.assumed.agent_from_sensor, "radar": pose(2, 0, 0.5, 0.5)})
-    annotations = replace(plain.annotations, points={"radar": np.full(len(objects), 6)})
+    annotations = replace(plain.annotations, points={"radar": np.array([6])})
     return replace(
         plain, calibration=mounts, assumed=mounts, radar={"radar": echoes.astype(np.float32)}, annotations=annotations
     )
@@ -75,7 +75,7 @@ def test_echoes_are_where_they_are_with_their_speed_over_ground() -> None:
     assert np.abs(made[1:, 4]).max() < 0.3
     cloud = read_cloud(with_radar(values), RADAR)
     assert cloud.shape == (1 + len(rate), 6)
-    np.testing.assert_array_equal(cloud[0], np.float32([5, 0, -1.8, 0.4, 0, 0]))
+    np.testing.assert_array_equal(cloud[0], np.array([5, 0, -1.8, 0.4, 0, 0], np.float32))
 
 
 def test_an_echo_counts_as_a_return_of_a_network_that_reads_the_radar() -> None:
@@ -88,8 +88,8 @@ def test_means_of_pillars_are_those_of_a_loop() -> None:
     rng = np.random.default_rng(1)
     points = rng.uniform((0, -2, -2, 0), (4, 2, 0, 1), (60, 4)).astype(np.float32)
     values, sample = rng.normal(size=(60, 2)).astype(np.float32), rng.integers(0, 2, 60)
-    grid = (0, -2, -3, 4, 2, 1), (1, 2)
-    found = pillar_means(*map(torch.from_numpy, (points, values, sample)), 2, *grid).numpy()
+    tensors = [torch.from_numpy(each) for each in (points, values, sample)]
+    found = pillar_means(tensors[0], tensors[1], tensors[2], 2, (0, -2, -3, 4, 2, 1), (1, 2)).numpy()
     for number in range(2):
         for row in range(2):
             for column in range(4):
@@ -248,9 +248,9 @@ def test_late_fusion_takes_speeds_from_echoes_and_scores_by_them() -> None:
     fused = fuse_late(found, cloud, LateFusion((1.0, 2.0), (1.0, -1.0)))
     assert fused.speed is not None
     np.testing.assert_allclose(fused.speed, [6, -5, 0], atol=1e-3)  # the third is across the line of sight
-    np.testing.assert_allclose(fused.score, 1 / (1 + np.exp(-2.0)))  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(np.asarray(fused.score), 1 / (1 + np.exp(-2.0)))
     unseen = fuse_late(found, cloud[3:], LateFusion((1.0, 2.0), (1.0, -1.0)))
-    np.testing.assert_allclose(unseen.score, 1 / (1 + np.exp(1.0)))  # pyright: ignore[reportArgumentType]
+    np.testing.assert_allclose(np.asarray(unseen.score), 1 / (1 + np.exp(1.0)))
     truth = FrameTruth("s", found[:1], Boxes.empty(), Boxes.empty())
     fitted = fit_late_fusion([found] * 20, [cloud[[0, 3]]] * 20, [truth] * 20, "Car")
     assert fitted.seen == (1.0, 0.0)  # all with an echo are right

@@ -11,6 +11,7 @@ al., "Instantaneous ego-motion estimation using Doppler radar", ITSC 2013).
 """
 
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -57,6 +58,13 @@ def frames_beside(data: Dataset, config: SecondConfig, numbers: Sequence[int]) -
                         f"and a spin takes {SPIN_MS:g} ms"
                     )
     return frame_reader(data, config.foreground)
+
+
+def refuse_files(config: SecondConfig, origin: Path) -> None:
+    """Raise `InputError` for a network that reads a second modality, which point clouds of files do not have."""
+    if config.beside:
+        sensor = SENSOR[config.beside]
+        raise InputError(f"{origin}: no {sensor} beside the points, which the network reads; give a dataset")
 
 
 def read_cloud(frame: Frame, config: SecondConfig, lidar: str | None = None) -> Array32:

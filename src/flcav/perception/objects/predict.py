@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from flcav.arrays import Array, Array32
-from flcav.config import InputError
 from flcav.dataset.formats.sweeps import list_cloud_files, read_cloud_file
 from flcav.dataset.layout import MANIFEST
 from flcav.dataset.store import Dataset
@@ -32,7 +31,7 @@ from flcav.perception.metrics import calibration_error, fit_logistic, match, rou
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.loss import anchor_boxes, anchor_classes, decode_residuals, decode_variance
-from flcav.perception.objects.modalities import SENSOR, frames_beside, read_cloud, widen
+from flcav.perception.objects.modalities import frames_beside, read_cloud, refuse_files, widen
 from flcav.perception.objects.model import LOG_VARIANCES, SPEED_M_S, HeadOutput, Second
 from flcav.perception.objects.samples import move_points, validate_points
 from flcav.perception.objects.truth import (
@@ -319,10 +318,7 @@ def read_point_clouds(
     """
     if (path / MANIFEST).is_file():
         return _recorded(path, frames, config)
-    if config.beside:
-        raise InputError(
-            f"{path}: no {SENSOR[config.beside]} beside the points, which the network reads; give a dataset"
-        )
+    refuse_files(config, path)
     move = None if mount is None else level_mount(mount, config)
     return (
         InputCloud(file, validate_points(read_cloud_file(file), file), move, partial(view_beside, file))

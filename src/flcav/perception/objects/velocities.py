@@ -110,8 +110,8 @@ def fuse_late(boxes: Boxes, cloud: Array32, fusion: LateFusion) -> Boxes:
     Boxes without an echo, or across the line of sight, keep their speed.
     """
     inside = find_echoes(boxes, cloud)
-    seen = inside.any(1)
-    factor, summand = np.where(seen[:, None], fusion.seen, fusion.unseen).T
+    seen = inside.any(axis=1)
+    factor, summand = np.where(np.expand_dims(seen, 1), fusion.seen, fusion.unseen).T
     assert boxes.score is not None
     score = expit(factor * logit(np.clip(boxes.score, 1e-7, 1 - 1e-7)) + summand)
     ahead = boxes.center[:, :2] / np.linalg.norm(boxes.center[:, :2], axis=1, keepdims=True)
