@@ -45,6 +45,7 @@ from flcav.perception.objects.truth import (
     select_class,
     select_sides,
 )
+from flcav.perception.objects.velocities import take_speeds
 from flcav.perception.ops.boxes import nms
 from flcav.perception.ops.sparse import SparseTensor
 from flcav.perception.task import Finding, Result
@@ -184,7 +185,11 @@ def _detect_ahead(network: Second, clouds: Sequence[Array32], score_threshold: f
             if output.speed is not None:
                 speed = (output.speed[..., 0].double() * SPEED_M_S).cpu().numpy()
             parts = zip(score, box, direction, spread, speed, strict=True)
-            found += [_decode_boxes(network, *one, score_threshold) for one in parts]
+            decoded = [_decode_boxes(network, *one, score_threshold) for one in parts]
+            if network.config.beside == "radar":
+                seen = (widen(cloud, network.config.columns) for cloud in clouds[first : first + batch])
+                decoded = [take_speeds(boxes, cloud) for boxes, cloud in zip(decoded, seen, strict=True)]
+            found += decoded
     return found
 
 

@@ -1,8 +1,8 @@
-"""Velocities of detected objects: their errors, and late fusion, which takes them from a radar's echoes.
+"""Velocities of detected objects: their errors, by a radar's echoes, and late fusion.
 
-The velocity of a box is its speed along its heading. Late fusion leaves the network that reads the LiDAR alone as it
-is: a box gets the speed whose part along the line of sight is the median range rate of the echoes in it, and a score
-that is calibrated separately for boxes with and without echoes.
+The velocity of a box is its speed along its heading. Where there are echoes in a box, their median range rate is the
+part of it along the line of sight. Late fusion leaves the network that reads the LiDAR alone as it is: a box gets such
+a speed, and a score that is calibrated separately for boxes with and without echoes.
 """
 
 from collections.abc import Sequence
@@ -109,17 +109,26 @@ def fuse_late(boxes: Boxes, cloud: Array32, fusion: LateFusion) -> Boxes:
 
     Boxes without an echo, or across the line of sight, keep their speed.
     """
-    inside = find_echoes(boxes, cloud)
-    seen = inside.any(axis=1)
+    seen = find_echoes(boxes, cloud).any(axis=1)
     factor, summand = np.where(np.expand_dims(seen, 1), fusion.seen, fusion.unseen).T
     assert boxes.score is not None
     score = expit(factor * logit(np.clip(boxes.score, 1e-7, 1 - 1e-7)) + summand)
+    return replace(take_speeds(boxes, cloud), score=score)
+
+
+def take_speeds(boxes: Boxes, cloud: Array32) -> Boxes:
+    """Return the boxes (LiDAR frame) with the speeds whose part along the line of sight is the echoes' range rate.
+
+    It is the median of the echoes in a box, of a cloud (N, 6). Boxes without an echo, or across the line of sight, keep
+    their speed.
+    """
+    inside = find_echoes(boxes, cloud)
     ahead = boxes.center[:, :2] / np.linalg.norm(boxes.center[:, :2], axis=1, keepdims=True)
     along = (ahead * heading_vectors(boxes.yaw)).sum(1)
     speed = np.full(len(boxes), np.nan) if boxes.speed is None else boxes.speed.copy()
-    for row in np.flatnonzero(seen & (np.abs(along) >= ALONG)):
+    for row in np.flatnonzero(inside.any(axis=1) & (np.abs(along) >= ALONG)):
         speed[row] = np.median(cloud[inside[row], 4]) / along[row]
-    return replace(boxes, score=score, speed=speed)
+    return replace(boxes, speed=speed)
 
 
 def find_echoes(boxes: Boxes, cloud: Array32) -> Mask:
