@@ -22,10 +22,12 @@ from flcav.perception.objects.samples import Sample, compress_sample, pack_sampl
 from flcav.perception.objects.truth import FrameTruth, ground_truth
 from flcav.perception.objects.velocities import (
     LateFusion,
+    find_echoes,
     fit_late_fusion,
     fuse_late,
     list_velocity_errors,
     measure_velocities,
+    take_speeds,
 )
 from flcav.perception.ops.grids import pillar_means
 from flcav.perception.road.model import STRIDE
@@ -169,6 +171,9 @@ def test_a_sensor_that_fails_looks_like_a_sweep_alone(kind: str) -> None:
     assert torch.equal(seen[:, :statistics], alone[:, :statistics])  # pyright: ignore[reportIndexIssue]
     (found,) = detect_all(network, [cloud], score_threshold=0.0)
     assert found.speed is not None
+    if kind == "radar":  # echoes in a box tell its speed
+        assert find_echoes(found, cloud).any()
+        np.testing.assert_array_equal(np.asarray(take_speeds(found, cloud).speed), found.speed)
     drawn = augment(
         Sample(cloud, Boxes.empty()), Augmentation(turn_rad=0, scale=0, blind=0.99), np.random.default_rng(0)
     )
