@@ -8,7 +8,7 @@ trained within fewer megabytes of uploads, for the plan that chooses between the
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -41,7 +41,7 @@ from flcav.runs.engine import Notify, Step, run_steps
 from flcav.runs.provenance import Provenance, provenance
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.storage.markdown import format_table
-from flcav.storage.records import Record
+from flcav.storage.records import LEFT_OUT, Record
 
 RIG: Json = {
     "lidars": {"lidar": {"mount": {"z": 1.85}, "settings": {"channels": 32, "azimuth_steps": 900}}},
@@ -114,12 +114,14 @@ class ModalitiesResult(Record):
     kept: Mapping[str, MeanOverSeeds]  # gain with both sensors less loss without the second, in AP50, by arm
     over_late: MeanOverSeeds  # RADAR - LATE, AP50
     slower: Mapping[str, MeanOverSeeds]  # reduction of the velocity error by RADAR, by the other arm [m/s]
-    plan: PlanResult
     provenance: Provenance
+    plan: Annotated[PlanResult | None, LEFT_OUT] = None  # None: its trainings are missing
 
     def sentences(self) -> list[str]:
         """Return AP50 of every arm on all test frames, and what the plan chose, in words."""
         lines = [f"{arm}: AP50 {mean.describe()}" for arm, mean in self.ap50[ALL].items()]
+        if self.plan is None:
+            return lines
         return [*lines, f"The plan uploads {self.plan.chosen}; the best of the retrainings is {self.plan.best}."]
 
 
@@ -182,12 +184,13 @@ def name_step(seed: int, arm: str, mb: float | None, careless: bool) -> str:
 def compare(values: Mapping[str, Any], seeds: Sequence[int]) -> ModalitiesResult:
     """Return the results, of the values of the steps."""
     found: dict[str, SeedOfModalities] = {}
+    every = [each for part in list_trainings() for each in part]
     for seed in seeds:
-        steps = {name_training(*each): name_step(seed, *each) for part in list_trainings() for each in part}
+        steps = {name_training(*each): name_step(seed, *each) for each in every}
         found[str(seed)] = SeedOfModalities(
             {arm: Tested(**each) for arm, each in values[f"tested-{seed}"].items()},
-            {name: Trained(**values[step]) for name, step in steps.items()},
-            {name: values[f"{step}-validated"] for name, step in steps.items()},
+            {name: Trained(**values[step]) for name, step in steps.items() if step in values},
+            {name: values[each] for name, step in steps.items() if (each := f"{step}-validated") in values},
         )
     tests = {seed: each.tests for seed, each in found.items()}
 
@@ -196,6 +199,7 @@ def compare(values: Mapping[str, Any], seeds: Sequence[int]) -> ModalitiesResult
         assert error is not None
         return error
 
+    known = all(len(each.validated) == len(every) for each in found.values())
     return ModalitiesResult(
         seeds=found,
         ap50={part: average_arms(tests, ARMS, lambda tested, part=part: tested.ap50[part]) for part in PARTS},
@@ -216,7 +220,7 @@ def compare(values: Mapping[str, Any], seeds: Sequence[int]) -> ModalitiesResult
         },
         over_late=mean_difference(tests, RADAR, LATE, lambda tested: tested.ap50[ALL]),
         slower={arm: mean_difference(tests, arm, RADAR, velocity) for arm in (LIDAR, LATE)},
-        plan=plan_uploads(_choices(found), SOME_MB),
+        plan=plan_uploads(_choices(found), SOME_MB) if known else None,
         provenance=provenance(),
     )
 
@@ -277,7 +281,7 @@ def tables(results: ModalitiesResult) -> dict[str, str]:
         "costs": format_table(
             ("network", "sample, MB", "compressed, MB", f"CPU time of {STEPS} steps, s, mean over seeds"), costs
         ),
-        **results.plan.tables(),
+        **({} if results.plan is None else results.plan.tables()),
     }
 
 
