@@ -252,7 +252,7 @@ def draw_gains(results: ModalitiesResult) -> bytes:
 
 
 def tables(results: ModalitiesResult) -> dict[str, str]:
-    """Return Markdown by name: ap50, velocities, claims, costs, plan, annotation."""
+    """Return Markdown by name: accuracy, velocities, claims, costs, plan, annotation."""
     rows = [[arm, *(results.ap50[part][arm].describe() for part in PARTS)] for arm in ARMS]
     claims: dict[tuple[str, ...], MeanOverSeeds] = {
         (f"{arm} - {LIDAR}", part.replace("_", " "), "AP50"): mean
@@ -272,7 +272,7 @@ def tables(results: ModalitiesResult) -> dict[str, str]:
         ]
         costs.append([arm, f"{means[0]:.3f}", f"{means[1]:.3f}", f"{means[2]:.0f}"])
     return {
-        "ap50": format_table(("arm", *(part.replace("_", " ") for part in PARTS)), rows),
+        "accuracy": format_table(("arm", *(part.replace("_", " ") for part in PARTS)), rows),
         "velocities": format_table(
             ("arm", "median velocity error of moving cars that are found, m/s"),
             [[arm, results.velocity_m_s[arm].describe()] for arm in ARMS],
