@@ -44,7 +44,8 @@ def main() -> None:
     pictures = [data.plane(i, "camera", "rgb") for data in sets[:-1] for i in range(len(data))]
     classes = [classes_of(data.plane(i, "camera", "semantic")) for data in sets[:-1] for i in range(len(data))]
     network = train_painter(pictures, classes, epochs=EPOCHS, seed=SEED)
-    save_file({name: each.contiguous() for name, each in network.state_dict().items()}, out / "painter.safetensors")
+    weights = {name: each.half() if each.is_floating_point() else each for name, each in network.state_dict().items()}
+    save_file({name: each.contiguous() for name, each in weights.items()}, out / "painter.safetensors")
     shares = measure_iou(network, sets[-1])
     print(", ".join(f"{name} {share:.3f}" for name, share in zip(PAINT_CLASSES, shares, strict=True)))
 
