@@ -22,7 +22,8 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import choose_frames
-from flcav.perception.objects.model import Augmentation, Second, pillars_config, second
+from flcav.perception.objects.config import Augmentation, pillars_config
+from flcav.perception.objects.model import Second, second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.training.loop import train
 from flcav.perception.weights import load_network

@@ -34,7 +34,8 @@ from flcav.dataset.recording.recorder import record
 from flcav.dataset.store import Dataset
 from flcav.machine.threads import use_threads
 from flcav.perception.agents import choose_frames
-from flcav.perception.objects.model import Second, pillars_config, second, tiny_config
+from flcav.perception.objects.config import pillars_config, tiny_config
+from flcav.perception.objects.model import Second, second
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS

@@ -10,7 +10,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.samples import Sample
 
 CLASSES, GROUND_M = ("Car", "Pedestrian", "Cyclist"), -1.73

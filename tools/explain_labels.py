@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes
 from flcav.perception.metrics.detection import assign_targets
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import asked_of
 from flcav.perception.ops.boxes import iou

@@ -139,7 +139,7 @@ def kind_of(annotation: Any) -> str:
         return " or ".join(kind_of(each) for each in inner if each is not NoneType)
     if origin is Literal:
         return ", ".join(f"`{each}`" for each in inner)
-    if origin is dict:
+    if origin in (dict, Mapping):
         return f"by name: {kind_of(inner[1])}"
     if origin is tuple and inner[-1] is not Ellipsis:
         return f"{len(inner)} numbers"

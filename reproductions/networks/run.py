@@ -16,7 +16,7 @@ import numpy as np
 from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.experiments.study import open_split, record_split
-from flcav.perception.objects.model import SecondConfig, pillars_config, tiny_config
+from flcav.perception.objects.config import SecondConfig, pillars_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.study import read_recipe
 from flcav.perception.task import build_network

@@ -21,7 +21,8 @@ from flcav.network.ledger import BYTES_PER_MB, Ledger, LinkMegabytes
 from flcav.odd.measure import measure_domain
 from flcav.odd.scenario_tasks import Complexity, count_tasks, generate_tasks
 from flcav.perception.client import TaskClient
-from flcav.perception.objects.model import Second, pillars_config
+from flcav.perception.objects.config import pillars_config
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.study import RecipeFields, read_recipe
 from flcav.perception.task import build_network

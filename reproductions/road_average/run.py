@@ -24,7 +24,7 @@ from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import average_precision, match
 from flcav.perception.metrics.detection import assign_targets
 from flcav.perception.networks import resolve_network
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar, ground_truth

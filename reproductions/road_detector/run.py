@@ -24,7 +24,7 @@ from flcav.interface.progress import Report, ignore_progress
 from flcav.perception.agents import POLE, kind_of
 from flcav.perception.metrics import match
 from flcav.perception.metrics.detection import assign_targets
-from flcav.perception.objects.model import CONFIGURATIONS, SecondConfig
+from flcav.perception.objects.config import CONFIGURATIONS, SecondConfig
 from flcav.perception.objects.truth import CARS, LOOKALIKE, choose_lidar, in_range, network_from_lidar
 from flcav.report import style
 from flcav.report.charts.roadside import draw_recall

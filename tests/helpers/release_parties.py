@@ -3,7 +3,8 @@ from pathlib import Path
 
 import torch
 
-from flcav.perception.objects.model import pillars_config, second
+from flcav.perception.objects.config import pillars_config
+from flcav.perception.objects.model import second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.weights import Card, DataEntry, load_network, read_card, save_network
 from flcav.releases.checking import RepositorySources, open_sources

@@ -258,6 +258,10 @@ class Dataset(Displayed):
         """Return the names of the cameras of frame `i`, without the infrared ones."""
         return list(self._cameras[i])
 
+    def radars(self, i: int) -> list[str]:
+        """Return the names of the radars of frame `i`."""
+        return list(self._radar[i])
+
     def infrareds(self, i: int) -> list[str]:
         """Return the names of the infrared cameras of frame `i`."""
         return list(self._infrared[i])

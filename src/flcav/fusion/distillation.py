@@ -48,7 +48,8 @@ from flcav.fusion.pose_graph import correct_poses
 from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes, inverse, points_in_boxes, spread_over_footprints, transform_points, wrap_angle
 from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.modalities import read_cloud
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
@@ -294,7 +295,7 @@ def distil_sample(
     road sensor observed as free ground, by the vehicle's estimated pose and assumed mount.
     """
     mount = frame.assumed.agent_from_sensor[lidar]
-    points = crop_to_range(frame.lidar[lidar], config)
+    points = crop_to_range(read_cloud(frame, config, lidar), config)
     boxes = guidance.boxes.transform(inverse(mount))
     of_classes = np.isin(boxes.label, config.classes)
     targets = of_classes & guidance.confirmed & points_in_boxes(points, boxes, margin_m=RETURNS_M).any(axis=1)

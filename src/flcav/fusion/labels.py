@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.fusion.road import CELL_M, GROUND_M, TOP_M, RoadView, find_free_cells
 from flcav.geometry import Boxes, concatenate, inverse, points_in_boxes, transform_points
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import ECHO, SecondConfig
+from flcav.perception.objects.modalities import read_cloud
 from flcav.perception.objects.samples import Sample, crop_to_range, move_sample
 from flcav.perception.objects.truth import detection_labels, is_lookalike, network_from_lidar
 from flcav.sensors.frame import Frame
@@ -46,7 +47,7 @@ def label_sample(
     `relief`: heights of the ground, world frame; None where it is level.
     """
     world_from_lidar = frame.world_from_sensor(lidar)
-    points = crop_to_range(frame.lidar[lidar], config)
+    points = crop_to_range(read_cloud(frame, config, lidar), config)
     roadside = concatenate([view.boxes for view in views])
     roadside = roadside[_distinct(roadside)].transform(inverse(world_from_lidar))
     label = detection_labels(roadside.label, config.classes)
@@ -85,7 +86,7 @@ def label_by_tracks(
     (K, 2) [m] `free` gives, LiDAR frame.
     """
     assert tracks.score is not None
-    points = crop_to_range(frame.lidar[lidar], config)
+    points = crop_to_range(read_cloud(frame, config, lidar), config)
     roadside = concatenate([view.boxes for view in views]).transform(inverse(frame.world_from_sensor(lidar)))
     targets = (tracks.score >= threshold) & (points_in_boxes(points, tracks, margin_m=0.1).sum(axis=1) > 0)
     boxes = replace(tracks, score=None, variance=None)
@@ -129,8 +130,9 @@ def _contradicted(detections: Boxes, roadside: Boxes, cells: NDArray, looked: Ma
 def find_free_ground(frame: Frame, points: Array32, cells: Array, lidar: str, relief: Relief | None) -> Mask:
     """Return (K,) whether the vehicle saw the ground within two cells of each cell, and nothing standing within two.
 
-    `points` (N, 4) of the sweep and the centres `cells` (K, 2) are in the LiDAR frame. `relief`: as of `label_sample`.
+    `points` (N, C) of the sweep and the centres `cells` (K, 2) are in the LiDAR frame. `relief`: as of `label_sample`.
     """
+    points = points[points[:, 3] != ECHO]
     above = points[:, 2] + float(frame.agent_from_sensor[lidar][2, 3])
     if relief is not None:
         world_from_lidar = frame.world_from_sensor(lidar)

@@ -44,6 +44,7 @@ class Boxes(Displayed):
     score: Array | None = None  # (N,) confidence in [0, 1]
     variance: Array | None = None  # (N, 7) of x, y, z [m^2], length, width, height [m^2], yaw [rad^2]
     tilt: Array | None = None  # (N, 2) pitch and roll [rad], as in `pose`; None: upright
+    speed: Array | None = None  # (N,) over ground, along the heading [m/s]; NaN: unknown
 
     def __post_init__(self) -> None:
         n = len(self.center)
@@ -55,6 +56,7 @@ class Boxes(Displayed):
             "score": (n,),
             "variance": (n, 7),
             "tilt": (n, 2),
+            "speed": (n,),
         }
         for name, shape in shapes.items():
             value = getattr(self, name)
@@ -69,10 +71,9 @@ class Boxes(Displayed):
         if not isinstance(index, slice):
             index = np.asarray(index)
             index = index if index.dtype == bool else index.astype(np.int64)
-        score = None if self.score is None else self.score[index]
-        variance = None if self.variance is None else self.variance[index]
-        tilt = None if self.tilt is None else self.tilt[index]
-        return Boxes(self.center[index], self.size[index], self.yaw[index], self.label[index], score, variance, tilt)
+        optional = (self.score, self.variance, self.tilt, self.speed)
+        chosen = (None if values is None else values[index] for values in optional)
+        return Boxes(self.center[index], self.size[index], self.yaw[index], self.label[index], *chosen)
 
     @classmethod
     def empty(cls) -> "Boxes":
@@ -237,7 +238,7 @@ def segments_meet_boxes(starts: ArrayLike, ends: ArrayLike, boxes: Boxes) -> Mas
 
 
 def concatenate(parts: Sequence[Boxes]) -> Boxes:
-    """Concatenate `parts` in order; the result has scores and variances if every non-empty part has them.
+    """Concatenate `parts` in order; the result has scores, variances and speeds if every non-empty part has them.
 
     If all parts are empty, the first one is returned, with or without (empty) scores; without parts, `Boxes.empty()`.
     """
@@ -254,4 +255,5 @@ def concatenate(parts: Sequence[Boxes]) -> Boxes:
         tilt = np.concatenate([np.zeros((len(part), 2)) if part.tilt is None else part.tilt for part in parts])
     rows = np.concatenate([part.array() for part in parts])
     labels = np.concatenate([part.label for part in parts])
-    return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, joined("score"), joined("variance"), tilt)
+    joint = (joined("score"), joined("variance"), tilt, joined("speed"))
+    return Boxes(rows[:, :3], rows[:, 3:6], rows[:, 6], labels, *joint)

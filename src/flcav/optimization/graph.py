@@ -3,7 +3,8 @@
 It is the graph of the article's Fig. 3a, in three layers of edges:
 
 - Layer 1 joins each task to its network. Tasks with the same network are a cluster: one resource serves them all, and
-  the cluster's loss is the weighted sum of theirs. A task's learning curve overrides its network's.
+  the cluster's loss is the weighted sum of theirs. A task's learning curve overrides its network's. A task that is
+  joined to several networks has alternatives, which may read other modalities: a plan takes one of them.
 - Layer 2 joins a network to the modalities that it reads, with the size of one sample [MB].
 - Layer 3 joins a modality to the vehicles that record it, with the number and the quality of the samples they hold.
 
@@ -11,6 +12,7 @@ The graph is a `networkx.Graph` with nodes (kind, name); nodes and edges have th
 all data of an allocation problem, and it is saved as node-link JSON.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -21,7 +23,7 @@ from pydantic import Field, model_validator
 from flcav.config import InputError, parse_config, read_yaml
 from flcav.network.plan import FormName
 from flcav.optimization.curves.curves import NonNegative, OwnCurve, Positive
-from flcav.optimization.problem import Budgets, Count, Form, Limits, LocalSteps, Problem, Quantities, Uplink
+from flcav.optimization.problem import Annotation, Budgets, Count, Form, Limits, LocalSteps, Problem, Quantities, Uplink
 from flcav.storage.records import LEFT_OUT, WHERE_TRUE
 
 CHOICES = ("local_steps", "forms")  # fields of a network that a plan chooses from
@@ -31,9 +33,16 @@ KINDS = ("task", "network", "modality", "vehicle")  # of nodes; each layer joins
 class TaskNode(Quantities):
     """A perception task: its network, its weight and, where it differs from the network's, its learning curve."""
 
-    network: str
+    network: str | Annotated[tuple[str, ...], Field(min_length=2)]  # several: alternatives, of which a plan takes one
     weight: Positive = 1.0
     curve: OwnCurve | None = None  # None: its network's
+    boxes: Annotated[NonNegative | None, LEFT_OUT] = None  # as of `AllocationTask`; None: its default
+    annotations: Annotated[Mapping[str, Annotation], WHERE_TRUE] = {}  # as of `AllocationTask`
+
+    @property
+    def networks(self) -> tuple[str, ...]:
+        """Its network, or all of its alternatives."""
+        return (self.network,) if isinstance(self.network, str) else self.network
 
 
 class NetworkNode(Quantities):
@@ -82,6 +91,7 @@ class Layers(Quantities):
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1
     horizon_s: Positive | None = None
+    annotation_s: Annotated[Positive | None, LEFT_OUT] = None  # as of `Problem`
     tasks: Annotated[Mapping[str, TaskNode], Field(min_length=1)]
     networks: Annotated[Mapping[str, NetworkNode], Field(min_length=1)]
     modalities: Annotated[Mapping[str, ModalityNode], Field(min_length=1)]
@@ -89,14 +99,22 @@ class Layers(Quantities):
 
     @model_validator(mode="after")
     def _joined(self) -> Self:
+        serves = Counter(network for task in self.tasks.values() for network in task.networks)
         for name, task in self.tasks.items():
-            _known(f"tasks.{name}.network", task.network, self.networks)
-            if task.curve is None and self.networks[task.network].curve is None:
-                raise ValueError(f"tasks.{name}.curve is missing, and networks.{task.network} has none either")
+            for network in task.networks:
+                _known(f"tasks.{name}.network", network, self.networks)
+                if task.curve is None and self.networks[network].curve is None:
+                    raise ValueError(f"tasks.{name}.curve is missing, and networks.{network} has none either")
+            shared = next((network for network in task.networks if serves[network] > 1), None)
+            if shared and (len(task.networks) > 1 or task.annotations):
+                field = "annotations" if task.annotations else "network"
+                raise ValueError(f"tasks.{name}.{field}: networks.{shared} serves another task too, or this one twice")
+            if task.curve is not None and len(task.networks) > 1:
+                raise ValueError(f"tasks.{name}.curve is of one network, and it has {len(task.networks)}")
         for name, network in self.networks.items():
             for modality in network.modalities:
                 _known(f"networks.{name}.modalities", modality, self.modalities)
-            if not any(task.network == name for task in self.tasks.values()):
+            if not serves[name]:
                 raise ValueError(f"networks.{name} serves no task")
             if not any(set(network.modalities) <= set(each.holds) for each in self.vehicles.values()):
                 raise ValueError(f"networks.{name} reads {', '.join(network.modalities)}, which no vehicle holds")
@@ -121,10 +139,12 @@ def build_graph(layers: Layers) -> nx.Graph:
         budgets_mb=layers.budgets_mb.model_dump(),
         edge_rounds_per_cloud_round=layers.edge_rounds_per_cloud_round,
         horizon_s=layers.horizon_s,
+        **layers.model_dump(mode="json", include={"annotation_s"}),
     )
     for name, task in layers.tasks.items():
-        graph.add_node(("task", name), kind="task", curve=task.model_dump(mode="json")["curve"])
-        graph.add_edge(("task", name), ("network", task.network), layer=1, weight=task.weight)
+        graph.add_node(("task", name), kind="task", **task.model_dump(mode="json", exclude={"network", "weight"}))
+        for network in task.networks:
+            graph.add_edge(("task", name), ("network", network), layer=1, weight=task.weight)
     for name, network in layers.networks.items():
         attributes = network.model_dump(mode="json", exclude={"modalities"})
         graph.add_node(("network", name), kind="network", **attributes)
@@ -144,17 +164,17 @@ def extract_layers(graph: nx.Graph) -> Layers:
     """Return the configuration of a graph: the inverse of `build_graph`; raises `InputError` for any other graph."""
     nodes = {kind: [key for key, found in graph.nodes(data="kind") if found == kind] for kind in KINDS}
     for key in nodes["task"]:
-        if graph.degree[key] != 1:
-            raise InputError(f"graph: task {key[1]!r} is joined to {graph.degree[key]} networks, not to one")
+        if not graph.degree[key]:
+            raise InputError(f"graph: task {key[1]!r} is joined to no network")
     try:
         tasks = {
             key[1]: {
-                "network": network[1],
-                "weight": graph.edges[key, network]["weight"],
+                "network": joined[0] if len(joined := [network[1] for network in graph[key]]) == 1 else joined,
+                "weight": max(graph.edges[key, network]["weight"] for network in graph[key]),
                 "curve": graph.nodes[key]["curve"],
+                **{name: graph.nodes[key][name] for name in ("boxes", "annotations") if name in graph.nodes[key]},
             }
             for key in nodes["task"]
-            for network in graph[key]
         }
         networks = {
             key[1]: {
@@ -229,36 +249,51 @@ def group_tasks(graph: nx.Graph) -> dict[str, dict[str, float]]:
 def to_problem(graph: nx.Graph) -> Problem:
     """Return the allocation problem of a graph, with one entry in `tasks` per cluster.
 
-    A cluster's name joins those of its tasks, and its weight is the sum of theirs. A sample is one of each modality of
+    A cluster's name joins those of its tasks, and its weight is the sum of theirs. A task with several networks is one
+    entry, that of its first network, and the others are its `alternatives`. A sample is one of each modality of
     its network. Its edge groups are the vehicles, by edge server, that hold all these modalities; a vehicle's number of
     samples, and their quality, is the least over them. Vehicles are named only where all their links are known; else
     all train as long as the slowest. Raises `InputError` where `graph` is none that `build_graph` returns.
     """
-    layers = extract_layers(graph)
-    tasks = []
-    for name, tasks_of in group_tasks(graph).items():
-        network = layers.networks[name]
-        fleet = {key: each for key, each in layers.vehicles.items() if set(network.modalities) <= set(each.holds)}
-        edges = list(dict.fromkeys(each.edge for each in fleet.values()))
-        ordered = {key: each for edge in edges for key, each in fleet.items() if each.edge == edge}
-        held = {key: [each.holds[modality] for modality in network.modalities] for key, each in ordered.items()}
-        tasks.append(
-            {
-                "name": " + ".join(tasks_of),
-                "weight": sum(tasks_of.values()),
-                "sample_mb": sum(layers.modalities[modality].sample_mb for modality in network.modalities),
-                "model_mb": network.model_mb,
-                "exchange_mb": network.exchange_mb,
-                "labels_mb": network.labels_mb,
-                "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
-                **_named(ordered, held, network.train_s),
-                **network.model_dump(mode="json", include={*CHOICES}),
-                "limits": network.limits.model_dump(),
-                "curve": _cluster_curve(layers, name, tasks_of),
-            }
-        )
-    shared = ("budgets_mb", "edge_rounds_per_cloud_round", "horizon_s")
-    return parse_config(Problem, {**{name: graph.graph[name] for name in shared}, "tasks": tasks}, "graph")
+    layers, clusters = extract_layers(graph), group_tasks(graph)
+    tasks, planned = [], set[str]()
+    for name, tasks_of in clusters.items():
+        if name in planned:
+            continue
+        networks = layers.tasks[next(iter(tasks_of))].networks
+        planned.update(networks)
+        if len(networks) == 1:
+            tasks.append(_unit(layers, name, tasks_of))
+            continue
+        own, *others = (_unit(layers, each, tasks_of) | {"network": each} for each in networks)
+        tasks.append(own | {"alternatives": others})
+    shared = ("budgets_mb", "edge_rounds_per_cloud_round", "horizon_s", "annotation_s")
+    values = {name: graph.graph[name] for name in shared if name in graph.graph}
+    return parse_config(Problem, {**values, "tasks": tasks}, "graph")
+
+
+def _unit(layers: Layers, name: str, tasks_of: Mapping[str, float]) -> dict[str, Any]:
+    """Return the entry in `tasks` of a cluster, by a network."""
+    network = layers.networks[name]
+    fleet = {key: each for key, each in layers.vehicles.items() if set(network.modalities) <= set(each.holds)}
+    edges = list(dict.fromkeys(each.edge for each in fleet.values()))
+    ordered = {key: each for edge in edges for key, each in fleet.items() if each.edge == edge}
+    held = {key: [each.holds[modality] for modality in network.modalities] for key, each in ordered.items()}
+    first = layers.tasks[next(iter(tasks_of))]
+    return {
+        "name": " + ".join(tasks_of),
+        "weight": sum(tasks_of.values()),
+        "sample_mb": sum(layers.modalities[modality].sample_mb for modality in network.modalities),
+        "model_mb": network.model_mb,
+        "exchange_mb": network.exchange_mb,
+        "labels_mb": network.labels_mb,
+        "edge_groups": [sum(each.edge == edge for each in ordered.values()) for edge in edges],
+        **_named(ordered, held, network.train_s),
+        **network.model_dump(mode="json", include={*CHOICES}),
+        **first.model_dump(mode="json", include={"boxes", "annotations"}),
+        "limits": network.limits.model_dump(),
+        "curve": _cluster_curve(layers, name, tasks_of),
+    }
 
 
 def _cluster_curve(layers: Layers, network: str, tasks: Mapping[str, float]) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Mapping
-from typing import Annotated, ClassVar, Literal, NamedTuple, Self
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from pydantic import BeforeValidator, Field, model_validator
@@ -95,6 +95,14 @@ class UpdateForm(Quantities):
     loss: Fraction = 0.0  # added to the error of a plan with this form, as measured
 
 
+class Annotation(Quantities):
+    """A way of annotating the samples of stage I: what it takes, and what its noise costs in accuracy."""
+
+    box_s: NonNegative  # time of an annotator for a box [s]
+    worth: Positive = 1.0  # samples of the history that a sample annotated in this way is worth, as measured
+    loss: Fraction = 0.0  # added to the error of a plan with it, as measured
+
+
 Form = Annotated[UpdateForm, BeforeValidator(lambda value: {} if value is None else value)]  # `int8:` has all defaults
 
 
@@ -127,12 +135,27 @@ class AllocationTask(Quantities):
     vehicle_train_s: Mapping[str, NonNegative] = {}  # by vehicle, where it is another; names them all if uplinks do not
     local_steps: Annotated[tuple[LocalSteps, ...], WHERE_TRUE] = ()  # those to choose from; none: those of the history
     forms: Annotated[Mapping[FormName, Form], WHERE_TRUE] = {}  # of updates, to choose from; none: `model_mb` is sent
+    boxes: NonNegative = 1.0  # to be annotated in a sample, mean
+    annotations: Annotated[Mapping[Name, Annotation], WHERE_TRUE] = {}  # to choose from; none: they take no time
+    network: Annotated[Name | None, LEFT_OUT] = None  # name of its network, where a plan chooses between several
+    alternatives: Annotated[tuple["AllocationTask", ...], WHERE_TRUE] = ()
+    # the task with other networks and modalities, of which a plan takes one instead; name and weight are the task's
     limits: Limits
     curve: Curve
     upper: Curve | None = None  # the upper band of `curve`, for robust plans
     lower: Annotated[Curve | None, LEFT_OUT] = None  # its lower band: with the upper, that of the predicted accuracy
     measured: Measured = Measured()
     performance_without: Fraction | None = None  # of the whole system when this task is left out
+
+    @property
+    def variants(self) -> tuple["AllocationTask", ...]:
+        """The task by every network that a plan may choose, its own first."""
+        return (self, *self.alternatives)
+
+    @property
+    def annotate_s(self) -> float:
+        """Time to annotate one sample [s], where there is no choice of the way."""
+        return self.boxes * sum(each.box_s for each in self.annotations.values()) if len(self.annotations) == 1 else 0.0
 
     @property
     def learners(self) -> tuple[Learner, ...]:
@@ -175,6 +198,33 @@ class AllocationTask(Quantities):
 
     def _sending_s(self, vehicle: str, mb: float) -> float:
         return 0.0 if self.uplink_mbps is None else BITS_PER_BYTE * mb / self.uplink_mbps[vehicle].wireless
+
+    @model_validator(mode="before")
+    @classmethod
+    def _name_alternatives(cls, values: Any) -> Any:
+        if not (isinstance(values, dict) and isinstance(values.get("alternatives"), list | tuple)):
+            return values
+        shared = {name: values[name] for name in ("name", "weight") if name in values}
+        named = [shared | each if isinstance(each, dict) else each for each in values["alternatives"]]
+        return values | {"alternatives": named}
+
+    @model_validator(mode="after")
+    def _alternative(self) -> Self:
+        for each in self.alternatives:
+            if each.alternatives or (each.name, each.weight) != (self.name, self.weight):
+                raise ValueError(f"alternatives of task {self.name!r} have its name and weight, and none of their own")
+            if bool(each.vehicles) != bool(self.vehicles) or (each.train_s > 0) != (self.train_s > 0):
+                raise ValueError(
+                    f"alternatives of task {self.name!r}: all of them name their vehicles and take train_s, or none"
+                )
+            if (each.called is None) != (self.called is None) or (each.upper is None) != (self.upper is None):
+                raise ValueError(f"alternatives of task {self.name!r}: all of them have 'called', and 'upper', or none")
+            if [member[0] for member in _members(each.curve)] != [member[0] for member in _members(self.curve)]:
+                raise ValueError(f"alternatives of task {self.name!r} must have curves of the same members")
+        names = [each.network for each in self.variants]
+        if self.alternatives and (None in names or len(set(names)) < len(names)):
+            raise ValueError(f"alternatives of task {self.name!r}: it and they need a 'network' each, all different")
+        return self
 
     @model_validator(mode="after")
     def _vehicles(self) -> Self:
@@ -296,6 +346,7 @@ class Problem(Displayed, Quantities):
     budgets_mb: Budgets
     edge_rounds_per_cloud_round: Count = 1  # k: each cloud round runs, and pays, k edge rounds in every region
     horizon_s: Positive | None = None  # longest time that each vehicle may be busy, on its own link and training
+    annotation_s: Annotated[Positive | None, LEFT_OUT] = None  # time of all annotators for the samples of stage I
     objective: Objective = "weighted"
     robust: bool = False  # whether to plan for the upper bands of the curves
     performance: Fraction | None = (
@@ -303,10 +354,15 @@ class Problem(Displayed, Quantities):
     )
     tasks: Annotated[tuple[AllocationTask, ...], Field(min_length=1)]
 
+    @property
+    def variants(self) -> tuple[AllocationTask, ...]:
+        """All tasks, each by every network that a plan may choose."""
+        return tuple(each for task in self.tasks for each in task.variants)
+
     @model_validator(mode="after")
     def _one_link_per_vehicle(self) -> Self:
         links: dict[str, Uplink] = {}
-        for task in self.tasks:
+        for task in self.variants:
             for vehicle, link in (task.uplink_mbps or {}).items():
                 if links.setdefault(vehicle, link) != link:
                     raise ValueError(
@@ -317,7 +373,7 @@ class Problem(Displayed, Quantities):
     @model_validator(mode="after")
     def _held_by_a_round(self) -> Self:
         horizon_s = np.inf if self.horizon_s is None else self.horizon_s
-        for task in self.tasks:
+        for task in self.variants:
             train_s = min([task.vehicle_train_s.get(name, task.train_s) for name in task.vehicles] or [task.train_s])
             for steps in task.local_steps:
                 if steps.factor * train_s > horizon_s:
@@ -341,6 +397,12 @@ class Problem(Displayed, Quantities):
                         f"task {task.name!r} asks for {task.limits.cloud_rounds[0]} cloud rounds or more, and "
                         "edge_rounds_per_cloud_round = 0 allows one: models that no one trains in between are equal"
                     )
+        return self
+
+    @model_validator(mode="after")
+    def _annotated(self) -> Self:
+        if self.annotation_s is not None and not any(each.annotations for each in self.variants):
+            raise ValueError(f"annotation_s = {self.annotation_s:g} limits nothing: no task has annotations")
         return self
 
     @model_validator(mode="after")

@@ -5,7 +5,7 @@ sweep and corners of boxes into it.
 """
 
 import io
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -150,14 +150,18 @@ def recorded_view(data: Dataset, number: int, lidar: str) -> CameraView | None:
 
     Poses and intrinsics are the agent's assumed calibration. None if no camera's axis is within 60 degrees.
     """
-    frame = data.frame(number)
+    return find_view(data.frame(number), lidar, lambda camera: data.plane(number, camera, "rgb"))
+
+
+def find_view(frame: Frame, lidar: str, read: Callable[[str], Picture] | None = None) -> CameraView | None:
+    """Return the view of `recorded_view` in a frame; `read` returns the image of a camera (None: the frame's)."""
     lidar_from_world = inverse(frame.assumed_world_from_sensor(lidar))
     ahead = {name: float((lidar_from_world @ frame.assumed_world_from_sensor(name))[0, 2]) for name in frame.images}
     camera = max(ahead, key=ahead.__getitem__, default=None)
     if camera is None or ahead[camera] < LEAST_AHEAD:
         return None
     return CameraView(
-        data.plane(number, camera, "rgb"),
+        frame.images[camera].rgb if read is None else read(camera),
         inverse(lidar_from_world @ frame.assumed_world_from_sensor(camera)),
         frame.assumed.intrinsics[camera],
         frame.assumed.distortion[camera],

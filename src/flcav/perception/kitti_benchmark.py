@@ -33,8 +33,10 @@ from flcav.perception.errors import THRESHOLD
 from flcav.perception.images import kitti_view
 from flcav.perception.metrics.detection import interval_words
 from flcav.perception.metrics.operating_point import FoundAtDistance, describe_counts
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.evaluate import Score, count_objects, score_detections
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.modalities import refuse_files
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_moved
 from flcav.perception.objects.samples import describe_rig
 from flcav.perception.objects.truth import FrameTruth, level_mount
@@ -300,6 +302,7 @@ def evaluate_kitti(
 
     Raises `InputError` where a file is missing, truncated or malformed.
     """
+    refuse_files(network.config, path)
     folder, split = open_evaluated(path)
     if not len(folder):
         raise InputError(f"{path}: no frames to evaluate")

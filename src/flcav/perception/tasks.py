@@ -29,7 +29,7 @@ def task_named(name: str) -> "Task":
 
     >>> from flcav import task_named
     >>> list(task_named("objects").configurations)  # networks, the default first
-    ['pillars', 'tiny', 'small', 'road', 'paper']
+    ['pillars', 'tiny', 'small', 'road', 'paper', 'pillars_far', 'pillars_radar', 'pillars_painted']
     """
     from flcav.perception.task import Task
 

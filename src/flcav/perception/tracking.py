@@ -33,7 +33,8 @@ from flcav.perception.agents import frame_reader
 from flcav.perception.metrics import round_or_none
 from flcav.perception.metrics.detection import on_neutral
 from flcav.perception.metrics.tracks import TrackingFrame, TrackScore, TracksEvaluation, amota, count_clear_mot
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range
 from flcav.sensors.frame import Frame

@@ -161,7 +161,7 @@ class EmbeddedSource(DividedSource):
 
     def _vehicle_rig(self, number: int) -> Rig:
         """Return the rig of the vehicle "cav<number>"."""
-        rig = self.recipe.vehicle_rig
+        rig = self.recipe.rigs.get(f"cav{number}", self.recipe.vehicle_rig)
         if self.recipe.randomise is None:
             return rig
         return randomise_rig(rig, stream(self.recipe.seed, "rig", f"cav{number}"), self.recipe.randomise)

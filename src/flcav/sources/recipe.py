@@ -17,6 +17,7 @@ from flcav.sensors.frame import LONGEST_NAME, format_key
 from flcav.sensors.lens import Lens
 from flcav.sensors.rig import RIGS, CalibrationError, Mounted, MountedInfrared, MountedRadar, Rig
 from flcav.sources.randomisation import Drawing
+from flcav.storage.records import WHERE_TRUE
 from flcav.world.map.parameters import RareKinds
 from flcav.world.map.town import PACKAGED
 from flcav.world.scenarios.scenario import LONGEST_S, Scenario
@@ -107,6 +108,7 @@ class Recipe(Displayed, Config):
     cavs: int = Field(default=1, ge=0, le=1000)  # connected vehicles that record: cav0, cav1, ...
     poles: Annotated[tuple[int, ...] | Literal["all"], BeforeValidator(_poles)] = ()  # numbers of the poles that record
     vehicle_rig: NamedRig = RIGS["lidar32"]  # every vehicle's sensors: the name of a rig, or a rig
+    rigs: Annotated[Mapping[str, NamedRig], WHERE_TRUE] = {}  # of single vehicles, by name (cav0, ...), instead of it
     pole_rig: NamedRig = RIGS["lidar_pole"]  # every pole's sensors: the name of a rig, or a rig
     weather: WeatherSchedule = WeatherSchedule.model_validate(WEATHERS["clear"])  # preset, values, keyframes, classes
     calibration_error: CalibrationError = CalibrationError()  # errors of the calibration that agents assume
@@ -136,6 +138,19 @@ class Recipe(Displayed, Config):
                 raise ValueError(f"scenarios: '{scenario.kind}' is near {scenario.near}, but cavs = {self.cavs}")
             if scenario.at_s >= self.times_s(self.warmup_steps[0])[-1]:
                 raise ValueError(f"scenarios: '{scenario.kind}' is at {scenario.at_s:g} s, after the last spin")
+        return self
+
+    @model_validator(mode="after")
+    def _rigs_of_vehicles(self) -> "Recipe":
+        vehicles = [f"cav{number}" for number in range(self.cavs)]
+        if strangers := [name for name in self.rigs if name not in vehicles]:
+            raise ValueError(
+                f"rigs names '{strangers[0]}', which is none of the vehicles {', '.join(vehicles) or '(none)'}"
+            )
+        if self.navigation_s and not all(rig.gnss and rig.imus for rig in self.rigs.values()):
+            raise ValueError(
+                "navigation_s: every vehicle needs a GNSS receiver and an IMU; give them to its rig in 'rigs'"
+            )
         return self
 
     @model_validator(mode="after")
@@ -212,7 +227,7 @@ class CarlaRecipe(Recipe):
 
     @model_validator(mode="after")
     def _has_what_carla_has(self) -> "CarlaRecipe":
-        for name in ("scenarios", "rare", "randomise", "window_range_m", "worn_paint"):
+        for name in ("scenarios", "rare", "randomise", "window_range_m", "worn_paint", "rigs"):
             if getattr(self, name):
                 raise ValueError(f"'{name}' is of the built-in simulator; source: carla has no such thing")
         for name in ("vehicle_rig", "pole_rig"):

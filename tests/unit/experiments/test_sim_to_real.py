@@ -10,7 +10,8 @@ from flcav.dataset.formats.kitti.files import KittiCalibration, KittiFrame, Obje
 from flcav.dataset.recording.recorder import record
 from flcav.geometry import Boxes
 from flcav.perception.kitti_benchmark import select_shown, truth_of
-from flcav.perception.objects.model import second, small_config
+from flcav.perception.objects.config import small_config
+from flcav.perception.objects.model import second
 from flcav.reproductions.sim_to_real import run as sim_to_real
 from flcav.reproductions.sim_to_real.clouds import summarise_clouds
 from flcav.sensors.rig import RIGS

@@ -17,7 +17,8 @@ from flcav.geometry import concatenate, pose
 from flcav.perception.agents import choose_frames
 from flcav.perception.networks import find_trained_lidar
 from flcav.perception.objects import predict as prediction
-from flcav.perception.objects.model import second, second_tiny, small_config, tiny_config
+from flcav.perception.objects.config import small_config, tiny_config
+from flcav.perception.objects.model import second, second_tiny
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import narrow_range
 from flcav.perception.task import KnownLidar

@@ -25,7 +25,7 @@ from flcav.perception.objects.augment import (
     select_free,
     tilt_sample,
 )
-from flcav.perception.objects.model import Augmentation, SecondConfig, small_config
+from flcav.perception.objects.config import Augmentation, SecondConfig, small_config
 from flcav.perception.objects.samples import Sample, crop_to_range
 from flcav.perception.objects.truth import MIN_RETURNS
 

@@ -4,7 +4,8 @@ import count_cars
 import numpy as np
 
 from flcav.geometry import Boxes
-from flcav.perception.objects.model import second, small_config
+from flcav.perception.objects.config import small_config
+from flcav.perception.objects.model import second
 from flcav.perception.objects.truth import GroundTruth
 
 

@@ -12,7 +12,8 @@ from flcav.cli.main import run
 from flcav.config import InputError
 from flcav.perception.device import CPU, select_device
 from flcav.perception.objects import Sample
-from flcav.perception.objects.model import Second, second, tiny_config
+from flcav.perception.objects.config import tiny_config
+from flcav.perception.objects.model import Second, second
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.ops import norm, rulebook
 from flcav.perception.ops.rulebook import build_strided_rulebook, build_submanifold_rulebook, encode_cells

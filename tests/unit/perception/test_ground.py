@@ -14,7 +14,7 @@ from flcav.dataset.store import Dataset
 from flcav.fusion.road import build_road_view
 from flcav.geometry import Boxes, inverse, pose, transform_points
 from flcav.perception.agents import choose_frames
-from flcav.perception.objects.model import tiny_config
+from flcav.perception.objects.config import tiny_config
 from flcav.perception.objects.task import OBJECTS
 from flcav.report import style
 from flcav.report.pictures import birdseye

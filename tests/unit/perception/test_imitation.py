@@ -13,9 +13,10 @@ from torch import Tensor
 from flcav.config import InputError
 from flcav.geometry import Boxes
 from flcav.perception.client import TaskClient
+from flcav.perception.objects.config import CONFIGURATIONS
 from flcav.perception.objects.distillation import SEEN, ImitatingObjects, imitation_loss
 from flcav.perception.objects.loss import BOX_WEIGHT, DIRECTION_WEIGHT, SMOOTH_L1_BETA
-from flcav.perception.objects.model import CONFIGURATIONS, HeadOutput, Second
+from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS

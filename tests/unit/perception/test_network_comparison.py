@@ -18,7 +18,7 @@ from flcav.geometry import Boxes, concatenate
 from flcav.interface.progress import ignore_progress
 from flcav.perception.comparing import compare
 from flcav.perception.objects import predict
-from flcav.perception.objects.model import paper_config, tiny_config
+from flcav.perception.objects.config import paper_config, tiny_config
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.outcomes import Outcomes, compare_outcomes
 from flcav.perception.signs import evaluate as signs_evaluate

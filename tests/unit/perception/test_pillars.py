@@ -9,8 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from flcav.geometry import Boxes
+from flcav.perception.objects.config import pillars_config
 from flcav.perception.objects.loss import anchor_boxes
-from flcav.perception.objects.model import head_shape, pillars_config, second
+from flcav.perception.objects.model import head_shape, second
 from flcav.perception.objects.predict import detect
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS

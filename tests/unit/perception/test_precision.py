@@ -6,7 +6,8 @@ import pytest
 import torch
 
 from flcav.perception.device import multiplies_bfloat16
-from flcav.perception.objects.model import second, tiny_config
+from flcav.perception.objects.config import tiny_config
+from flcav.perception.objects.model import second
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.task import OBJECTS
 

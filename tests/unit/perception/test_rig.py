@@ -8,7 +8,8 @@ import pytest
 
 from flcav.geometry import Boxes, pose, transform_points, wrap_angle
 from flcav.perception.objects import predict as prediction
-from flcav.perception.objects.model import second_tiny, tiny_config
+from flcav.perception.objects.config import tiny_config
+from flcav.perception.objects.model import second_tiny
 from flcav.perception.objects.predict import detect_all, detect_in, look_around
 from flcav.perception.objects.samples import sample_from_frame
 from flcav.perception.objects.truth import in_range, network_from_lidar

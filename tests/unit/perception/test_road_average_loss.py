@@ -7,6 +7,7 @@ import pytest
 import torch
 
 from flcav.geometry import Boxes
+from flcav.perception.objects.config import SecondConfig, tiny_config
 from flcav.perception.objects.distillation import (
     DistillationTerms,
     contrastive_loss,
@@ -24,7 +25,7 @@ from flcav.perception.objects.loss import (
     decode_variance,
     encode_variance,
 )
-from flcav.perception.objects.model import HeadOutput, SecondConfig, head_shape, second, tiny_config
+from flcav.perception.objects.model import HeadOutput, head_shape, second
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 

@@ -9,6 +9,7 @@ import torch
 from flcav.geometry import Boxes, points_in_boxes
 from flcav.perception.objects import Sample, second_tiny
 from flcav.perception.objects.augment import augment, transform_sample
+from flcav.perception.objects.config import Augmentation
 from flcav.perception.objects.loss import (
     anchor_boxes,
     assign_anchors,
@@ -18,7 +19,7 @@ from flcav.perception.objects.loss import (
     mark_free_cells,
     second_loss,
 )
-from flcav.perception.objects.model import Augmentation, head_shape
+from flcav.perception.objects.model import head_shape
 from flcav.perception.objects.samples import crop_to_range
 
 CONFIG = second_tiny().config

@@ -22,8 +22,8 @@ from flcav.geometry import Boxes
 from flcav.interface.progress import ignore_progress
 from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient
+from flcav.perception.objects.config import CONFIGURATIONS
 from flcav.perception.objects.distillation import SEEN, TaughtObjects, ensemble_loss
-from flcav.perception.objects.model import CONFIGURATIONS
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS

@@ -5,8 +5,8 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes
+from flcav.perception.objects.config import CONFIGURATIONS
 from flcav.perception.objects.loss import assign_anchors, classification_loss
-from flcav.perception.objects.model import CONFIGURATIONS
 from flcav.perception.objects.predict import predict
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS

@@ -8,7 +8,7 @@ import pytest
 
 from flcav.config import InputError
 from flcav.geometry import Boxes, points_in_boxes, pose
-from flcav.perception.objects.model import pillars_config
+from flcav.perception.objects.config import pillars_config
 from flcav.runs.arm_checks import check_federations
 from flcav.runs.arms import resolve_settings
 from flcav.runs.extras.groups import roadside

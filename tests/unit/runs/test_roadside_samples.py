@@ -9,7 +9,7 @@ from flcav.config import InputError
 from flcav.dataset.ground import DatasetGround
 from flcav.geometry import points_in_boxes, pose, transform_points
 from flcav.interface.progress import ignore_progress
-from flcav.perception.objects.model import pillars_config
+from flcav.perception.objects.config import pillars_config
 from flcav.perception.objects.truth import choose_lidar
 from flcav.runs.arm_checks import check_federations
 from flcav.runs.arms import resolve_settings

@@ -88,6 +88,12 @@ def test_a_range_of_warm_ups_is_one_of_the_recipes_settings():
         ({"weather": "hail"}, "field 'weather.*unknown weather"),
         ({"calibration_error": {"position_m": -1}}, "field 'calibration_error.position_m' = -1"),
         ({"vehicle_rig": 3}, "field 'vehicle_rig' = 3"),
+        ({"rigs": {"cav0": "plane"}}, "field 'rigs.cav0' = 'plane': unknown rig"),
+        ({"rigs": {"cav5": "car"}}, ".*rigs names 'cav5', which is none of the vehicles cav0"),
+        (
+            {"navigation_s": 1.0, "vehicle_rig": "car", "rigs": {"cav0": "lidar32"}},
+            ".*navigation_s: every vehicle needs a GNSS receiver and an IMU",
+        ),
         (
             {"vehicle_rig": {"lidars": {"lidar": {"settings": {"range_m": -5}}}}},
             r"field 'vehicle_rig.lidars.lidar.settings.range_m' = -5",

@@ -165,12 +165,13 @@ def _plain(plan: "Allocation | Baseline") -> dict[str, Any]:
             if task[name] is None:
                 del task[name]
     values["tasks"] = [
-        _given(task, "upper_error", "members", "called", "local_steps", "form") for task in values["tasks"]
+        _given(task, "upper_error", "members", "called", "local_steps", "form", "network", "annotation")
+        for task in values["tasks"]
     ]
     for name in ("used_mb", "marginal_error_per_gb"):
         if name in values:
             values[name] = {link.removesuffix("_mb"): number for link, number in values[name].items()}
-    return _given(values, "busy_s", "note", "warnings", "certificate")
+    return _given(values, "busy_s", "annotation_s", "note", "warnings", "certificate")
 
 
 def _given(values: dict[str, Any], *optional: str) -> dict[str, Any]:
@@ -185,7 +186,7 @@ def _describe(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") 
         if task.called is not None:
             told = plural(task.called, "vehicle")
             yield (f"{task.name}: {told} at most of each edge server in its edge rounds")
-        if chosen := task.describe_rounds():
+        if chosen := task.describe_choices():
             yield f"{task.name}: {chosen}"
     curves = "the fitted curves" if len(plan.tasks) > 1 else "the fitted curve"
     yield (f"{measure} {plan.objective:{SHOWN}}, {plan.status} for {curves} ({_proven(plan.gap)})")
@@ -201,6 +202,8 @@ def _describe(problem: "Problem", plan: "Allocation", more: "Sequence[Saving]") 
             yield (f"  {larger}, solved anew: {verb} {saved} ({_proven(saving.gap)})")
     if plan.busy_s is not None:
         yield (f"time: {plan.busy_s:.1f} of {problem.horizon_s:.6g} s on the busiest vehicle")
+    if plan.annotation_s is not None:
+        yield (f"annotation: {plan.annotation_s:.1f} of {problem.annotation_s:.6g} s")
     yield from filter(None, (plan.note, *plan.warnings))
 
 

@@ -14,7 +14,7 @@ from flcav.config import InputError
 from flcav.geometry.arrays import Array
 from flcav.interface.notebook import Displayed
 from flcav.network.ledger import LinkMegabytes
-from flcav.optimization.allocation.round_choices import RoundChoice, find_choice, list_settled, settle_all
+from flcav.optimization.allocation.choices import TaskChoice, find_choice, list_settled, settle_all
 from flcav.optimization.curves.curves import Curve, SharedCurve
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.area import area, maximise_area
@@ -57,12 +57,16 @@ class TaskAllocation:
     accuracy_high: float | None = None  # predicted by its lower band
     local_steps: float | None = None  # times those of the history, where the problem leaves the choice
     form: str | None = None  # of the updates, where the problem leaves the choice
+    network: str | None = None  # by which the task is learned, where the problem leaves the choice
+    annotation: str | None = None  # of its samples, where the problem leaves the choice
 
-    def describe_rounds(self) -> str:
-        """Return the local steps and the form of updates that a plan has chosen; "" where it had no choice."""
+    def describe_choices(self) -> str:
+        """Return network, annotation, local steps and form of updates that a plan has chosen; "" without a choice."""
         times = f"{self.local_steps:g} times " if self.local_steps not in (None, 1) else ""
         steps = "" if self.local_steps is None else f"{times}the local steps of the history"
-        return ", ".join(filter(None, (steps, f"updates in {self.form}" if self.form else "")))
+        form = f"updates in {self.form}" if self.form else ""
+        annotation = f"{self.annotation} annotation" if self.annotation else ""
+        return ", ".join(filter(None, (self.network, annotation, steps, form)))
 
     def describe_accuracy(self) -> str:
         """Return the predicted accuracy with its band, as far as that is known; the error has two digits in it."""
@@ -100,6 +104,7 @@ class Allocation(Displayed):
     used_mb: LinkMegabytes
     marginal_error_per_gb: LinkMegabytes  # derivative by each budget, per 1000 MB: see `allocate`
     busy_s: float | None = None  # time of the busiest vehicle, where horizon_s limits what vehicles train
+    annotation_s: float | None = None  # time of annotators, where the problem limits it
     note: str | None = None
     warnings: tuple[str, ...] = ()
     certificate: tuple[Dual, ...] = ()  # of each branch that has a plan (`solve_branches`): the least bound holds
@@ -151,22 +156,28 @@ def allocate(problem: Problem, *, gap: float = 1e-4, clocks: Sequence[Clock] = (
     return join_plans(problem, [*found.values()], gap)
 
 
-def name_choices(plan: Allocation, choices: Sequence[RoundChoice]) -> Allocation:
-    """Return the plan with a choice of local steps and form named in each of its tasks."""
+def name_choices(plan: Allocation, choices: Sequence[TaskChoice]) -> Allocation:
+    """Return the plan with the choice named in each of its tasks."""
     return replace(plan, tasks=name_in_tasks(plan.tasks, choices))
 
 
-def name_in_tasks(plans: Sequence[TaskAllocation], choices: Sequence[RoundChoice]) -> tuple[TaskAllocation, ...]:
-    """Return the tasks' plans with their choices of local steps and form."""
+def name_in_tasks(plans: Sequence[TaskAllocation], choices: Sequence[TaskChoice]) -> tuple[TaskAllocation, ...]:
+    """Return the tasks' plans with their choices."""
     return tuple(
-        replace(plan, local_steps=None if choice.steps is None else choice.steps.factor, form=choice.form)
+        replace(
+            plan,
+            local_steps=None if choice.steps is None else choice.steps.factor,
+            form=choice.form,
+            network=choice.network,
+            annotation=choice.annotation,
+        )
         for plan, choice in zip(plans, choices, strict=True)
     )
 
 
 def settle_plan(problem: Problem, plans: Sequence[TaskAllocation]) -> Problem:
-    """Return the problem with the local steps and forms that `plans`, one per task, have chosen."""
-    choices = (find_choice(task, plan.local_steps, plan.form) for task, plan in zip(problem.tasks, plans, strict=True))
+    """Return the problem with what `plans`, one per task, have chosen."""
+    choices = (find_choice(task, plan) for task, plan in zip(problem.tasks, plans, strict=True))
     return settle_all(problem, tuple(choices))
 
 
@@ -193,7 +204,7 @@ def join_plans(
 
 
 def _allocate(problem: Problem, sought: float, gap: float, clocks: Sequence[Clock]) -> Allocation:
-    """Return the best plan, to a relative gap `sought`, of a problem without choices of local steps and forms."""
+    """Return the best plan, to a relative gap `sought`, of a problem without choices."""
     resolved = resolve_problem(problem)
     method = _METHODS[problem.objective]
     solved = solve_branches(
@@ -213,6 +224,7 @@ def _allocate(problem: Problem, sought: float, gap: float, clocks: Sequence[Cloc
         used_mb=sum_prices(tasks),
         marginal_error_per_gb=LinkMegabytes(*(MB_PER_GB * max(float(rate), 0.0) for rate in best.rates[:2])),
         busy_s=_busy_s(resolved, tasks),
+        annotation_s=_annotation_s(resolved, tasks),
         note=NO_CERTIFICATE if lower is None else None,
         warnings=(*_idle_horizon(problem), *_beyond(problem, tasks), *_unmeasured(problem, tasks)),
         certificate=tuple(plan.dual for plan in solved if plan.dual is not None),
@@ -226,6 +238,13 @@ def _busy_s(problem: Problem, plans: Sequence[TaskAllocation]) -> float | None:
     if clock is None:
         return None
     return sum(train_s * (plan.edge_rounds + k * plan.cloud_rounds) for train_s, plan in zip(clock.per_round, plans))
+
+
+def _annotation_s(problem: Problem, plans: Sequence[TaskAllocation]) -> float | None:
+    """Return the time of annotators [s]; None where the problem does not limit it."""
+    if problem.annotation_s is None:
+        return None
+    return sum(task.annotate_s * plan.samples for task, plan in zip(problem.tasks, plans, strict=True))
 
 
 def _call(problem: Problem, branch: Problem) -> Problem:

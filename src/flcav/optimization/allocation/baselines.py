@@ -20,12 +20,12 @@ from flcav.optimization.allocation.allocate import (
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.round_choices import settle_first
+from flcav.optimization.allocation.choices import settle_first
 from flcav.optimization.allocation.vehicles import split_plan, trains
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.branches import solve_branches
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
-from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, price_once
+from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, own_clocks, price_once
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import solve_two_budgets
 from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
@@ -162,7 +162,7 @@ def _round_down(branch: Problem) -> tuple[float, Array]:
 
 
 def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:
-    """Return `problem` with other limits (N, 3) and budgets (L,): of the links [MB], and the horizon [s] if it has one.
+    """Return `problem` with other limits (N, 3) and budgets (L,): of the links [MB], and of its `own_clocks` [s].
 
     The constant cost `price_once` is added to the wireless budget.
     """
@@ -176,8 +176,11 @@ def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Proble
     limited = problem.model_copy(update={"tasks": tuple(tasks)})
     links = {"wireless": float(budget[0]) + price_once(limited), "wireline": float(budget[1])}
     budgets = problem.budgets_mb.model_copy(update=links)
-    horizon_s = {"horizon_s": float(budget[2]) or None} if len(budget) > 2 else {}  # 0 s: only before the first round
-    return limited.model_copy(update={"budgets_mb": budgets, **horizon_s})
+    clocks = zip(own_clocks(problem), budget[2:], strict=True)
+    seconds: dict[str, float | None] = {clock.limit: float(left) for clock, left in clocks}
+    if seconds.get("horizon_s") == 0:
+        seconds["horizon_s"] = None  # only before the first round
+    return limited.model_copy(update={"budgets_mb": budgets, **seconds})
 
 
 BASELINES: dict[str, Callable[[Problem, Instance], Array]] = {

@@ -39,7 +39,7 @@ from flcav.optimization.allocation.allocate import (
     resolve_problem,
     sum_prices,
 )
-from flcav.optimization.allocation.round_choices import list_settled
+from flcav.optimization.allocation.choices import list_settled
 from flcav.optimization.allocation.vehicles import Shares, TooSlow, split_plan, sum_busy, trains
 from flcav.optimization.problem import BITS_PER_BYTE, AllocationTask, Problem
 from flcav.optimization.solvers.instance import Clock, Infeasible

@@ -9,7 +9,7 @@ from typing import Annotated, ClassVar, Literal
 from pydantic import Field
 
 from flcav.config import Config, InputError
-from flcav.optimization.allocation.round_choices import narrow, settle_first
+from flcav.optimization.allocation.choices import narrow, settle_first
 from flcav.optimization.curves.curves import (
     STAGES,
     Additive,
@@ -39,6 +39,8 @@ class TaskState(Config):
     )
     local_steps: Annotated[Positive | None, LEFT_OUT] = None  # factor of its rounds so far, where a plan says
     form: Annotated[str | None, LEFT_OUT] = None  # of their updates, where a plan says
+    network: Annotated[str | None, LEFT_OUT] = None  # that learned it, where a plan says
+    annotation: Annotated[str | None, LEFT_OUT] = None  # of its samples, where a plan says
     accuracy: Fraction | None = (
         None  # accuracy now; None: not measured; of a cluster: the weighted mean of its members'
     )
@@ -90,9 +92,12 @@ def condition_problem(problem: Problem, progress: PlanState) -> Problem:
 
 
 def _call(problem: Problem, task: AllocationTask, spent: TaskState | None) -> AllocationTask:
-    """Return the task with the number of vehicles, the local steps and the form of the rounds that are done."""
-    if spent is not None and (any(spent.counts[1:]) or spent.local_steps is not None or spent.form is not None):
-        task = narrow(task, spent.local_steps, spent.form)
+    """Return the task with the choices of what is done: network, annotation, local steps, form, number of vehicles."""
+    if spent is not None:
+        told = (spent.local_steps, spent.form, spent.network, spent.annotation)
+        begun = any(spent.counts if task.alternatives or task.annotations else spent.counts[1:])
+        if begun or any(each is not None for each in told):
+            task = narrow(task, spent)
     if spent is None or spent.called is None:
         return task
     if task.called is None or not task.called[0] <= spent.called <= task.called[1]:

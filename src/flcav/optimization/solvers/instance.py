@@ -36,6 +36,7 @@ class Clock:
     per_sample: tuple[float, ...]  # (N,) [s]
     per_round: tuple[float, ...]  # (N,) [s] of an edge round; a cloud round is k of them
     seconds: float  # available time [s]
+    limit: str = "horizon_s"  # field of the problem that limits it
 
 
 def shared_clock(problem: Problem) -> Clock | None:
@@ -48,6 +49,19 @@ def shared_clock(problem: Problem) -> Clock | None:
     if problem.horizon_s is None or not any(per_round):
         return None
     return Clock((0.0,) * len(per_round), per_round, problem.horizon_s)
+
+
+def annotation_clock(problem: Problem) -> Clock | None:
+    """Return the limit of annotators' time on the samples of all tasks; None where the problem has none."""
+    if problem.annotation_s is None:
+        return None
+    per_sample = tuple(task.annotate_s for task in problem.tasks)
+    return Clock(per_sample, (0.0,) * len(per_sample), problem.annotation_s, "annotation_s")
+
+
+def own_clocks(problem: Problem) -> tuple[Clock, ...]:
+    """Return the limits of time of a problem: `shared_clock`, then `annotation_clock`, as far as it has them."""
+    return tuple(clock for clock in (shared_clock(problem), annotation_clock(problem)) if clock is not None)
 
 
 @dataclass(frozen=True)
@@ -156,8 +170,7 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
     idle = np.setdiff1d(np.arange(len(low)), [row[3] for row in rows])
     rows += [(0.0, 1.0, 1.0, int(quantity)) for quantity in idle]
     a, b, x0, of = np.array(sorted(rows, key=lambda row: row[3])).T
-    own_clock = shared_clock(problem)
-    clocks = clocks if own_clock is None else (own_clock, *clocks)
+    clocks = (*own_clocks(problem), *clocks)
     once_mb = price_once(problem)
     links = (problem.budgets_mb.wireless - once_mb, problem.budgets_mb.wireline)
     budget = np.array((*links, *(clock.seconds for clock in clocks)))
@@ -165,7 +178,7 @@ def build_instance(problem: Problem, clocks: Sequence[Clock] = ()) -> Instance:
     cost = np.column_stack((unit_costs(problem), *(_spent(clock, k) for clock in clocks)))
     powers_of = None if len(of) == len(low) else of.astype(np.intp)
     powers = Separable(a, b, x0, low, high, cost, budget, powers_of)
-    _refuse(powers, once_mb)
+    _refuse(powers, once_mb, clocks)
     powers = replace(powers, high=np.minimum(high, low + room(powers)))
     effective = build_effective_tasks(alone, k, low, powers.high, powers.cost) if alone else None
     floor = sum(learner.weight * learner.curve.floor for task in problem.tasks for learner in task.learners)
@@ -225,12 +238,13 @@ def _spent(clock: Clock, k: int) -> Array:
     return np.column_stack((clock.per_sample, per_round, k * per_round)).ravel()
 
 
-def _refuse(problem: Separable, once_mb: float) -> None:
-    for need, have in zip(problem.spent(problem.low)[2:], problem.budget[2:]):
+def _refuse(problem: Separable, once_mb: float, clocks: Sequence[Clock]) -> None:
+    for clock, need, have in zip(clocks, problem.spent(problem.low)[2:], problem.budget[2:], strict=True):
         if need > have * (1 + BUDGET_SLACK):
+            of = "on a vehicle" if clock.limit == "horizon_s" else "of annotators"
             raise Infeasible(
-                f"the least that the limits allow takes {need:.6g} s on a vehicle, {need - have:.6g} s more than "
-                f"horizon_s = {have:.6g}"
+                f"the least that the limits allow takes {need:.6g} s {of}, {need - have:.6g} s more than "
+                f"{clock.limit} = {have:.6g}"
             )
     links = (("wireless", once_mb), ("wireline", 0.0))
     for (link, once), need, have in zip(links, problem.spent(problem.low), problem.budget):

@@ -42,7 +42,8 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
     lower = plan["lower_bound"]
     duals = plan.get("certificate", ())
     read, budgets = read_tasks(problem, k)
-    chosen = [(row.get("local_steps"), row.get("form")) for row in plan["tasks"]]
+    fields = ("network", "annotation", "local_steps", "form")
+    chosen = [tuple(row.get(field) for field in fields) for row in plan["tasks"]]
     settled = [task.works.get(names, task) for task, names in zip(read, chosen, strict=True)]
     tasks = [task.calls.get(row.get("called"), task) for task, row in zip(settled, plan["tasks"], strict=True)]
     counts = [[row[name] for name in QUANTITIES] for row in plan["tasks"]]
@@ -57,7 +58,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
         value = float(np.sin(2 * np.pi / len(corners)) / 2 * (corners @ np.roll(corners, 1)))
     spent = sum(costs, np.zeros(1, dtype=object))
     claims = {
-        "the local steps and forms": all(names in task.works for task, names in zip(read, chosen)),
+        "the choices": all(names in task.works for task, names in zip(read, chosen)),
         "the vehicles called": all(
             not task.calls or row["called"] in task.calls for task, row in zip(settled, plan["tasks"])
         ),
@@ -66,6 +67,7 @@ def verify_allocation(problem_json: str, plan_json: str, optimal: float = 1e-4) 
         "the megabytes": all(
             near(float(a), b) for recomputed, said in zip([spent, *costs], stated) for a, b in zip(recomputed, said)
         ),
+        "the annotators' time": problem.get("annotation_s") is None or near(float(spent[-1]), plan["annotation_s"]),
         "the objective": near(value, plan["objective"]),
     }
     trusted = [CURVES] + [FLEET] * any(task["uplink_mbps"] or task["vehicle_train_s"] for task in problem["tasks"])
@@ -112,7 +114,8 @@ def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: A
         paid += fsum(w * (curve_["floor"] + curve_.get("merge", 0.0) * merged) for w, curve_ in task.curves)
         if curve["model"] == "additive":
             for stage, price, (low, high) in zip(STAGES, prices, ranges):
-                paces = (1.0 if stage == "pretrain" else each.get("pace", 1.0) for _, each in task.curves)
+                paid_by = "worth" if stage == "pretrain" else "pace"
+                paces = (each.get(paid_by, 1.0) for _, each in task.curves)
                 decays = [
                     (w * each[stage]["a"], each[stage]["b"], pace, each[stage]["x0"])
                     for pace, (w, each) in zip(paces, task.curves)
@@ -120,7 +123,8 @@ def bound_weighted(tasks: Sequence[VerifiedTask], multipliers: Array, budgets: A
                 paid += float(_bound_convex([each for each in decays if each[0] > 0], price, low, high))
         else:
             y, z = _pair(ranges)
-            powers: Powers = [(weight * curve["a"], curve["b"], curve["alpha"], held_samples(curve, y, z, k))]
+            alpha = curve.get("worth", 1.0) * curve["alpha"]
+            powers: Powers = [(weight * curve["a"], curve["b"], alpha, held_samples(curve, y, z, k))]
             rounds = weight * compute_drift(curve, z) + prices[1] * y + prices[2] * z
             paid += float(np.min(_bound_convex(powers, prices[0], *ranges[0]) + rounds))
         least.append(paid * SUMS)

@@ -18,18 +18,20 @@ Array = np.ndarray[Any, np.dtype[Any]]  # of floats, or (L,) of Fractions
 
 BITS = {"float32": 32, "fp16": 16, "int8": 8, "int4": 4, "top-k": 64}  # of a parameter that is sent
 QUANTITIES, STAGES = ("samples", "edge_rounds", "cloud_rounds"), ("pretrain", "edge", "cloud")
+Choice = tuple[str | None, str | None, float | None, str | None]  # network, annotation, local steps, form of updates
+CAREFUL: Data = {"box_s": 0, "worth": 1.0, "loss": 0.0}  # annotation as in the history, of no limited time
 SLACK = 1 + Fraction(1, 10**12)  # of a budget: the rounding of a sum that is within it
 
 
 class VerifiedTask(NamedTuple):
-    """A task under L budgets: wireless and wireline uplink [MB], and where it is limited, time [s]."""
+    """A task under L budgets: uplink, wireless and wireline [MB]; where limited, vehicles' and annotators' time [s]."""
 
     curves: list[tuple[float, Data]]  # weight and curve of each member
     limits: list[list[int]]  # least and most samples, edge rounds, cloud rounds
     unit: Array  # (3, L) cost of one of each
     once: Array  # (L,) cost of the first cloud round
     calls: Mapping[int, Any] = {}  # the task with each number of vehicles that a plan may call, the fewest first
-    works: Mapping[tuple[float | None, str | None], Any] = {}  # with each number of local steps and form of updates
+    works: Mapping[Choice, Any] = {}  # with each choice that a plan may make
 
     def cost(self, counts: Sequence[int]) -> Array:
         """Return the cost (L,) of samples, edge rounds and cloud rounds."""
@@ -49,44 +51,69 @@ def read_tasks(problem: Data, k: int) -> tuple[list[VerifiedTask], Array]:
     gains = [max((problem["performance"] or 0) - (each["performance_without"] or 0), 0) for each in problem["tasks"]]
     for task, gain in zip(problem["tasks"], gains):
         weight = task["weight"] if problem["performance"] is None else gain / sum(gains)
-        curve = task["upper" if problem["robust"] else "curve"]
-        members = curve.get("members") or [{"weight": 1.0, "curve": curve}]
-        curves = [(weight * each["weight"] / sum(m["weight"] for m in members), each["curve"]) for each in members]
-        names = task["uplink_mbps"] or task["vehicle_train_s"]
-        limits = [[*task["limits"][name]] for name in QUANTITIES]
-        limits[0][1] = min(limits[0][1], sum(task["samples_held"].get(name, inf) for name in names) if names else inf)
-        limits[2][1] = min(limits[2][1], 1 if k == 0 else inf)
-        for limit, stage in zip(limits, STAGES):  # where an error is infinite at 0
-            infinite = (member[stage]["a"] > 0 == member[stage]["x0"] for _, member in curves if stage in member)
-            limit[0] = max(limit[0], any(infinite))
         works = {}
-        for factor, worth, form, share, loss in _list_works(task, horizon_s):
-            paced: list[tuple[float, Data]] = [
-                (w, {**own, "floor": own["floor"] + loss, "pace": worth * own.get("pace", 1.0)}) for w, own in curves
-            ]
-            model = exact(task["model_mb"]) * share
-            sizes = (task["sample_mb"], task.get("exchange_mb") or model, task.get("labels_mb") or 0)
-            sample, sent, labels = map(exact, sizes)
-            train_s = exact(0 if names else task["train_s"]) * exact(factor or 1)
-            timed |= train_s > 0
-            cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
-            rounds = [[cars * (sent + labels), 0, train_s], [k * cars * sent, servers * model, k * train_s]]
-            costs = np.array([[sample, sample, 0], *rounds, [cars * labels, 0, 0]], dtype=object)
-            read = VerifiedTask(paced, limits, costs[:3], costs[3])
-            calls = _list_calls(task, read, sent + labels, k) if task.get("called") else {}
-            works[factor, form] = read._replace(calls=calls)
+        for variant in (task, *task.get("alternatives", ())):
+            own, takes_time = _read_variant(problem, variant, weight, k)
+            works |= own
+            timed |= takes_time
         tasks.append(next(iter(works.values()))._replace(works=works))
-    budgets += [horizon_s] * (horizon_s is not None and timed)
-    kept = slice(len(budgets))
+    watched = problem.get("annotation_s") is not None
+    kept = [0, 1, *([2] if horizon_s is not None and timed else []), *([3] if watched else [])]
+    limits = [*budgets, horizon_s, problem.get("annotation_s")]
     tasks = [_keep(task, kept) for task in tasks]
-    return tasks, np.array([exact(budget) * SLACK for budget in budgets])
+    return tasks, np.array([exact(limits[column]) * SLACK for column in kept])
 
 
-def _list_works(task: Data, horizon_s: float | None) -> list[tuple[float | None, float, str | None, Fraction, float]]:
-    """Return the choices of rounds that no other makes superfluous.
+def _read_variant(problem: Data, task: Data, weight: float, k: int) -> tuple[dict[Choice, VerifiedTask], bool]:
+    """Return the task by its own network, with each of its choices; and whether its rounds take a vehicle's time."""
+    timed = False
+    curve = task["upper" if problem["robust"] else "curve"]
+    members = curve.get("members") or [{"weight": 1.0, "curve": curve}]
+    curves = [(weight * each["weight"] / sum(m["weight"] for m in members), each["curve"]) for each in members]
+    names = task["uplink_mbps"] or task["vehicle_train_s"]
+    limits = [[*task["limits"][name]] for name in QUANTITIES]
+    limits[0][1] = min(limits[0][1], sum(task["samples_held"].get(name, inf) for name in names) if names else inf)
+    limits[2][1] = min(limits[2][1], 1 if k == 0 else inf)
+    for limit, stage in zip(limits, STAGES):  # where an error is infinite at 0
+        infinite = (member[stage]["a"] > 0 == member[stage]["x0"] for _, member in curves if stage in member)
+        limit[0] = max(limit[0], any(infinite))
+    works = {}
+    for way, factor, pace, form, share, loss in _list_works(task, problem):
+        how = task.get("annotations", {}).get(way) or CAREFUL
+        paced: list[tuple[float, Data]] = [
+            (
+                w,
+                {
+                    **own,
+                    "floor": own["floor"] + loss + how["loss"],
+                    "pace": pace * own.get("pace", 1.0),
+                    "worth": how["worth"],
+                },
+            )
+            for w, own in curves
+        ]
+        model = exact(task["model_mb"]) * share
+        sizes = (task["sample_mb"], task.get("exchange_mb") or model, task.get("labels_mb") or 0)
+        sample, sent, labels = map(exact, sizes)
+        annotate_s = exact(task.get("boxes", 1.0)) * exact(how["box_s"])
+        train_s = exact(0 if names else task["train_s"]) * exact(factor or 1)
+        timed |= train_s > 0
+        cars, servers = sum(task["edge_groups"]), len(task["edge_groups"])
+        rounds = [[cars * (sent + labels), 0, train_s, 0], [k * cars * sent, servers * model, k * train_s, 0]]
+        costs = np.array([[sample, sample, 0, annotate_s], *rounds, [cars * labels, 0, 0, 0]], dtype=object)
+        read = VerifiedTask(paced, limits, costs[:3], costs[3])
+        calls = _list_calls(task, read, sent + labels, k) if task.get("called") else {}
+        works[task.get("network"), way, factor, form] = read._replace(calls=calls)
+    return works, timed
 
-    They are the factor and worth of local steps, and name, share of the stored bits and loss of a form.
+
+def _list_works(task: Data, problem: Data) -> list[tuple[Any, ...]]:
+    """Return the choices of a task by its own network that no other makes superfluous.
+
+    They are the way of annotation, factor and worth of local steps, and name, share of the stored bits and loss of a
+    form.
     """
+    ways = list(task.get("annotations", ())) or [None]
     steps = [(each["factor"], each["worth"]) for each in task.get("local_steps", ())] or [(None, 1.0)]
     forms = [(None, Fraction(1), 0.0)]
     if task.get("forms"):
@@ -98,20 +125,23 @@ def _list_works(task: Data, horizon_s: float | None) -> list[tuple[float | None,
             )
             for name, form in task["forms"].items()
         ]
-    limited = horizon_s is not None and (task["train_s"] > 0 or any(task["vehicle_train_s"].values()))
-    every = [(*one, *other) for one, other in product(steps, forms)]
+    limited = problem["horizon_s"] is not None and (task["train_s"] > 0 or any(task["vehicle_train_s"].values()))
+    watched = problem.get("annotation_s") is not None
+    every = [(way, *one, *other) for way, one, other in product(ways, steps, forms)]
+
+    def replaces(one: Sequence[Any], other: Sequence[Any]) -> bool:
+        """Return whether one choice takes no more time and bits than another, and teaches and loses no worse."""
+        a, b = (task["annotations"][each[0]] if each[0] else CAREFUL for each in (one, other))
+        annotated = (not watched or a["box_s"] <= b["box_s"]) and a["worth"] >= b["worth"] and a["loss"] <= b["loss"]
+        quick = not limited or (one[1] or 1) <= (other[1] or 1)
+        return annotated and quick and one[2] >= other[2] and one[4] <= other[4] and one[5] <= other[5]
+
     return [
         own
         for number, own in enumerate(every)
-        if not any(_replaces(each, own, limited) for each in every[:number])
-        and not any(_replaces(each, own, limited) and not _replaces(own, each, limited) for each in every[number + 1 :])
+        if not any(replaces(each, own) for each in every[:number])
+        and not any(replaces(each, own) and not replaces(own, each) for each in every[number + 1 :])
     ]
-
-
-def _replaces(one: Sequence[Any], other: Sequence[Any], limited: bool) -> bool:
-    """Return whether a choice of rounds takes no more time and bits than another, and teaches and loses no worse."""
-    quick = not limited or (one[0] or 1) <= (other[0] or 1)
-    return quick and one[1] >= other[1] and one[3] <= other[3] and one[4] <= other[4]
 
 
 def _list_calls(task: Data, read: VerifiedTask, sent: Fraction, k: int) -> dict[int, VerifiedTask]:
@@ -138,7 +168,7 @@ def _list_calls(task: Data, read: VerifiedTask, sent: Fraction, k: int) -> dict[
     return calls
 
 
-def _keep(task: VerifiedTask, budgets: slice) -> VerifiedTask:
+def _keep(task: VerifiedTask, budgets: list[int]) -> VerifiedTask:
     """Return the task with costs under the budgets that exist only."""
     calls = {number: _keep(called, budgets) for number, called in task.calls.items()}
     works = {names: _keep(work, budgets) for names, work in task.works.items()}
@@ -170,14 +200,15 @@ def error(curve: Data, counts: Sequence[Any], k: int) -> Any:
     x, y, z = counts
     if curve["model"] == "additive":
         pace = curve.get("pace", 1.0)
-        powers = ((curve[stage], each) for stage, each in zip(STAGES, (x, pace * y, pace * z)))
+        counted = (curve.get("worth", 1.0) * x, pace * y, pace * z)
+        powers = ((curve[stage], each) for stage, each in zip(STAGES, counted))
         parts = [
             power["a"] * np.asarray(each + power["x0"], float) ** -power["b"]
             for power, each in powers
             if power["a"] > 0
         ]
         return curve["floor"] + curve["merge"] * (z > 0) + sum(parts)
-    effective = curve["alpha"] * x + held_samples(curve, y, z, k)
+    effective = curve.get("worth", 1.0) * curve["alpha"] * x + held_samples(curve, y, z, k)
     return curve["floor"] + compute_drift(curve, z) + curve["a"] * np.asarray(effective, float) ** -curve["b"]
 
 

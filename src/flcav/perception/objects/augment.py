@@ -17,7 +17,8 @@ import torch
 
 from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.geometry import Boxes, concatenate, heading_vectors, points_in_boxes
-from flcav.perception.objects.model import Augmentation, SecondConfig
+from flcav.perception.objects.config import Augmentation, SecondConfig
+from flcav.perception.objects.modalities import blind
 from flcav.perception.objects.samples import Sample, map_sample
 from flcav.perception.objects.truth import MIN_RETURNS, in_range
 from flcav.perception.ops.boxes import iou
@@ -30,10 +31,12 @@ VIEW = (0.845, 0.28, 0.24)  # tangents of a camera's field of view, sideways, do
 def augment(sample: Sample, how: Augmentation, rng: np.random.Generator) -> Sample:
     """Return the sample augmented by random amounts drawn from `rng`, within the limits of `how`.
 
-    The order is: objects lose returns; a dense sweep is thinned; cars are resized, and boxes get their margin; the
-    whole sweep is mirrored, rotated and scaled; shifted; tilted and lifted; returns are dropped; the sweep is cut to a
-    camera's field of view.
+    The order is: the second modality is left out; objects lose returns; a dense sweep is thinned; cars are resized, and
+    boxes get their margin; the whole sweep is mirrored, rotated and scaled; shifted; tilted and lifted; returns are
+    dropped; the sweep is cut to a camera's field of view.
     """
+    if how.blind and rng.random() < how.blind:
+        sample = replace(sample, points=blind(sample.points))
     if how.fade:
         sample = fade_objects(sample, rng.uniform(0, how.fade, len(sample.boxes)), rng)
     if how.thin and rng.random() < how.thin and len(sample.points) > DENSE:

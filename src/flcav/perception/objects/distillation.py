@@ -31,6 +31,7 @@ from torch import Tensor
 
 from flcav.arrays import Ints
 from flcav.geometry import Boxes, concatenate, spread_over_footprints
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.loss import (
     BOX_WEIGHT,
     DIRECTION_WEIGHT,
@@ -43,7 +44,7 @@ from flcav.perception.objects.loss import (
     second_loss,
     smooth_l1,
 )
-from flcav.perception.objects.model import HeadOutput, Second, SecondConfig
+from flcav.perception.objects.model import HeadOutput, Second
 from flcav.perception.objects.predict import voxels_of
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import ObjectsTask

@@ -17,7 +17,6 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.perception.agents import frame_reader
 from flcav.perception.errors import THRESHOLD
 from flcav.perception.metrics import (
     FoundCars,
@@ -34,7 +33,9 @@ from flcav.perception.metrics import (
 )
 from flcav.perception.metrics.operating_point import DISTANCES_M, FoundAtDistance, count_by_distance, describe_counts
 from flcav.perception.metrics.tracks import TracksEvaluation
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.modalities import frames_beside
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import OVERLAP, Reliability, detect_frames
 from flcav.perception.objects.truth import (
     QUARTERS,
@@ -45,6 +46,7 @@ from flcav.perception.objects.truth import (
     select_sides,
     share_range,
 )
+from flcav.perception.objects.velocities import VelocityError
 from flcav.perception.ops.boxes import Kind
 from flcav.perception.outcomes import Counted, Measure, Outcomes, Times, Values
 from flcav.perception.task import Evaluated
@@ -100,6 +102,7 @@ class ObjectsEvaluation(Evaluated):
     slices: tuple[BreakdownRow, ...]  # breakdown of AP
     trust: tuple[Reliability, ...]  # calibration of scores and variances, one per class
     tracks: Annotated[TracksEvaluation | None, LEFT_OUT] = None  # None unless requested
+    velocities: Annotated[tuple[VelocityError, ...] | None, LEFT_OUT] = None  # None where no speeds are predicted
 
     @property
     def score(self) -> float:
@@ -111,7 +114,7 @@ class ObjectsEvaluation(Evaluated):
         """Return the known metrics, by name, of all classes.
 
         AP for every kind of overlap and IoU; AOS and the share of right headings in 3D at IoU 0.5; expected calibration
-        error; MOTA and AMOTA where tracks were evaluated.
+        error; MOTA and AMOTA where tracks were evaluated; median velocity error [m/s] where speeds are predicted.
         """
         ap = {f"{row.label} AP {row.kind} at {row.iou}": row.ap for row in self.scores}
         headings = {
@@ -126,7 +129,9 @@ class ObjectsEvaluation(Evaluated):
             for row in (self.tracks.scores if self.tracks else ())
             for name, value in (("MOTA", row.mota), ("AMOTA", row.amota))
         }
-        return {name: value for name, value in (ap | headings | errors | tracks).items() if value is not None}
+        speeds = {f"{row.label} velocity error": row.median_m_s for row in self.velocities or ()}
+        known = ap | headings | errors | tracks | speeds
+        return {name: value for name, value in known.items() if value is not None}
 
     def lines(self) -> list[str]:
         """Return the evaluation in words.
@@ -152,6 +157,11 @@ class ObjectsEvaluation(Evaluated):
         for row in self.trust:
             if row.ece is not None:
                 lines.append(f"{row.label:<12}expected calibration error {row.ece:.3f}")
+        for row in self.velocities or ():
+            moving = "" if row.median_m_s is None else f", of moving ones {row.median_m_s:.2f} m/s"
+            standing = "" if row.standing_m_s is None else f", of standing ones {row.standing_m_s:.2f} m/s"
+            counts = f"{row.moving} and {row.standing} of those found"
+            lines.append(f"{row.label:<12}median velocity error{moving}{standing} ({counts})")
         return [*lines, *(self.tracks.lines() if self.tracks else ())]
 
 
@@ -315,7 +325,7 @@ class ObjectsOutcomes:
         asked: the classes and the range that count, see `detect_frames`; None: the network's. Raises `InputError`
         where there are no frames, or one has no LiDAR.
         """
-        read = frame_reader(data, network.config.foreground)
+        read = frames_beside(data, network.config, frames)
         found, truths = detect_frames(network, map(read, frames), asked, total=len(frames), progress=progress)
         classes = (asked or network.config).classes
         if not truths:

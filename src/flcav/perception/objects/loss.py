@@ -25,7 +25,8 @@ from torch import Tensor
 
 from flcav.arrays import Array, Array32, Ints, Mask
 from flcav.geometry import heading_vectors
-from flcav.perception.objects.model import HEADINGS, LOG_VARIANCES, HeadOutput, SecondConfig, head_shape
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import HEADINGS, LOG_VARIANCES, SPEED_M_S, HeadOutput, head_shape
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import in_range
 
@@ -79,6 +80,7 @@ class Targets:
     exact: Tensor  # (P,) float32: 1 where residual and direction are learned, else 0
     direction: Tensor  # (P,) int64 direction class: 1 where the yaw is in [-3/4 pi, pi/4), else 0
     variance: Tensor | None = None  # (P, 7) float32 of the residuals, where boxes have one
+    speed: Tensor | None = None  # (P,) float32 over ground, along the heading [m/s], where boxes have one; NaN: unknown
 
 
 def encode_residuals(boxes: Array, anchors: Array) -> Array:
@@ -187,6 +189,9 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
     if sample.boxes.variance is not None:
         label_variance = sample.boxes.variance[inside][owner[positive]]
         variance = torch.from_numpy(encode_variance(label_variance, targets, anchors[positive]).astype(np.float32))
+    speed = None
+    if sample.boxes.speed is not None:
+        speed = torch.from_numpy(sample.boxes.speed[inside][owner[positive]].astype(np.float32))
     return Targets(
         positive=torch.from_numpy(positive),
         weight=torch.from_numpy(counts.astype(np.float32)),
@@ -194,6 +199,7 @@ def assign_anchors(sample: Sample, config: SecondConfig) -> Targets:
         residual=torch.from_numpy(encode_residuals(targets, anchors[positive]).astype(np.float32)),
         direction=torch.from_numpy(direction_of(targets[:, 6])),
         variance=variance,
+        speed=speed,
     )
 
 
@@ -240,7 +246,7 @@ def _axis_aligned(boxes: Array) -> tuple[Array, Array]:
 
 
 ALPHA, GAMMA = 0.25, 2.0  # of the focal loss
-BOX_WEIGHT, DIRECTION_WEIGHT, VARIANCE_WEIGHT = 2.0, 1.0, 0.2
+BOX_WEIGHT, DIRECTION_WEIGHT, VARIANCE_WEIGHT, SPEED_WEIGHT = 2.0, 1.0, 0.2, 1.0
 SMOOTH_L1_BETA = 1 / 9  # error at which the smooth L1 loss turns from quadratic to linear
 
 
@@ -255,6 +261,8 @@ def second_loss(output: HeadOutput, targets: Sequence[Targets], config: SecondCo
     total = BOX_WEIGHT * box.sum(1) + DIRECTION_WEIGHT * direction
     if nll is not None:
         total = total + VARIANCE_WEIGHT * nll.sum(1)
+    if output.speed is not None:
+        total = total + SPEED_WEIGHT * speed_loss(output.speed, _positive(output, targets), targets)
     return (classification_loss(output, targets, config) + (total * share).sum()) / len(targets)
 
 
@@ -292,6 +300,14 @@ def box_losses(output: HeadOutput, targets: Sequence[Targets]) -> tuple[Tensor, 
         return box, direction, None
     log_variance = output.log_variance.flatten(0, 1)[positive].clamp(*LOG_VARIANCES)
     return box, direction, gaussian_nll(error.detach(), log_variance)
+
+
+def speed_loss(output: Tensor, positive: Tensor, targets: Sequence[Targets]) -> Tensor:
+    """Return the smooth L1 loss (P,) of the speeds of positive anchors [SPEED_M_S]; 0 where a speed is unknown."""
+    unknown = [torch.full((len(target.positive),), torch.nan) for target in targets]
+    speeds = [none if target.speed is None else target.speed for target, none in zip(targets, unknown, strict=True)]
+    error = output.flatten()[positive] - torch.cat(speeds).to(output.device) / SPEED_M_S
+    return smooth_l1(error.nan_to_num())
 
 
 def residual_errors(found: Tensor, wanted: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import torch
@@ -24,14 +24,15 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, concatenate, inverse, pose
 from flcav.interface.progress import Report, ignore_progress
 from flcav.interface.wording import plural
-from flcav.perception.agents import frame_reader
 from flcav.perception.device import inference
 from flcav.perception.images import CameraView, recorded_view, view_beside
 from flcav.perception.marks import CloudBoxes
 from flcav.perception.metrics import calibration_error, fit_logistic, match, round_or_none
 from flcav.perception.metrics.detection import assign_targets
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.loss import anchor_boxes, anchor_classes, decode_residuals, decode_variance
-from flcav.perception.objects.model import LOG_VARIANCES, HeadOutput, Second, SecondConfig
+from flcav.perception.objects.modalities import frames_beside, read_cloud, refuse_files, widen
+from flcav.perception.objects.model import LOG_VARIANCES, SPEED_M_S, HeadOutput, Second
 from flcav.perception.objects.samples import move_points, validate_points
 from flcav.perception.objects.truth import (
     QUARTERS,
@@ -44,11 +45,12 @@ from flcav.perception.objects.truth import (
     select_class,
     select_sides,
 )
+from flcav.perception.objects.velocities import take_speeds
 from flcav.perception.ops.boxes import nms
 from flcav.perception.ops.sparse import SparseTensor
 from flcav.perception.task import Finding, Result
 from flcav.sensors.frame import Frame
-from flcav.storage.records import Class
+from flcav.storage.records import LEFT_OUT, Class
 
 LOWEST_SCORE = 0.05  # of detections that are evaluated; lower ones change AP by less than its interval
 CANDIDATES = 256  # anchors of highest score per class that enter non-maximum suppression
@@ -67,6 +69,7 @@ class ObjectFound:
     width: float
     height: float
     yaw: float  # counter-clockwise from the x axis [rad]
+    speed: Annotated[float | None, LEFT_OUT] = None  # over ground, along the heading [m/s]; None where not predicted
 
 
 @dataclass(frozen=True)
@@ -81,7 +84,8 @@ class ObjectsFound(Result):
         for box in self.boxes:
             place = f"at ({box.x:.1f}, {box.y:.1f}, {box.z:.1f}) m, yaw {box.yaw:.2f} rad"
             size = f"{box.length:.1f} x {box.width:.1f} x {box.height:.1f} m"
-            lines.append(f"{box.label:<11}{box.score:.2f}  {place}, {size}")
+            moves = "" if box.speed is None else f", {box.speed:.1f} m/s"
+            lines.append(f"{box.label:<11}{box.score:.2f}  {place}, {size}{moves}")
         return lines
 
 
@@ -100,7 +104,7 @@ def detect_in(network: Second, frames: Sequence[Frame], *, score_threshold: floa
     Sweeps are moved to the height and direction that the network was trained for, see `network_from_lidar`. Raises
     `InputError` where a frame has no LiDAR.
     """
-    clouds = [frame.lidar[choose_lidar(frame)] for frame in frames]
+    clouds = [read_cloud(frame, network.config) for frame in frames]
     moves = [network_from_lidar(frame, network.config) for frame in frames]
     return detect_moved(network, clouds, moves, score_threshold=score_threshold)
 
@@ -175,11 +179,17 @@ def _detect_ahead(network: Second, clouds: Sequence[Array32], score_threshold: f
             score = calibrate_logits(output.score, network.config).sigmoid().cpu().numpy()
             box = output.box.double().cpu().numpy()
             direction = output.direction.argmax(2).cpu().numpy()
-            spread = [None] * len(score)
+            spread, speed = [None] * len(score), [None] * len(score)
             if output.log_variance is not None:
                 spread = output.log_variance.double().clamp(*LOG_VARIANCES).exp().cpu().numpy()
-            parts = zip(score, box, direction, spread, strict=True)
-            found += [_decode_boxes(network, *one, score_threshold) for one in parts]
+            if output.speed is not None:
+                speed = (output.speed[..., 0].double() * SPEED_M_S).cpu().numpy()
+            parts = zip(score, box, direction, spread, speed, strict=True)
+            decoded = [_decode_boxes(network, *one, score_threshold) for one in parts]
+            if network.config.beside == "radar":
+                seen = (widen(cloud, network.config.columns) for cloud in clouds[first : first + batch])
+                decoded = [take_speeds(boxes, cloud) for boxes, cloud in zip(decoded, seen, strict=True)]
+            found += decoded
     return found
 
 
@@ -208,14 +218,17 @@ def detect_frames(
 
 
 def predict(network: Second, clouds: Sequence[Array32]) -> HeadOutput:
-    """Return the raw predictions of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
+    """Return the raw predictions of `network` for a batch of point clouds (N_i, C), LiDAR frame, on its device."""
     return network(voxels_of(network, clouds))
 
 
 def voxels_of(network: Second, clouds: Sequence[Array32]) -> SparseTensor | Tensor:
-    """Return the input of `network` for a batch of point clouds (N_i, 4), LiDAR frame, on its device."""
+    """Return the input of `network` for a batch of point clouds (N_i, C), LiDAR frame, on its device.
+
+    Clouds of four columns are of the LiDAR alone, see `flcav.perception.objects.modalities`.
+    """
     device = network.head.weight.device
-    points = torch.from_numpy(np.concatenate(clouds)).to(device)
+    points = torch.from_numpy(np.concatenate([widen(cloud, network.config.columns) for cloud in clouds])).to(device)
     sizes = torch.tensor([len(cloud) for cloud in clouds], device=device)
     sample = torch.repeat_interleave(torch.arange(len(clouds), device=device), sizes)
     return network.voxels(points, sample, len(clouds))
@@ -232,8 +245,9 @@ def calibrate_logits(logits: Tensor, config: SecondConfig) -> Tensor:
 def boxes_to_rows(boxes: Boxes) -> tuple[ObjectFound, ...]:
     """Return the boxes as records, one per box; an unknown score becomes 1."""
     scores = boxes.score if boxes.score is not None else np.ones(len(boxes))
-    rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), strict=True)
-    return tuple(ObjectFound(label, score, *row) for label, score, row in rows)
+    speeds = [None] * len(boxes) if boxes.speed is None else boxes.speed.tolist()
+    rows = zip(boxes.label.tolist(), scores.tolist(), boxes.array().tolist(), speeds, strict=True)
+    return tuple(ObjectFound(label, score, *row, speed=speed) for label, score, row, speed in rows)
 
 
 def rows_to_boxes(rows: Sequence[ObjectFound]) -> Boxes:
@@ -243,7 +257,13 @@ def rows_to_boxes(rows: Sequence[ObjectFound]) -> Boxes:
 
 
 def _decode_boxes(
-    network: Second, score: NDArray, box: NDArray, direction: NDArray, spread: NDArray | None, threshold: float
+    network: Second,
+    score: NDArray,
+    box: NDArray,
+    direction: NDArray,
+    spread: NDArray | None,
+    speed: NDArray | None,
+    threshold: float,
 ) -> Boxes:
     config = network.config
     parts = []
@@ -259,6 +279,8 @@ def _decode_boxes(
         found = Boxes.from_array(rows[kept], name, scores[kept])
         if spread is not None:
             found = replace(found, variance=decode_variance(spread[anchors_of_class][kept], rows[kept], anchors[kept]))
+        if speed is not None:
+            found = replace(found, speed=speed[anchors_of_class][kept])
         parts.append(found)
     return concatenate(parts)
 
@@ -301,6 +323,7 @@ def read_point_clouds(
     """
     if (path / MANIFEST).is_file():
         return _recorded(path, frames, config)
+    refuse_files(config, path)
     move = None if mount is None else level_mount(mount, config)
     return (
         InputCloud(file, validate_points(read_cloud_file(file), file), move, partial(view_beside, file))
@@ -310,13 +333,13 @@ def read_point_clouds(
 
 def _recorded(folder: Path, frames: Sequence[int] | None, config: SecondConfig) -> Iterator[InputCloud]:
     dataset = Dataset.open(folder)
-    read = frame_reader(dataset, config.foreground)
+    read = frames_beside(dataset, config, dataset.numbers(frames))
     for i in dataset.numbers(frames):
         frame = read(i)
         lidar, origin = choose_lidar(frame), folder / frame.key
-        points = frame.lidar[lidar]
+        points = read_cloud(frame, config, lidar)
         if not config.foreground:  # without its background, a street may be empty
-            validate_points(points, origin)
+            validate_points(frame.lidar[lidar], origin)
         yield InputCloud(origin, points, network_from_lidar(frame, config), partial(recorded_view, dataset, i, lidar))
 
 

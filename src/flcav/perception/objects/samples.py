@@ -21,12 +21,12 @@ from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, transform_points
 from flcav.interface.wording import plural
 from flcav.network.ledger import Arrays, from_names, pack_arrays, to_names, unpack_arrays
-from flcav.perception.agents import POLE, frame_reader, kind_of
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.agents import POLE, kind_of
+from flcav.perception.objects.config import ECHO, SWEEP_COLUMNS, SecondConfig
+from flcav.perception.objects.modalities import frames_beside, read_cloud, widen
 from flcav.perception.objects.truth import (
     LEVEL_M,
     LEVEL_RAD,
-    choose_lidar,
     ground_truth,
     level_mount,
     network_from_lidar,
@@ -38,6 +38,7 @@ from flcav.sensors.frame import Frame
 from flcav.sensors.lidar.compression import decode_sweep, encode_sweep
 
 RANGE_SLACK = 0.2  # relative difference of a LiDAR's range from that of the training that is not mentioned
+KEPT_PAINTED = 500  # painted sweeps of a recording that are kept in memory: painting takes longer than reading
 HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one that a network expects
 
 
@@ -45,7 +46,7 @@ HEIGHT_SLACK_M = 0.5  # largest difference between a LiDAR's height and the one 
 class Sample:
     """A labelled LiDAR sweep, LiDAR frame."""
 
-    points: Array32  # (N, 4) x, y, z [m], intensity [0, 1]
+    points: Array32  # (N, C) x, y, z [m], intensity [0, 1], and what a second modality adds, see `modalities`
     boxes: Boxes  # (B,) objects to detect; label = detection class
     ignore: Boxes = field(default_factory=Boxes.empty)  # objects left out of the loss, neither positive nor negative
     free: Array32 | None = None  # (K, 2) positions x, y [m] without objects; None: everywhere outside boxes
@@ -71,7 +72,7 @@ def label_sweep(frame: Frame, config: SecondConfig, lidar: str | None = None) ->
     """Return the frame's sweep, whole, with its ground truth as labels, see `sample_from_frame`."""
     truth = ground_truth(frame, config, lidar)
     ignored = (truth.returns > 0) & ((truth.known & ~truth.enough) | truth.lookalike)
-    whole = Sample(frame.lidar[choose_lidar(frame, lidar)], truth.boxes[truth.enough], truth.boxes[ignored])
+    whole = Sample(read_cloud(frame, config, lidar), truth.boxes[truth.enough], truth.boxes[ignored])
     return move_sample(whole, network_from_lidar(frame, config, lidar))
 
 
@@ -93,18 +94,19 @@ def map_sample(sample: Sample, points: Array32, moved: Callable[[Boxes], Boxes],
 
 
 def move_points(points: Array32, move: Array | None) -> Array32:
-    """Return points (N, 4) x, y, z [m], intensity in the target frame of the rigid `move` (4, 4); None: unchanged."""
+    """Return points (N, C), x, y, z [m] first, in the target frame of the rigid `move` (4, 4); None: unchanged."""
     return (
         points
         if move is None
-        else np.column_stack((transform_points(move, points[:, :3]).astype(np.float32), points[:, 3]))
+        else np.column_stack((transform_points(move, points[:, :3]).astype(np.float32), points[:, 3:]))
     )
 
 
 class RecordedSweeps(Sequence[Sample]):
     """Frames of a dataset as a sequence of samples with ground truth as labels, which are read on access.
 
-    Raises `InputError` where one of the frames has no LiDAR, or the dataset no labels of objects.
+    Raises `InputError` where one of the frames has no LiDAR, or the dataset no labels of objects, and as
+    `frames_beside` does.
     """
 
     def __init__(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> None:
@@ -113,13 +115,19 @@ class RecordedSweeps(Sequence[Sample]):
             raise InputError(
                 f"{data.folder}: no LiDAR in {len(blind)} of {plural(len(frames), 'frame')}, as in {blind[0]}"
             )
-        self._read, self._config, self._frames = frame_reader(data, config.foreground), config, frames
+        self._read, self._config, self._frames = frames_beside(data, config, frames), config, frames
+        self._painted: dict[int, Sample] = {}
 
     def __len__(self) -> int:
         return len(self._frames)
 
     def __getitem__(self, index: Any) -> Any:
-        return sample_from_frame(self._read(self._frames[index]), self._config)
+        if index in self._painted:
+            return self._painted[index]
+        sample = sample_from_frame(self._read(self._frames[index]), self._config)
+        if self._config.beside == "painted" and len(self._painted) < KEPT_PAINTED:
+            self._painted[index] = sample
+        return sample
 
 
 def select_fitting_frames(data: Dataset, config: SecondConfig) -> Sequence[int]:
@@ -252,9 +260,8 @@ def validate_points(points: Array32, origin: str | Path) -> Array32:
 def pack_sample(frame: Frame, config: SecondConfig) -> bytes:
     """Return the message of a frame's sweep with its ground truth; raises `InputError` where it has no LiDAR."""
     sample = label_sweep(frame, config)
-    return pack_arrays(
-        {"points": sample.points, **pack_boxes(sample.boxes, "boxes"), **pack_boxes(sample.ignore, "ignore")}
-    )
+    boxes = {**pack_boxes(sample.boxes, "boxes"), **pack_boxes(sample.ignore, "ignore")}
+    return pack_arrays({**pack_cloud(sample.points, config), **boxes})
 
 
 def compress_sample(message: bytes) -> bytes:
@@ -266,16 +273,43 @@ def compress_sample(message: bytes) -> bytes:
 def unpack_sample(message: bytes, config: SecondConfig) -> Sample:
     """Return the training sample in a message: that of `sample_from_frame`, to a centimetre if it is compressed."""
     arrays = unpack_arrays(message)
-    sent = arrays["points"]
-    points = crop_to_range(decode_sweep(sent) if sent.dtype == np.uint8 else sent, config)
+    points = crop_to_range(unpack_cloud(arrays, config), config)
     return Sample(points, unpack_boxes(arrays, "boxes"), unpack_boxes(arrays, "ignore"))
 
 
+def pack_cloud(cloud: Array32, config: SecondConfig) -> Arrays:
+    """Return a cloud as arrays of a message: the sweep, 16 bytes a point, and what the second modality adds.
+
+    An echo takes 20 bytes (x, y, z, range rate, cross-section), a score of a painted point one, to 1/255.
+    """
+    echo = cloud[:, 3] == ECHO
+    sweep: Arrays = {"points": np.ascontiguousarray(cloud[~echo, :SWEEP_COLUMNS])}
+    if config.beside == "radar":
+        return sweep | {"echoes": np.ascontiguousarray(np.delete(cloud[echo], 3, axis=1))}
+    if config.beside == "painted":
+        return sweep | {"scores": np.rint(cloud[:, SWEEP_COLUMNS:] * 255).astype(np.uint8)}
+    return sweep
+
+
+def unpack_cloud(arrays: Arrays, config: SecondConfig) -> Array32:
+    """Return the cloud in a message: the inverse of `pack_cloud`, blind where the message has only a sweep."""
+    sent = arrays["points"]
+    sweep = decode_sweep(sent) if sent.dtype == np.uint8 else sent
+    if config.beside == "radar" and "echoes" in arrays:
+        return np.concatenate((widen(sweep, config.columns), np.insert(arrays["echoes"], 3, ECHO, axis=1)))
+    if config.beside == "painted" and "scores" in arrays:
+        return np.column_stack((sweep, arrays["scores"] / 255)).astype(np.float32)
+    return widen(sweep, config.columns)
+
+
 def pack_boxes(boxes: Boxes, name: str) -> Arrays:
-    """Return boxes without scores as two arrays of a message."""
-    return {name: boxes.array(), f"{name}.label": from_names(boxes.label.tolist())}
+    """Return boxes without scores as arrays of a message, with their speeds if known."""
+    speed = {} if boxes.speed is None else {f"{name}.speed": boxes.speed.astype(np.float32)}
+    return {name: boxes.array(), f"{name}.label": from_names(boxes.label.tolist()), **speed}
 
 
 def unpack_boxes(arrays: Arrays, name: str) -> Boxes:
     """Return the boxes in a message: the inverse of `pack_boxes`."""
-    return Boxes.from_array(arrays[name], to_names(arrays[f"{name}.label"]))
+    boxes = Boxes.from_array(arrays[name], to_names(arrays[f"{name}.label"]))
+    speed = arrays.get(f"{name}.speed")
+    return boxes if speed is None else replace(boxes, speed=speed.astype(np.float64))

@@ -16,10 +16,10 @@ from flcav.config import Json
 from flcav.dataset.store import Dataset
 from flcav.geometry import Boxes, points_in_boxes, transform_points
 from flcav.interface.progress import Report, ignore_progress
-from flcav.perception.agents import frame_reader
 from flcav.perception.errors import FALSE_POSITIVE, MISS, THRESHOLD, PerceptionError, Registry, measure_distance
 from flcav.perception.metrics.detection import assign_targets, on_neutral
 from flcav.perception.objects.augment import Cutouts, augment, cut_out_objects, paste_objects
+from flcav.perception.objects.config import CONFIGURATIONS, SecondConfig
 from flcav.perception.objects.evaluate import (
     ObjectsEvaluation,
     ObjectsOutcomes,
@@ -29,7 +29,8 @@ from flcav.perception.objects.evaluate import (
     score_detections,
 )
 from flcav.perception.objects.loss import assign_anchors, second_loss
-from flcav.perception.objects.model import CONFIGURATIONS, Second, SecondConfig, second
+from flcav.perception.objects.modalities import frames_beside
+from flcav.perception.objects.model import Second, second
 from flcav.perception.objects.predict import (
     calibrate,
     detect_frames,
@@ -48,6 +49,7 @@ from flcav.perception.objects.samples import (
     unpack_sample,
 )
 from flcav.perception.objects.truth import choose_lidar, ground_truth, in_range, target_criteria
+from flcav.perception.objects.velocities import measure_velocities
 from flcav.perception.study import StudyRecipe, read_recipe
 from flcav.perception.task import Finding, KnownLidar, Practice
 from flcav.sensors.frame import Frame
@@ -249,7 +251,7 @@ class ObjectsTask(ObjectsOutcomes):
         numbers, classes = data.numbers(frames), network.config.classes
         found, truths = detect_frames(
             network,
-            map(frame_reader(data, network.config.foreground), numbers),
+            map(frames_beside(data, network.config, numbers), numbers),
             asked,
             total=len(numbers),
             progress=progress,
@@ -263,17 +265,19 @@ class ObjectsTask(ObjectsOutcomes):
             counts=count_objects(found, truths, classes),
             slices=break_down(found, truths, classes),
             trust=measure_reliability(found, truths, classes),
+            velocities=measure_velocities(found, truths, classes) or None,
         )
 
     def calibrate(self, network: Second, data: Dataset, frames: Sequence[int] | None = None) -> None:
         """Set the Platt scaling of the network's scores, fitted on frames (None: all) not used for training."""
         data.check_labelled("objects")
-        calibrate(network, map(frame_reader(data, network.config.foreground), data.numbers(frames)))
+        numbers = data.numbers(frames)
+        calibrate(network, map(frames_beside(data, network.config, numbers), numbers))
 
     def pack_samples(self, data: Dataset, config: SecondConfig, frames: Sequence[int]) -> Iterator[bytes]:
         """Yield the messages of frames, with their whole sweep and boxes."""
         RecordedSweeps(data, config, frames)  # raises for frames without a LiDAR
-        read = frame_reader(data, config.foreground)
+        read = frames_beside(data, config, frames)
         return (pack_sample(read(i), config) for i in frames)
 
     def compress_samples(self, messages: Iterable[bytes]) -> Iterator[bytes]:
@@ -312,7 +316,8 @@ class ObjectsTask(ObjectsOutcomes):
         `threshold` is the lowest score of a detection. See `find_errors`.
         """
         data.check_labelled("objects")
-        numbers, read = data.numbers(frames), frame_reader(data, network.config.foreground)
+        numbers = data.numbers(frames)
+        read = frames_beside(data, network.config, numbers)
 
         def found() -> Iterator[Boxes]:
             for done, number in enumerate(numbers, start=1):

@@ -1,8 +1,8 @@
 """Ground truth of object detection: targets, faint, hidden and lookalike objects of a frame, and target criteria.
 
 An object of a class the network knows, with its centre in the network's range, is a *target* with five LiDAR returns or
-more, *faint* with one to four, *hidden* with none. Training, evaluation, error registry and tracking share this
-definition; how each treats the kinds is in docs/tasks.md.
+more, *faint* with one to four, *hidden* with none. For a network that reads a radar, an echo counts as a return.
+Training, evaluation, error registry and tracking share this definition; how each treats the kinds is in docs/tasks.md.
 """
 
 import math
@@ -15,9 +15,9 @@ import numpy as np
 
 from flcav.arrays import Array, Ints, Mask, Words
 from flcav.config import InputError
-from flcav.geometry import Boxes, inverse
+from flcav.geometry import Boxes, heading_vectors, inverse
 from flcav.perception.agents import POLE, kind_of
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.sensors.frame import Frame
 from flcav.statistics.estimates import CONFIDENCE
 from flcav.storage.records import LEFT_OUT
@@ -46,8 +46,8 @@ class GroundTruth:
     range, lookalikes, and actors of no class that the network knows.
     """
 
-    boxes: Boxes  # (M,) LiDAR frame; label = detection class, for a lookalike the one that it resembles, else ""
-    returns: Ints  # (M,) by all LiDARs
+    boxes: Boxes  # (M,) LiDAR frame, with speeds; label = class, for a lookalike the one that it resembles, else ""
+    returns: Ints  # (M,) by all LiDARs, and for a network that reads a radar also by all radars
     inside: Mask  # (M,) centre within the range in bird's-eye view
     lookalike: Mask  # (M,) trucks and buses, for a network that knows cars
 
@@ -86,8 +86,12 @@ def ground_truth(frame: Frame, config: SecondConfig, lidar: str | None = None) -
     boxes = annotations.boxes.transform(inverse(frame.world_from_sensor(choose_lidar(frame, lidar))))
     lookalike = is_lookalike(annotations.boxes.label, config.classes)
     label = np.where(lookalike, "Car", detection_labels(annotations.boxes.label, config.classes))
-    named = Boxes(boxes.center, boxes.size, boxes.yaw, label)
-    return GroundTruth(named, annotations.returns, in_range(boxes, config), lookalike)
+    speed = (annotations.velocity[:, :2] * heading_vectors(annotations.boxes.yaw)).sum(1)
+    named = Boxes(boxes.center, boxes.size, boxes.yaw, label, speed=speed)
+    returns = annotations.returns
+    if config.beside == "radar":
+        returns = returns + sum(annotations.points[name] for name in frame.radar)
+    return GroundTruth(named, returns, in_range(boxes, config), lookalike)
 
 
 def in_range(boxes: Boxes, config: SecondConfig) -> Mask:
@@ -242,12 +246,13 @@ class TargetCriteria:
     min_returns: int  # LiDAR returns from it
     confidence: float  # in (0, 1)
     around: Annotated[bool | None, LEFT_OUT] = None  # whether the range also extends to the sides and behind
+    echoes: Annotated[bool | None, LEFT_OUT] = None  # whether a radar's echoes count as returns
 
     def lines(self) -> list[str]:
         """Return the criteria in words: a line on targets, a line on intervals."""
         return [
             f"targets: centre {_extent(self.range_m, around=bool(self.around))}, "
-            f"{self.min_returns} LiDAR returns or more; "
+            f"{self.min_returns} LiDAR returns{' and radar echoes' if self.echoes else ''} or more; "
             "others are neutral, and so are trucks and buses beside cars",
             f"intervals: {100 * self.confidence:g} %, over scenes",
         ]
@@ -255,7 +260,9 @@ class TargetCriteria:
 
 def target_criteria(config: SecondConfig) -> TargetCriteria:
     """Return the target criteria of an evaluation of a network of `config`."""
-    return TargetCriteria(tuple(config.range_m), MIN_RETURNS, CONFIDENCE, config.around or None)
+    return TargetCriteria(
+        tuple(config.range_m), MIN_RETURNS, CONFIDENCE, config.around or None, config.beside == "radar" or None
+    )
 
 
 def _extent(range_m: tuple[float, ...], *, around: bool = False) -> str:

@@ -34,6 +34,43 @@ def pillar_statistics(
         pillar_m: size of a pillar along x and along y [m].
         ground_z_m: height of the ground [m].
     """
+    kept, key, offset, (rows, columns) = _pillars_of(points, sample, range_m, pillar_m)
+    height = points[kept, 2] - ground_z_m
+    cells = samples * rows * columns
+    count = torch.bincount(key, minlength=cells).to(points.dtype)
+    whole = torch.column_stack((height, points[kept, 3], offset))
+    mean = whole.new_zeros(cells, 4).index_add_(0, key, whole) / count.clamp(min=1)[:, None]
+    extremes = [whole.new_zeros(cells).scatter_reduce_(0, key, height, how, include_self=False) for how in EXTREMES]
+    bins = whole.new_zeros(len(BINS_M), cells)
+    for number, (low_m, high_m) in enumerate(zip(BINS_M, (*BINS_M[1:], torch.inf), strict=True)):
+        bins[number, key[(height >= low_m) & (height < high_m)]] = 1
+    channels = torch.cat((torch.log1p(count)[None] / 2, torch.stack(extremes), mean.T, bins))
+    return channels.view(STATISTICS, samples, rows, columns).transpose(0, 1)
+
+
+def pillar_means(
+    points: Tensor, values: Tensor, sample: Tensor, samples: int, range_m: Sequence[float], pillar_m: Sequence[float]
+) -> Tensor:
+    """Return the map (samples, 1 + V, rows along y, columns along x) of values of points.
+
+    Channels: half the logarithm of one plus the number of points, and the means of the values (N, V); all are 0 in a
+    pillar without points. Arguments are those of `pillar_statistics`; only the first three columns of points count.
+    """
+    kept, key, _, (rows, columns) = _pillars_of(points, sample, range_m, pillar_m)
+    cells = samples * rows * columns
+    count = torch.bincount(key, minlength=cells).to(points.dtype)
+    total = values.new_zeros(cells, values.shape[1]).index_add_(0, key, values[kept])
+    channels = torch.cat((torch.log1p(count)[None] / 2, (total / count.clamp(min=1)[:, None]).T))
+    return channels.view(len(channels), samples, rows, columns).transpose(0, 1)
+
+
+def _pillars_of(
+    points: Tensor, sample: Tensor, range_m: Sequence[float], pillar_m: Sequence[float]
+) -> tuple[Tensor, Tensor, Tensor, tuple[int, int]]:
+    """Return which points are in range (K,), their pillars' keys (K,) and their offsets (K, 2) from its centre.
+
+    Offsets are in [-1/2, 1/2]; the last are the rows and columns of the grid.
+    """
     low, size = points.new_tensor(range_m[:2]), points.new_tensor(pillar_m[:2])
     columns, rows = (round((range_m[i + 3] - range_m[i]) / pillar_m[i]) for i in range(2))
     place = (points[:, :2] - low) / size
@@ -42,19 +79,8 @@ def pillar_statistics(
     inside &= (points[:, 2] >= range_m[2]) & (points[:, 2] < range_m[5])
     kept = inside.nonzero()[:, 0]
     cell = cell[kept]
-    height = points[kept, 2] - ground_z_m
     x, y = cell.long().unbind(1)
-    key = (sample[kept] * rows + y) * columns + x
-    cells = samples * rows * columns
-    count = torch.bincount(key, minlength=cells).to(points.dtype)
-    whole = torch.column_stack((height, points[kept, 3], place[kept] - cell - 0.5))
-    mean = whole.new_zeros(cells, 4).index_add_(0, key, whole) / count.clamp(min=1)[:, None]
-    extremes = [whole.new_zeros(cells).scatter_reduce_(0, key, height, how, include_self=False) for how in EXTREMES]
-    bins = whole.new_zeros(len(BINS_M), cells)
-    for number, (low_m, high_m) in enumerate(zip(BINS_M, (*BINS_M[1:], torch.inf), strict=True)):
-        bins[number, key[(height >= low_m) & (height < high_m)]] = 1
-    channels = torch.cat((torch.log1p(count)[None] / 2, torch.stack(extremes), mean.T, bins))
-    return channels.view(STATISTICS, samples, rows, columns).transpose(0, 1)
+    return kept, (sample[kept] * rows + y) * columns + x, place[kept] - cell - 0.5, (rows, columns)
 
 
 def grid_shape(range_m: Sequence[float], voxel_m: Sequence[float]) -> Triple:

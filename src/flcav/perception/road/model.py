@@ -57,9 +57,9 @@ class Block(nn.Module):
 
 
 class RoadNetwork(nn.Module):
-    """The network: a logit for every class of `ROAD_CLASSES` in every cell of `STRIDE` pixels."""
+    """The network: a logit for every class, by default of `ROAD_CLASSES`, in every cell of `STRIDE` pixels."""
 
-    def __init__(self, config: RoadConfig) -> None:
+    def __init__(self, config: RoadConfig, classes: int = len(ROAD_CLASSES)) -> None:
         super().__init__()
         self.config = config
         c2, c4, c8, c16 = config.channels
@@ -68,7 +68,7 @@ class RoadNetwork(nn.Module):
         self.to_16 = nn.Sequential(unit(c8, c16, stride=2), *(Block(c16, dilation) for dilation in config.dilations))
         self.narrow_16, self.narrow_8 = unit(c16, c8, 1), unit(c8, c4, 1)
         self.mix_8, self.mix_4 = unit(c8, c8), unit(c4, c4)
-        self.head = nn.Conv2d(c4, len(ROAD_CLASSES), 1)
+        self.head = nn.Conv2d(c4, classes, 1)
 
     def forward(self, pictures: Tensor) -> Tensor:
         """Return logits (B, classes, H / 4, W / 4) of images (B, 3, H, W) in [-1, 1]; H and W are multiples of 16."""

@@ -61,11 +61,11 @@ def plan_results(compared: PlanComparison) -> dict[str, Any]:
         {
             **asdict(row),
             "accuracy": row.describe_accuracy(),
-            "rounds": row.describe_rounds(),
+            "rounds": row.describe_choices(),
             "weight": task.weight,
             "vehicles": sum(task.edge_groups),
         }
-        for task, row in zip(resolve_problem(problem).tasks, plan.tasks, strict=True)
+        for task, row in zip(resolve_problem(settle_plan(problem, plan.tasks)).tasks, plan.tasks, strict=True)
     ]
     values = {
         "measure": {"name": MEASURES[problem.objective], "kind": problem.objective, **BETTER[problem.objective]},

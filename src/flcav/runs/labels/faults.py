@@ -8,7 +8,7 @@ import torch
 from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, concatenate
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import ground_truth
 from flcav.perception.ops.boxes import iou

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from flcav.geometry import Boxes, inverse
 from flcav.perception.metrics.detection import assign_targets, match_at_each
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import asked_of, in_range, network_from_lidar
 from flcav.runs.frames import Frames

@@ -8,7 +8,7 @@ import numpy as np
 from flcav.dataset.ground import DatasetGround
 from flcav.fusion.labels import label_sample
 from flcav.geometry import Boxes, inverse, pose
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample, move_points
 from flcav.perception.objects.truth import QUARTERS, choose_lidar
 from flcav.runs.frames import Frames

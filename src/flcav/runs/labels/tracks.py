@@ -16,7 +16,8 @@ from flcav.fusion.tracks import LEAST_SCORE, VehicleSweep, track_objects
 from flcav.geometry import Boxes, concatenate, inverse, transform_points
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import from_names, pack_arrays, to_names, unpack_arrays
-from flcav.perception.objects.model import Second, SecondConfig
+from flcav.perception.objects.config import SecondConfig
+from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import LOWEST_SCORE, detect_in
 from flcav.perception.objects.samples import Sample, crop_to_range
 from flcav.perception.objects.truth import asked_of, choose_lidar, detection_labels, in_range

@@ -9,6 +9,7 @@ from flcav.config import Config
 from flcav.federation.local_steps import MEASURED
 from flcav.sensors.rig import CalibrationError
 from flcav.sources.recipe import Duration, NamedRig, Warmup
+from flcav.storage.records import LEFT_OUT
 from flcav.world.map.parameters import RareKinds
 from flcav.world.scenarios.scenario import Scenario
 from flcav.world.weather import WeatherSchedule
@@ -106,6 +107,7 @@ class Recording(Config):
     """Changes to a task's recording settings, by the fields of `flcav.sources.recipe.Recipe`; None: no change."""
 
     vehicle_rig: NamedRig | None = None
+    rigs: Annotated[Mapping[str, NamedRig] | None, LEFT_OUT] = None
     pole_rig: NamedRig | None = None
     weather: WeatherSchedule | None = None
     warmup_s: Warmup | None = None

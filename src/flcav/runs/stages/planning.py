@@ -15,7 +15,7 @@ from flcav.network.radio.links import RadioLinks
 from flcav.optimization.allocation.uploads import UploadDemand, share_by_held, share_by_links
 from flcav.optimization.problem import Problem
 from flcav.perception.client import as_shared
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.task import find_configuration
 from flcav.perception.tasks import task_named
 from flcav.runs.allocation import PlanRequest, PlanSettings, make_plan, remake_plan

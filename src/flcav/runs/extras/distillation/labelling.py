@@ -30,8 +30,9 @@ from flcav.fusion.road import RoadView
 from flcav.geometry import Boxes
 from flcav.interface.progress import Report, ignore_progress
 from flcav.network.ledger import Direction, send_message
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.distillation import DistillationTerms, DistilledObjects
-from flcav.perception.objects.model import SecondConfig, second
+from flcav.perception.objects.model import second
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.task import OBJECTS
 from flcav.perception.objects.truth import choose_lidar

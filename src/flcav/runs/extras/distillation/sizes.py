@@ -11,7 +11,7 @@ import numpy as np
 from flcav.fusion.average import NavigationErrors, Sighting
 from flcav.fusion.distillation import Distillation, pack_sighting
 from flcav.network.ledger import BYTES_PER_MB
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.truth import asked_of
 from flcav.runs.frames import Frames, list_window
 from flcav.runs.labels.pseudo_labels import select_frames_near

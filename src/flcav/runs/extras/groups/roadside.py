@@ -9,7 +9,7 @@ from flcav.dataset.ground import DatasetGround
 from flcav.fusion.labels import label_sample
 from flcav.fusion.road import build_road_view, road_detector
 from flcav.geometry import Boxes
-from flcav.perception.objects.model import SecondConfig
+from flcav.perception.objects.config import SecondConfig
 from flcav.perception.objects.samples import Sample
 from flcav.perception.objects.truth import choose_lidar
 from flcav.runs.frames import Frames

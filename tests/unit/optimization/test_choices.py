@@ -187,7 +187,7 @@ def test_more_combinations_than_can_be_planned_are_one_sentence() -> None:
 
 def test_an_example_problem_tells_what_it_chose() -> None:
     plan = allocate(load_problem(Path(__file__).parents[3] / "recipes" / "allocation" / "steps_and_forms.yaml"))
-    assert plan.tasks[0].describe_rounds() == "4 times the local steps of the history, updates in int8"
+    assert plan.tasks[0].describe_choices() == "4 times the local steps of the history, updates in int8"
     few = allocate(parsed(one_task(local_steps=STEPS, forms=FORMS))).tasks[0]
-    assert few.describe_rounds() == "the local steps of the history, updates in int8"
-    assert allocate(parsed(one_task())).tasks[0].describe_rounds() == ""
+    assert few.describe_choices() == "the local steps of the history, updates in int8"
+    assert allocate(parsed(one_task())).tasks[0].describe_choices() == ""
