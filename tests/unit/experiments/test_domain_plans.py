@@ -41,8 +41,9 @@ def test_rates_are_multiplied_and_misread_weather_is_any_other() -> None:
     worse = spoil(model, {"objects": 0.5, "signs": 0.25, "weather": 0.3})
     assert worse.detected["Car"] == pytest.approx([0.5 * rate for rate in model.detected["Car"]])
     assert worse.lights == pytest.approx((0.25 * model.lights[0], model.lights[1]))
-    assert worse.weather["fog"]["fog"] == pytest.approx(0.3)
-    assert worse.weather["fog"]["night"] == pytest.approx(0.1)
+    fog = model.weather["fog"]
+    assert worse.weather["fog"]["fog"] == pytest.approx(0.3 * fog["fog"])
+    assert worse.weather["fog"]["night"] == pytest.approx(fog.get("night", 0.0) + 0.7 * fog["fog"] / 7)
     assert all(sum(read.values()) == pytest.approx(1) for read in worse.weather.values())
     assert spoil(model, dict.fromkeys(TASKS, 1.0)).detected == model.detected
 

@@ -76,7 +76,7 @@ def test_names_of_arms_keep_apart(run: Run):
     ]
     figure = figures.gains(rows)
     assert style.png(figure)[:4] == b"\x89PNG"
-    names = {text.get_text(): text.xy for text in figure.axes[0].texts if isinstance(text, Annotation)}
+    names = {text.get_text(): text.xyann for text in figure.axes[0].texts if isinstance(text, Annotation)}
     assert names.keys() == {"main", "other", "third", "bare"}
     heights = sorted(names[name][1] for name in ("main", "other", "bare"))
     low, high = figure.axes[0].get_ylim()

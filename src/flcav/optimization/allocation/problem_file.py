@@ -127,6 +127,8 @@ def insert_curves(text: str, tasks: Mapping[str, FittedFields], k: int, origin: 
         if name not in known:
             raise InputError(f"{origin}: the history is of task {name!r}, which is none of {', '.join(known)}")
         held, node = known[name]
+        if isinstance(several := held.get("network"), list) and len(several) > 1:
+            raise InputError(f"{origin}: task {name!r} has {len(several)} networks, and a curve is of one of them")
         fields = {field: value for field, value in _fields(fitted).items() if _wanted(field, value, held)}
         if "networks" in values:  # a graph, whose tasks have a curve and no more
             fields = {"curve": fields["curve"]}
