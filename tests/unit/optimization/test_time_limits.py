@@ -184,3 +184,12 @@ def test_a_horizon_in_which_nothing_takes_time_is_told() -> None:
     assert warning == "horizon_s = 10 limits nothing: no task has train_s, vehicle_train_s or uplink_mbps"
     values["tasks"][0]["train_s"] = 1.0
     assert allocate(parsed(values)).warnings == ()
+
+
+@pytest.mark.parametrize("name", BASELINES)
+def test_baselines_take_a_task_that_needs_no_time_beside_one_that_does(name: str) -> None:
+    values = timed(2, 2, "additive", 40.0, budget=300.0)
+    del values["tasks"][1]["train_s"]
+    plan = baseline(parsed(values), name)
+    assert plan.tasks[0].edge_rounds * values["tasks"][0]["train_s"] <= 40.0 * (1 + 1e-9)
+    assert plan.objective >= allocate(parsed(values)).objective * (1 - 1e-9)

@@ -25,7 +25,7 @@ from flcav.optimization.allocation.vehicles import split_plan, trains
 from flcav.optimization.problem import AllocationTask, Problem
 from flcav.optimization.solvers.branches import solve_branches
 from flcav.optimization.solvers.cutting_planes import Program, continuous_optimum
-from flcav.optimization.solvers.instance import Infeasible, Instance, build_instance, own_clocks, price_once
+from flcav.optimization.solvers.instance import Clock, Infeasible, Instance, build_instance, own_clocks, price_once
 from flcav.optimization.solvers.rounding import trim
 from flcav.optimization.solvers.separable import solve_two_budgets
 from flcav.optimization.solvers.weighted import list_drifts, list_terms, minimise_weighted_error
@@ -86,7 +86,7 @@ def equal_stages(problem: Problem, made: Instance) -> Array:
     for stage in range(3):
         most = np.where(np.arange(3) == stage, high, x)
         budget = x.ravel() @ made.cost + np.where(uses[stage, :], share, 0.0)
-        limited = _limited(problem, x, most, budget)
+        limited = _limited(problem, x, most, budget, own_clocks(problem))
         x = _minimise(limited).reshape(-1, 3)
     return x.ravel()
 
@@ -99,11 +99,11 @@ def equal_tasks(problem: Problem, made: Instance) -> Array:
     low, high = made.low.reshape(-1, 3), made.high.reshape(-1, 3)
     cost = made.cost.reshape(-1, 3, len(made.budget))
     share = (made.budget - made.low @ made.cost) / len(low)
-    x = low.copy()
+    x, clocks = low.copy(), own_clocks(problem)  # a task alone may have fewer
     for number, task in enumerate(problem.tasks):
         alone = problem.model_copy(update={"tasks": (task,)})
         row = slice(number, number + 1)
-        limited = _limited(alone, low[row], high[row], low[number] @ cost[number] + share)
+        limited = _limited(alone, low[row], high[row], low[number] @ cost[number] + share, clocks)
         x[number] = _minimise(limited)
     return x.ravel()
 
@@ -161,8 +161,8 @@ def _round_down(branch: Problem) -> tuple[float, Array]:
     return made.error(x) + made.floor, x
 
 
-def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Problem:
-    """Return `problem` with other limits (N, 3) and budgets (L,): of the links [MB], and of its `own_clocks` [s].
+def _limited(problem: Problem, low: Array, high: Array, budget: Array, clocks: Sequence[Clock]) -> Problem:
+    """Return `problem` with other limits (N, 3) and budgets (L,): of the links [MB], and of `clocks` [s].
 
     The constant cost `price_once` is added to the wireless budget.
     """
@@ -176,8 +176,9 @@ def _limited(problem: Problem, low: Array, high: Array, budget: Array) -> Proble
     limited = problem.model_copy(update={"tasks": tuple(tasks)})
     links = {"wireless": float(budget[0]) + price_once(limited), "wireline": float(budget[1])}
     budgets = problem.budgets_mb.model_copy(update=links)
-    clocks = zip(own_clocks(problem), budget[2:], strict=True)
-    seconds: dict[str, float | None] = {clock.limit: float(left) for clock, left in clocks}
+    seconds: dict[str, float | None] = {
+        clock.limit: float(left) for clock, left in zip(clocks, budget[2:], strict=True)
+    }
     if seconds.get("horizon_s") == 0:
         seconds["horizon_s"] = None  # only before the first round
     return limited.model_copy(update={"budgets_mb": budgets, **seconds})
