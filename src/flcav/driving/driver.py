@@ -164,7 +164,7 @@ def decide_controls(
         occupied = find_occupied(line, own.along, seen.boxes, seen.path, seen.yaw, vehicle.size[1] / 2, kept)
         return _least([*needs, *_avoid(line, own, seen, occupied, half, wanted)])
 
-    line, (acceleration, cause) = _choose_line(route, own, seen, vehicle, wanted, margin, judge, settings, lanes)
+    line, (acceleration, cause) = _choose_line(route, own, seen, vehicle, wanted, margin, judge, lanes)
     emergency = acceleration < -EMERGENCY_MPS2
     if emergency:
         acceleration = -vehicle.brake_mps2
@@ -188,7 +188,6 @@ def _choose_line(
     wanted: float,
     margin: Array,
     judge: Callable[[ReferenceLine, Array], Need],
-    settings: DriverSettings,
     lanes: BaseGeometry | None,
 ) -> tuple[ReferenceLine, Need]:
     """Return the line to follow and its need: the route, or a line around a standing vehicle that blocks it.

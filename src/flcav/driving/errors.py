@@ -94,6 +94,8 @@ def load_error_model(path: Path | None = None) -> ErrorModel:
     model = ErrorModel.from_json(read_json(path), str(path))
     if missing := [name for name in MOTIONS if len(model.growth.get(name, ())) != len(TIMES_S)]:
         raise InputError(f"{path}: no growth of '{missing[0]}' over {len(TIMES_S)} times; measure the errors again")
+    if missing := [name for name in CLASSES if name not in model.detected or name not in model.sd]:
+        raise InputError(f"{path}: no errors of '{missing[0]}'; measure the errors again")
     return model
 
 

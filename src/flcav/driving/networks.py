@@ -1,8 +1,8 @@
 """Perception by the networks of the package: LiDAR at 10 Hz and a camera at 2 Hz on the ego vehicle of a live world.
 
 `objects` detects road users in the sweep, which are tracked together with what stands on the lanes and has no class
-(`obstacles`), and `trajectory` forecasts them; `signs` detects lights in
-the picture, which are matched with the projected signal heads of the map; `weather` gives the share of the speed limit.
+(`obstacles`), and `trajectory` forecasts them; `signs` detects lights in the picture, which are matched with the
+projected signal heads of the map; `weather` gives the share of the speed limit.
 Speed limit signs and stop signs are detected but not used: a route has its limits from the map.
 """
 

@@ -17,6 +17,7 @@ from flcav.driving.following import CERTAIN, Following
 from flcav.driving.jobs import DriveJob, Sensed, run_jobs
 from flcav.driving.measures import DriveResult, Hit
 from flcav.driving.networks import load_road_map
+from flcav.driving.obstacles import OBSTACLE
 from flcav.driving.road import merge_detections, pack_tracks
 from flcav.driving.scenarios import list_scenarios
 from flcav.driving.seen import TIMES_S
@@ -194,6 +195,15 @@ def test_an_error_model_without_a_kind_of_motion_is_refused(tmp_path: Path) -> N
     path = tmp_path / "errors.json"
     path.write_text(json.dumps(replace(model, growth={"drives": model.growth["drives"]}).as_json()))
     with pytest.raises(InputError, match="no growth of 'stands'"):
+        load_error_model(path)
+
+
+def test_an_error_model_without_a_class_is_refused(tmp_path: Path) -> None:
+    model = load_error_model()
+    known = {name: rates for name, rates in model.detected.items() if name != OBSTACLE}
+    path = tmp_path / "errors.json"
+    path.write_text(json.dumps(replace(model, detected=known).as_json()))
+    with pytest.raises(InputError, match="no errors of 'Obstacle'"):
         load_error_model(path)
 
 

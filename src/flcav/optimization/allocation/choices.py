@@ -171,7 +171,7 @@ def list_settled(problem: Problem) -> Iterator[tuple[tuple[TaskChoice, ...], Pro
 
 
 class Told(Protocol):
-    """What says which choice of a task was taken: a plan of it, or its progress."""
+    """Record of the choices that were taken for a task: its plan, or its progress."""
 
     @property
     def network(self) -> str | None: ...  # noqa: D102
