@@ -1,10 +1,8 @@
 """A recording from CARLA's protocol, by the genuine client, of our own server: no CARLA runs here."""
 
-import contextlib
 import json
 import os
 import signal
-import socket
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -14,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from ports import find_port
 from scipy.spatial import KDTree
 
 from flcav.cli.main import run
@@ -42,18 +41,6 @@ FIELDS: dict[str, Any] = {
 }
 
 
-def free_port() -> int:
-    """Return a port with a free one after it."""
-    for _ in range(100):
-        with socket.socket() as one, socket.socket() as other:
-            one.bind(("127.0.0.1", 0))
-            port = one.getsockname()[1]
-            with contextlib.suppress(OSError):
-                other.bind(("127.0.0.1", port + 1))
-                return port
-    raise OSError("no two free ports")
-
-
 def start_server(port: int) -> "subprocess.Popen[str]":
     command = [sys.executable, "-m", "flcav", "carla", "serve", "grid", "--port", str(port)]
     server = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
@@ -65,13 +52,13 @@ def start_server(port: int) -> "subprocess.Popen[str]":
 @pytest.fixture(scope="module")
 def asked() -> Iterator[dict[str, Any]]:
     """Return the fields of a recipe for a server that runs."""
-    port = free_port()
+    port = find_port(2)
     server = start_server(port)
     yield {
         **FIELDS,
         "source": "carla",
         "port": port,
-        "traffic_port": free_port(),
+        "traffic_port": find_port(),
         "vehicles": 8,
         "pedestrians": 12,
         "timeout_s": 60,
@@ -174,16 +161,16 @@ def test_what_a_server_lacks_is_one_sentence(
 
 
 def test_no_server_is_one_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    fields = {**FIELDS, "source": "carla", "port": free_port(), "timeout_s": 1}
+    fields = {**FIELDS, "source": "carla", "port": find_port(2), "timeout_s": 1}
     code, said = refused(fields, tmp_path, capsys)
     assert code == 1
     assert "time-out of 1000ms" in said
 
 
 def test_a_lost_server_is_named_and_the_recording_goes_on(tmp_path: Path) -> None:
-    port = free_port()
+    port = find_port(2)
     server = start_server(port)
-    fields = {**FIELDS, "source": "carla", "port": port, "traffic_port": free_port(), "vehicles": 4, "timeout_s": 3}
+    fields = {**FIELDS, "source": "carla", "port": port, "traffic_port": find_port(), "vehicles": 4, "timeout_s": 3}
     fields |= {"poles": [], "scenes": 2, "spins_per_scene": 20}
 
     def kill(frames: int) -> Callable[[int, int, str], None]:

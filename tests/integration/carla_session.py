@@ -1,6 +1,6 @@
 """A session of the genuine CARLA client, in a process of its own, since a client that is misled aborts its process.
 
-python carla_session.py NAME PORT runs the function of that name; it prints "passed" at its end.
+python carla_session.py NAME PORT TRAFFIC_PORT runs the function of that name; it prints "passed" at its end.
 """
 
 import queue
@@ -247,7 +247,7 @@ def traffic(client: Any) -> None:
     """The client's own Traffic Manager drives cars."""
     with synchronous(client) as world:
         library, points = world.get_blueprint_library(), world.get_map().get_spawn_points()
-        manager = client.get_trafficmanager(int(sys.argv[2]) + 9)
+        manager = client.get_trafficmanager(int(sys.argv[3]))
         manager.set_synchronous_mode(True)
         manager.set_random_device_seed(0)
         car = library.find("vehicle.tesla.model3")
@@ -285,7 +285,7 @@ def loading(client: Any) -> None:
 
 def loading_beside_a_manager(client: Any) -> None:
     """A Traffic Manager that drives nobody, whose thread goes on while the client loads maps."""
-    manager = client.get_trafficmanager(int(sys.argv[2]) + 9)
+    manager = client.get_trafficmanager(int(sys.argv[3]))
     for town in ("ring", "suburb") * 4:
         assert client.load_world(town).get_map().name.endswith(town)
     manager.shut_down()

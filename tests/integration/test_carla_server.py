@@ -11,6 +11,7 @@ from pathlib import Path
 
 import msgpack
 import pytest
+from ports import find_port
 from waiting import LONGEST_S
 
 from flcav.carla.server import wire
@@ -29,22 +30,9 @@ SESSIONS = (
 )  # the last ones load other maps
 
 
-def _find_port() -> int:
-    """Return a free port whose next one is free too."""
-    while True:
-        with socket.socket() as one, socket.socket() as other:
-            one.bind(("127.0.0.1", 0))
-            port = one.getsockname()[1]
-            try:
-                other.bind(("127.0.0.1", port + 1))
-            except OSError:
-                continue
-            return port
-
-
 @pytest.fixture(scope="module")
 def port(tmp_path_factory):
-    port = _find_port()
+    port = find_port(2)
     command = [sys.executable, "-m", "flcav", "carla", "serve", "suburb", "--port", str(port)]
     log = tmp_path_factory.mktemp("carla") / "log"
     with log.open("w") as errors:
@@ -64,7 +52,7 @@ def test_the_genuine_client(session, port):
     pytest.importorskip("carla", reason="needs the extra 'carla'")
     environment = os.environ | {"PYTHONUNBUFFERED": "1"}
     done = subprocess.run(
-        [sys.executable, str(SESSION), session, str(port)],
+        [sys.executable, str(SESSION), session, str(port), str(find_port())],
         capture_output=True,
         text=True,
         timeout=LONGEST_S,
@@ -126,7 +114,7 @@ def test_a_cue_is_answered_after_the_state_of_its_tick(port):
     [(signal.SIGTERM, 0, ""), pytest.param(signal.SIGINT, 130, "flcav: interrupted\n", marks=pytest.mark.slow)],
 )
 def test_it_ends_without_a_word_about_its_clients_and_leaves_nothing(how, code, told, tmp_path):
-    port = _find_port()
+    port = find_port(2)
     command = [sys.executable, "-m", "flcav", "carla", "serve", "suburb", "--port", str(port)]
     here = {"cwd": tmp_path, "env": os.environ | {"TMPDIR": str(tmp_path)}}
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, **here) as server:
@@ -171,6 +159,6 @@ def test_a_port_in_use_is_one_sentence(port, capsys):
 )
 def test_bad_input_is_one_sentence(arguments, told, capsys):
     with pytest.raises(SystemExit) as left:
-        run(["carla", "serve", "--port", str(_find_port()), *arguments])
+        run(["carla", "serve", "--port", str(find_port(2)), *arguments])
     assert left.value.code == 2
     assert told in capsys.readouterr().err
