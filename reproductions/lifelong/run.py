@@ -116,7 +116,8 @@ def count_mended(arms: Sequence[LifelongArm]) -> Mended:
 
 def draw_lifelong(results: LifelongResult) -> bytes:
     """Return AP50 on each condition after each condition, a line per arm, as a PNG."""
-    return style.png(draw_conditions(results.tested, MEASURE))
+    tested = {name: {arm: results.tested[name][arm] for arm in ARMS} for name in results.conditions}
+    return style.png(draw_conditions(tested, MEASURE))
 
 
 def lifelong_tables(results: LifelongResult) -> dict[str, str]:

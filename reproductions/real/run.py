@@ -48,6 +48,7 @@ from flcav.storage.records import Record
 
 DATA = "FLCAV_REAL_DATA"  # environment variable: the folder whose `real` holds the data
 RECIPE = Path(__file__).with_name("real.yaml")
+TITLES = {KARLSRUHE: "Karlsruhe (KITTI)", ASTYX: "Astyx"}
 GAIN, ALIKE = 0.20, 0.05  # AP50: that the claim is about; within which one network serves as well as another
 Compared = tuple[str, str, str]  # region, network, network before
 EXPECTED: Mapping[Compared, tuple[float, float]] = {  # bounds of the difference in AP50
@@ -208,11 +209,13 @@ def _run(out: Path, options: Options) -> Outcome[RealResult]:
 
 def draw_networks(results: RealResult) -> bytes:
     """Return AP50 of all networks by region, with intervals, as a PNG."""
-    return style.png(figures.arms(_list_estimates(results)))
-
-
-def _list_estimates(results: RealResult) -> dict[str, dict[str, Estimate]]:
-    return {region: {name: each.ap50 for name, each in of.items()} for region, of in results.reached.items()}
+    reached = {region: results.reached[region] for region in TITLES}
+    panels: dict[str, dict[str, Estimate]] = {
+        title: {name: reached[region][name].ap50 for name in NETWORKS if name in reached[region]}
+        for region, title in TITLES.items()
+    }
+    counts = [each.trainings for of in reached.values() for each in of.values()]
+    return style.png(figures.arms(panels, f"AP50, mean of {min(counts)} to {max(counts)} trainings"))
 
 
 def tabulate_real(results: RealResult) -> dict[str, str]:

@@ -66,7 +66,7 @@ def reproduce(
     with when_interrupted():
         outcome = experiment.run(out, options)
     if outcome.results is not None:
-        write_json(out / "result.json", experiment.encode(outcome.results))
+        write_json(out / "result.json", experiment.encode(outcome.results), sort=False)
     for name, picture in outcome.pictures.items():
         write_bytes(out / name, picture)
     for sentence in outcome.sentences:

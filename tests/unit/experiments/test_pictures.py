@@ -34,6 +34,7 @@ DRAWN = {  # experiment -> module and function that draw it
     "pole_rules": ("pole_rules", "draw_rules"),
     "predictions": ("predictions", "draw_predictions"),
     "radio_labels": ("radio_labels", "draw_labels"),
+    "real": ("real", "draw_networks"),
     "road_regions": ("road_regions", "draw"),
     "task_objects": ("task_objects", "_draw"),
     "task_signs": ("task_signs", "_draw"),
@@ -41,7 +42,7 @@ DRAWN = {  # experiment -> module and function that draw it
     "vehicle_worth": ("vehicle_worth", "draw_worth"),
 }
 SPREAD = re.compile(r"95 %|range|(dots|circles): (\d+ )?(the )?seed")
-COUNTED = re.compile(r"\d+ seeds|(dots|circles): (the seed|seeds)|number of targets")
+COUNTED = re.compile(r"\d+ (seeds|trainings)|(dots|circles): (the seed|seeds)|number of targets")
 
 
 def draw(name: str, monkeypatch: pytest.MonkeyPatch) -> tuple[list[Figure], Any]:
@@ -96,3 +97,11 @@ def test_the_label_of_means_counts_their_seeds() -> None:
     assert name_measure("AP50", [eight, eight]) == "AP50 (mean of 8 seeds, 95 % interval)"
     assert name_measure("AP50", [five, eight]) == "AP50 (mean of 5 to 8 seeds, 95 % interval)"
     assert name_measure("AP50", [MeanOverSeeds(0.5, 0.4, 0.6)]) == "AP50 (95 % interval)"
+
+
+def test_conditions_are_drawn_in_the_order_in_which_they_came(monkeypatch: pytest.MonkeyPatch) -> None:
+    ((figure,), results) = draw("lifelong", monkeypatch)
+    assert sorted(results.conditions) != [*results.conditions]  # in the file they are sorted
+    for axes in figure.axes:
+        assert [label.get_text() for label in axes.get_xticklabels()] == ["start", *results.conditions]
+    assert [axes.get_title(loc="left") for axes in figure.axes] == [f"tested in {name}" for name in results.conditions]

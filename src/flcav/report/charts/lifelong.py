@@ -13,6 +13,7 @@ from flcav.statistics.estimates import Estimate
 
 COLOURS = (style.BLUE, style.VERMILLION, style.GREEN, style.ORANGE, style.PURPLE, style.SKY)  # of conditions, in turn
 ARM_COLOURS = (style.BLUE, style.ORANGE, style.MUTED)  # of arms, in turn
+SHORT = 8  # characters of a name that fits below an axis as it is
 APART = 0.06  # horizontal distance of arms
 
 
@@ -61,7 +62,8 @@ def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measu
     `found` is by tested condition, in order, and by arm: pretrained, then after each condition.
     """
     conditions = [*found]
-    figure = style.canvas(2.4 * len(conditions), 3.2)
+    turn = 40 if max(map(len, conditions)) > SHORT else 0
+    figure = style.canvas(2.4 * len(conditions), 3.5)
     panels = figure.subplots(1, len(conditions), sharey=True, squeeze=False)[0]
     for number, (panel, (condition, arms)) in enumerate(zip(panels, found.items(), strict=True)):
         for place, ((arm, means), colour) in enumerate(zip(arms.items(), ARM_COLOURS, strict=False)):
@@ -70,7 +72,9 @@ def draw_conditions(found: Mapping[str, Mapping[str, Sequence[Estimate]]], measu
             for x, estimate in zip(at.tolist(), means, strict=True):
                 style.interval(panel, x, estimate, color=colour, linewidth=1.0)
         panel.axvspan(number + 0.5, number + 1.5, color=style.SIDEWALK, zorder=0)
-        panel.set_xticks(range(len(conditions) + 1), ["start", *conditions], rotation=40, ha="right")
+        panel.set_xticks(
+            range(len(conditions) + 1), ["start", *conditions], rotation=turn, ha="right" if turn else "center"
+        )
         panel.set(title=f"tested in {condition}")
         panel.grid(axis="y")
     every = [estimate for arms in found.values() for means in arms.values() for estimate in means]
