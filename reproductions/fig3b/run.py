@@ -34,7 +34,7 @@ from flcav.sources.embedded import EmbeddedSource
 from flcav.sources.recipe import Recipe
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record
-from flcav.world.line_of_sight import count_visible_actors
+from flcav.world.line_of_sight import count_visible_actors, find_viewshed
 from flcav.world.map.census import measure_traffic_density
 from flcav.world.map.town import Town
 
@@ -219,12 +219,14 @@ def _place(candidates: Candidates, town: Town, scores: Mapping[str, NDArray[np.f
 
 def _draw(town: Town, errors: NDArray[np.float64], kind: NDArray[np.str_], results: Fig3b) -> bytes:
     first = {chosen.rule: [str(pole) for pole in chosen.poles] for chosen in results.placed if chosen.count == 1}
+    poles = poles_of(town)
     scene = ErrorMap(
         town,
         errors,
         kind,
-        poles_of(town),
+        poles,
         chosen=dict.fromkeys(first["VRCSP"], RANGE_M),
+        viewsheds={name: find_viewshed(town, [], poles[name], RANGE_M) for name in first["VRCSP"]},
         conventional={DENSEST: first["traffic density"], MOST_VISIBLE: first["visible objects"]},
         zones={str(zone.pole): zone.per_hectare for zone in results.zones},
         zone_m=ZONE_M,

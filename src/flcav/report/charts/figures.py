@@ -140,7 +140,7 @@ def seeds(panels: Mapping[str, Mapping[str, Estimate]]) -> Figure:
 @style.styled
 def by_megabytes(lines: Mapping[str, Sequence[tuple[float, Estimate]]]) -> Figure:
     """Return AP50 against uplink megabytes, with intervals: a line per name."""
-    figure = style.canvas(1.6 * WIDTH, 0.9 * WIDTH)
+    figure = style.canvas(1.6 * WIDTH, 1.1 * WIDTH)
     axes = figure.add_subplot()
     runs.draw_by_megabytes(axes, lines)
     style.key(figure, axes.get_legend_handles_labels()[0], ncols=2)
