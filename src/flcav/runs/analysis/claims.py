@@ -1,29 +1,18 @@
 """The claims of a run as rows of one table, in the words of a colleague."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from flcav.runs.analysis.findings import judge_differences
+from flcav.runs.analysis.findings import NAMES, judge_differences, word_arm
 from flcav.runs.arms import Setting, resolve_settings
-from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
+from flcav.runs.recipe import EDGE, MAIN, RunRecipe
 from flcav.runs.results.run import Run
 from flcav.runs.results.tests import Difference
 from flcav.statistics.estimates import Estimate
 from flcav.statistics.verdicts import ESTIMATE
 from flcav.storage.records import select
-
-NAMES = {
-    PRETRAIN: "Pretraining",
-    EDGE: "Edge FL",
-    CLOUD: "Cloud FL",
-    CENTRAL: "Central training",
-    MORE_EDGE: "Further edge FL",
-}
-BY_TASK = ("labels", "plan")  # settings whose fields are tasks
-LONGEST = 60  # characters of the settings of an arm that are named; the name of others is
 
 
 @dataclass(frozen=True)
@@ -72,6 +61,7 @@ def list_claims(run: Run) -> list[ClaimRow]:
 def word_claim(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setting], *, loss: bool = False) -> str:
     """Return a claim in words: what is better than what; of a loss to an upper bound what it is against."""
     ours = NAMES[each.stage]
+    ours = ours[0].upper() + ours[1:]
     if each.before_arm == MAIN:
         if each.stage == EDGE:
             return f"{ours} beats the pretrained network"
@@ -81,38 +71,6 @@ def word_claim(each: Difference, recipe: RunRecipe, settings: Mapping[str, Setti
         return f"{ours} helps {'at home' if home else 'where no vehicle learned'}, too"
     other = word_arm(settings[MAIN], settings[each.before_arm], recipe, each)
     return f"{ours} against {other}, an upper bound" if loss else f"{ours} beats {other}"
-
-
-def word_arm(main: Setting, other: Setting, recipe: RunRecipe, each: Difference) -> str:
-    """Return what an arm is, in words: its training, its poles, its labels, or else its settings or its name."""
-    if other.central == "pretrain":
-        return "central training for as many steps"
-    if other.central == "federate":
-        return "central training on the true labels of its vehicles"
-    if other.central == ALL:
-        return "central training on the true labels of all towns"
-    if main.placement.rule != other.placement.rule:
-        poles = {"none": "no pole", "densest": "the pole with the densest traffic", "random": "a random pole"}
-        if other.placement.rule in poles:
-            return poles[other.placement.rule]
-    if (main.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
-        return "labels of an ideal road detector"
-    told = ", ".join(_list_settings(recipe.arms[other.name].model_dump(exclude_unset=True, mode="json")))
-    return f"the same with {told}" if 0 < len(told) <= LONGEST else f"the arm {other.name}"
-
-
-def _list_settings(given: Mapping[str, Any], outer: str = "") -> Iterator[str]:
-    """Yield the settings of an arm as "name value", without those of which stages and regions it has.
-
-    A setting by task, such as the labels, has its name in place of the task's.
-    """
-    for name, value in given.items():
-        if isinstance(value, Mapping) and value:
-            yield from _list_settings(value, name)
-        elif name not in ("stages", "regions"):
-            told = outer if outer in BY_TASK else name
-            listed = ", ".join(map(str, value)) if isinstance(value, list) else value
-            yield told.replace("_", " ") if value in ({}, True) else f"{told.replace('_', ' ')} {listed}"
 
 
 def _mean(run: Run, each: Difference, arm: str, stage: str) -> float:

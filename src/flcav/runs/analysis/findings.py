@@ -12,15 +12,15 @@ that the run beats an upper bound, such as an arm with an ideal road detector: t
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from flcav.runs.arms import Setting
 from flcav.runs.label_sources import LABEL_SOURCES
-from flcav.runs.recipe import ALL, CLOUD, EDGE, ELSEWHERE, MAIN, RunRecipe
+from flcav.runs.recipe import ALL, CENTRAL, CLOUD, EDGE, ELSEWHERE, MAIN, MORE_EDGE, PRETRAIN, RunRecipe
 from flcav.runs.results.run import ArmResult
 from flcav.runs.results.tests import Difference, RunFinding, Test, name_stage
 from flcav.statistics.seeds import MeanOverSeeds, of_one_training
@@ -39,6 +39,15 @@ from flcav.statistics.verdicts import (
 Kind = Literal["claim", "primary", "secondary", "loss"]
 OVER_PRETRAINING = "Does federated learning beat pretraining alone?"
 OVER_EDGE = "Does cloud FL add to edge FL?"
+NAMES = {
+    PRETRAIN: "pretraining",
+    EDGE: "edge FL",
+    CLOUD: "cloud FL",
+    CENTRAL: "central training",
+    MORE_EDGE: "further edge FL",
+}
+BY_TASK = ("labels", "plan")  # settings whose fields are tasks
+LONGEST = 60  # characters of the settings of an arm that are named; the name of others is
 
 
 @dataclass(frozen=True)
@@ -136,8 +145,40 @@ def _question(each: Difference, recipe: RunRecipe, settings: Mapping[str, Settin
     if (main.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
         return "What do labels of the trained road detector lose to those of an ideal one?"
     if _is_bound(main, other, each.task):
-        return f"What does the run lose to its arm '{each.before_arm}', which learns from ground truth?"
-    return f"Does the run beat its arm '{each.before_arm}'?"
+        return f"What does {NAMES[each.stage]} lose to {word_arm(main, other, recipe, each)}, an upper bound?"
+    return f"Does {NAMES[each.stage]} beat {word_arm(main, other, recipe, each)}?"
+
+
+def word_arm(main: Setting, other: Setting, recipe: RunRecipe, each: Difference) -> str:
+    """Return what an arm is, in words: its training, its poles, its labels, or else its settings or its name."""
+    if other.central == "pretrain":
+        return "central training for as many steps"
+    if other.central == "federate":
+        return "central training on the true labels of its vehicles"
+    if other.central == ALL:
+        return "central training on the true labels of all towns"
+    if main.placement.rule != other.placement.rule:
+        poles = {"none": "no pole", "densest": "the pole with the densest traffic", "random": "a random pole"}
+        if other.placement.rule in poles:
+            return poles[other.placement.rule]
+    if (main.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
+        return "labels of an ideal road detector"
+    told = ", ".join(_list_settings(recipe.arms[other.name].model_dump(exclude_unset=True, mode="json")))
+    return f"the same with {told}" if 0 < len(told) <= LONGEST else f"the arm {other.name}"
+
+
+def _list_settings(given: Mapping[str, Any], outer: str = "") -> Iterator[str]:
+    """Yield the settings of an arm as "name value", without those of which stages and regions it has.
+
+    A setting by task, such as the labels, has its name in place of the task's.
+    """
+    for name, value in given.items():
+        if isinstance(value, Mapping) and value:
+            yield from _list_settings(value, name)
+        elif name not in ("stages", "regions"):
+            told = outer if outer in BY_TASK else name
+            listed = ", ".join(map(str, value)) if isinstance(value, list) else value
+            yield told.replace("_", " ") if value in ({}, True) else f"{told.replace('_', ' ')} {listed}"
 
 
 TRAINED = ("plan", "labels", "distillation", "federation", "training", "central")  # settings besides the placement
