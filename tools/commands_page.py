@@ -50,6 +50,7 @@ class Example(BaseModel):
     run: tuple[str, ...] = ()
     shown: tuple[str, ...] = ()
     picture: str = ""  # a file that it writes, shown below
+    next: str = ""  # the command that follows, which a terminal shows
 
 
 class Section(BaseModel):

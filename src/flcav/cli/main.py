@@ -22,7 +22,7 @@ from flcav.cli.drive import drive
 from flcav.cli.federate import federate
 from flcav.cli.fleet import fleet
 from flcav.cli.network import radio, rounds
-from flcav.cli.options import add_examples, escape_markup
+from flcav.cli.options import add_examples, add_next_steps, escape_markup
 from flcav.cli.perception import errors, evaluate, infer, train
 from flcav.cli.pictures import birdseye, camera, view
 from flcav.cli.planning.allocate import allocate, replan
@@ -79,9 +79,12 @@ for name, group in {"towns": towns, "odd": odd, "carla": carla, "fleet": fleet, 
 
 
 @functools.cache
-def _build_command() -> click.Command:
-    """Return the command line as Click has it, which takes 50 ms to build."""
-    return escape_markup(typer.main.get_command(app))
+def _build_command(*, terminal: bool) -> click.Command:
+    """Return the command line as Click has it, which takes 50 ms to build; on a terminal it tells what follows."""
+    command = escape_markup(typer.main.get_command(app))
+    if terminal and isinstance(command, click.Group):
+        add_next_steps(command)
+    return command
 
 
 def run(arguments: list[str] | None = None) -> None:
@@ -91,7 +94,7 @@ def run(arguments: list[str] | None = None) -> None:
     ):  # not within another program
         signal.signal(signal.SIGINT, _interrupt)
     try:
-        command = _build_command()
+        command = _build_command(terminal=sys.stderr.isatty())
         typed = sys.argv[1:] if arguments is None else arguments
         if isinstance(command, click.Group) and (not typed or "--help" in typed):
             add_examples(command)

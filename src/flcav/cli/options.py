@@ -1,8 +1,11 @@
 """Options shared by several commands, their choices and checks, and the layout of the help."""
 
+import functools
 import inspect
 import math
-from collections.abc import Iterable, Iterator
+import shlex
+import string
+from collections.abc import Callable, Iterable, Iterator
 from enum import StrEnum
 from pathlib import Path
 
@@ -12,6 +15,7 @@ import yaml
 from click.core import ParameterSource
 from rich.markup import escape
 
+from flcav.cli.terminal import echo
 from flcav.config import InputError
 from flcav.perception.tasks import TASKS
 
@@ -156,6 +160,7 @@ def escape_markup(command: click.Command) -> click.Command:
     return command
 
 
+SHORT_OF_IT = ("as_json", "dry", "listed")  # options after which nothing follows
 SHOWN = Path(__file__).with_name("commands.yaml")  # groups of commands, with examples
 
 
@@ -175,6 +180,34 @@ def add_examples(app: click.Group) -> None:
                 typed = next(line.split(" | ")[0] for line in lines if f"{line} ".startswith(f"flcav {name} "))
                 named[name].epilog = f"Example: [bold]{escape(typed)}[/bold]"
     app.commands = {**listed, **app.commands}
+
+
+def add_next_steps(app: click.Group) -> None:
+    """Let each command of `app` print on stderr, once it is done, the command that usually follows, by `SHOWN`.
+
+    Words in capitals are the user's to replace. Nothing is printed after the options `SHORT_OF_IT`.
+    """
+    named = dict(_walk(app))
+    for section in yaml.safe_load(SHOWN.read_text(encoding="utf-8")):
+        for name, example in section["commands"].items():
+            if "next" in example and (command := named.get(name)) and command.callback:
+                command.callback = _tell_after(command.callback, example["next"])
+
+
+def _tell_after(command: Callable[..., object], template: str) -> Callable[..., object]:
+    """Return a command that then prints a template with its parameters; not one that needs a parameter left out."""
+
+    @functools.wraps(command)
+    def followed(**given: object) -> object:
+        answer = command(**given)
+        first = {name: value[0] if isinstance(value, list) and value else value for name, value in given.items()}
+        told = {name: shlex.quote(str(value)) for name, value in first.items() if value not in (None, [])}
+        needed = {name for _, name, _, _ in string.Formatter().parse(template) if name}
+        if needed <= told.keys() and not any(given.get(name) for name in SHORT_OF_IT):
+            echo(f"next: {template.format_map(told)}", err=True)
+        return answer
+
+    return followed
 
 
 def _walk(command: click.Command, words: tuple[str, ...] = ()) -> Iterator[tuple[str, click.Command]]:

@@ -9,7 +9,7 @@ from rich.progress import BarColumn, Progress, TaskID, TextColumn, TimeElapsedCo
 from flcav.federation.state import FAILED
 from flcav.interface.progress import DAMAGED
 from flcav.interface.wording import plural
-from flcav.runs.engine import FINISHED, Notify
+from flcav.runs.engine import FINISHED, WHOLE, Notify
 from flcav.runs.rigs import RIG
 
 EPSILON = "epsilon"  # in the notes of rounds with differential privacy
@@ -17,7 +17,10 @@ EPSILON = "epsilon"  # in the notes of rounds with differential privacy
 
 @contextlib.contextmanager
 def live_steps(title: str) -> Iterator[Notify]:
-    """Yield a `Notify` that draws a bar per running step, or prints a line per finished step without a terminal."""
+    """Yield a `Notify` that draws a bar of all steps, with the time left, and one per running step.
+
+    Without a terminal it prints a line per finished step.
+    """
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=24),
@@ -28,10 +31,12 @@ def live_steps(title: str) -> Iterator[Notify]:
     with Progress(*columns, console=console, disable=not console.is_terminal) as bars:
         whole = bars.add_task(title, total=None, note="")
         rows: dict[str, TaskID] = {}
-        finished = 0
 
         def notify(step: str, done: int, total: int, note: str) -> None:
-            nonlocal finished
+            if step == WHOLE:
+                counted = f"{done} of {plural(total, 'step')}"
+                bars.update(whole, completed=done, total=total, note=f"{counted}, {note}" if note else counted)
+                return
             if step == RIG:  # no step: a difference between the run's rig and the recorded one, which stays visible
                 console.print(f"{title}: {note}", highlight=False)
                 return
@@ -44,9 +49,7 @@ def live_steps(title: str) -> Iterator[Notify]:
             if DAMAGED in note:
                 console.print(f"{title}: {step}: {note}", highlight=False, markup=False, soft_wrap=True)
             if note in FINISHED:
-                finished += 1
                 bars.update(rows[step], visible=False)
-                bars.update(whole, note=f"{plural(finished, 'step')} done, {step} {note}")
                 if not console.is_terminal:
                     console.print(f"{title}: {step} {note}", highlight=False)
 

@@ -75,7 +75,8 @@ def run(recipe: RunRecipe | Path | str, out: Path | str, **options: Unpack[RunOp
     Options:
         beside: folder that towns, datasets and histories are looked for in; None, the default: the working directory.
         jobs: number of workers, of one thread each; 1 by default.
-        notify: called with a step's name, its progress and a note; by default a line of each is printed.
+        notify: called with a step's name, its progress and a note, and with "" for that of all steps; by default a line
+            of each finished step is printed.
         stale: what becomes of finished steps of other code or arguments: refuse (the default), redo or keep (see
             `run_steps`).
         engine: processes of this machine (the default), or ray: actors of a cluster.

@@ -1,13 +1,19 @@
 """Names that users give are printed as they are."""
 
+import re
+import string
 from pathlib import Path
 
+import click
 import pytest
+import typer
 import yaml
 
 from flcav.cli.federate import _describe, _print_rounds
-from flcav.cli.main import run
+from flcav.cli.main import app, run
+from flcav.cli.options import SHOWN, add_next_steps
 from flcav.cli.steps import live_steps
+from flcav.runs.engine import WHOLE
 from flcav.runs.results.training import FederatedRound, StageResult
 
 NAME = "cars [3D] :car:"
@@ -66,3 +72,56 @@ def test_a_federation_s_last_line_names_who_failed_or_was_lost(timed: str):
         stage = StageResult("edge", "weather", "ring", len(records), 16, 2, (), records=records)
         rounds = f"{len(records)} round{'s' if len(records) > 1 else ''}"
         assert _describe(stage) == f"weather in ring, {rounds}, 2 vehicles, 16 samples{timed}{words}"
+
+
+def test_all_steps_and_the_time_left_are_one_bar_of_a_terminal(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+):
+    for name, value in {"FORCE_COLOR": "1", "COLUMNS": "120", "TERM": "xterm"}.items():
+        monkeypatch.setenv(name, value)
+    with live_steps("run") as notify:
+        notify(WHOLE, 3, 8, "about 2 minutes left")
+    assert "3 of 8 steps, about 2 minutes left" in capsys.readouterr().err
+    monkeypatch.delenv("FORCE_COLOR")
+    with live_steps("run") as notify:
+        notify(WHOLE, 3, 8, "about 2 minutes left")
+    assert not capsys.readouterr().err
+
+
+def _find_command(words: list[str]) -> click.Command:
+    command = typer.main.get_command(app)
+    for word in words:
+        command = getattr(command, "commands", {}).get(word, command)
+    return command
+
+
+FOLLOWED = {
+    name: example["next"]
+    for section in yaml.safe_load(SHOWN.read_text())
+    for name, example in section["commands"].items()
+    if "next" in example
+}
+
+
+@pytest.mark.parametrize("name", FOLLOWED)
+def test_what_follows_a_command_is_a_command_with_parameters_that_there_are(name: str):
+    fields = {field for _, field, _, _ in string.Formatter().parse(FOLLOWED[name]) if field}
+    assert fields <= {parameter.name for parameter in _find_command(name.split()).params}
+    program, *words = FOLLOWED[name].split()
+    following = _find_command(words)
+    options = {option for parameter in following.params for option in (*parameter.opts, *parameter.secondary_opts)}
+    assert program == "flcav"
+    assert following.params
+    assert {*re.findall(r"--[a-z-]+", FOLLOWED[name])} <= options
+
+
+def test_a_terminal_tells_what_follows(tmp_path: Path, capsys: pytest.CaptureFixture[str]):
+    command = typer.main.get_command(app)
+    assert isinstance(command, click.Group)
+    add_next_steps(command)
+    out = tmp_path / "a town.png"
+    command(["towns", "show", "suburb", "--out", str(out)], standalone_mode=False)
+    assert capsys.readouterr().err == "next: flcav planner suburb\n"
+    for quiet in (["towns", "list", "--json"], ["drive", "--list", "--scenario", "suburb-stalled-clear"]):
+        command(quiet, standalone_mode=False)
+        assert not capsys.readouterr().err

@@ -17,8 +17,9 @@ import pytest
 
 import flcav
 from flcav.config import Config, InputError
-from flcav.runs.engine import Step, Work, run_side_by_side, run_steps
+from flcav.runs.engine import WHOLE, Step, Work, run_side_by_side, run_steps
 from flcav.runs.engine.cluster import packed, replace_folder, stamps
+from flcav.runs.engine.run import Pace
 from flcav.runs.engine.step import DONE_NOW
 from flcav.runs.engine.workers import find_seed
 from flcav.runs.provenance import checkout
@@ -255,7 +256,7 @@ def chain(own: ModuleType) -> list[Step]:
 def told(steps: list[Step], folder: Path, **how: Any) -> list[str]:
     said = []
     run_steps(steps, folder, jobs=1, notify=lambda name, done, total, note: said.append(f"{name} {note}"), **how)
-    return [each for each in said if not each.endswith(" ")]
+    return [each for each in said if each[:1] != " " and not each.endswith(" ")]  # of steps, not of all of them
 
 
 def kept(folder: Path) -> dict[str, Any]:
@@ -407,7 +408,7 @@ def test_a_damaged_step_is_told_and_done_anew_and_no_other(tmp_path, file, text)
     path.unlink()
     if text is not None:
         path.write_text(text)
-    note = lambda step, done, total, note: told.append((step, note)) if done in (0, total) and note else None  # noqa: E731
+    note = lambda step, done, total, note: told.append((step, note)) if step and done in (0, total) and note else None  # noqa: E731
     assert run_steps(steps, tmp_path, jobs=1, notify=note) == whole
     damage = [("a", f"{path} is damaged, the step is done anew")]
     assert sorted(told) == sorted([*damage, ("a", "done"), ("b", "done before"), ("c", "done before")])
@@ -540,3 +541,30 @@ def test_files_that_come_from_another_machine_keep_their_permissions(tmp_path: P
     assert {name: stat.S_IMODE((here / name).stat().st_mode) for name in modes} == modes
     assert stamps(here).keys() == stamps(there).keys()
     assert all((here / name).read_text() == name for name in modes)
+
+
+def test_the_number_of_finished_steps_is_told_and_the_time_left(tmp_path):
+    told: list[tuple[int, int]] = []
+
+    def notify(name: str, done: int, total: int, note: str) -> None:
+        if name == WHOLE:
+            told.append((done, total))
+
+    run_steps(STEPS, tmp_path, jobs=1, notify=notify)
+    assert told[-1] == (3, 3)
+    assert told == sorted(told)
+    told.clear()
+    run_side_by_side({tmp_path / "one": STEPS[:2], tmp_path / "two": STEPS[:1]}, jobs=1, notify=notify)
+    assert told[-1] == (3, 3)  # one of them is taken over
+
+
+def test_a_step_is_expected_to_take_as_long_as_those_of_its_function():
+    pace = Pace(2)
+    assert pace.tell_left(STEPS, []) == ""
+    pace.add(STEPS[0], 600.0)
+    pace.add(STEPS[2], 60.0)
+    assert pace.tell_left([], []) == ""
+    assert pace.tell_left(STEPS[:2], []) == "about 10 minutes left"  # two of 600 s, by two workers
+    assert pace.tell_left(STEPS[:1], [(STEPS[1], 240.0), (STEPS[2], 900.0)]) == "about 8 minutes left"
+    assert pace.tell_left([Step("other", print, {})], []) == "about 3 minutes left"  # the mean of all
+    assert pace.tell_left([], [(STEPS[2], 30.0)]) == "less than a minute left"

@@ -16,10 +16,12 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from queue import Empty
+from statistics import fmean
 from typing import Any
 
 from flcav.config import InputError, read_json
 from flcav.interface.progress import DAMAGED
+from flcav.interface.wording import plural
 from flcav.machine.locks import only_writer
 from flcav.runs.engine.cluster import open_actors
 from flcav.runs.engine.source_hash import Sources, find_definitions
@@ -29,6 +31,7 @@ from flcav.runs.engine.step import (
     DONE_NOW,
     KEPT,
     STALE,
+    WHOLE,
     Notify,
     Step,
     StepRecord,
@@ -71,7 +74,7 @@ def run_steps(
     done by other code. Raises `InputError` for steps that are refused, and where another process runs steps in the
     folder; `OSError` where a worker was killed.
     """
-    return _run({folder: steps}, {folder: notify}, jobs, stale, engine)[folder]
+    return _run({folder: steps}, {folder: notify}, notify, jobs, stale, engine)[folder]
 
 
 def run_side_by_side(
@@ -94,7 +97,7 @@ def run_side_by_side(
         name = folder.name if names is None else names[folder]
         return lambda step, done, total, note: notify(f"{name}/{step}", done, total, note)
 
-    return _run(runs, {folder: named(folder) for folder in runs}, jobs, stale, engine)
+    return _run(runs, {folder: named(folder) for folder in runs}, notify, jobs, stale, engine)
 
 
 @dataclass(frozen=True)
@@ -113,10 +116,44 @@ class _Run:
         self.notify(step.name, 1, 1, DONE_NOW)
 
 
+class Pace:
+    """Wall times of finished steps, by what they compute: they tell how long the others take."""
+
+    def __init__(self, jobs: int) -> None:
+        self._jobs, self._times = jobs, dict[Callable[..., Any], list[float]]()
+
+    def add(self, step: Step, took_s: float) -> None:
+        """Take the wall time of a finished step."""
+        self._times.setdefault(step.run, []).append(took_s)
+
+    def tell_left(self, waiting: Sequence[Step], running: Sequence[tuple[Step, float]]) -> str:
+        """Return the time left for steps, in words; of running ones the time so far [s] counts.
+
+        It is empty where no step is left, and before the first is finished.
+
+        A step takes as long as those of its function did, or else as all did.
+        """
+        every = [took_s for times in self._times.values() for took_s in times]
+        if not every or not (waiting or running):
+            return ""
+
+        def take(step: Step) -> float:
+            return fmean(self._times.get(step.run, every))
+
+        left_s = sum(map(take, waiting)) + sum(max(take(step) - so_far_s, 0.0) for step, so_far_s in running)
+        minutes = left_s / self._jobs / 60
+        return "less than a minute left" if minutes < 1 else f"about {plural(round(minutes), 'minute')} left"
+
+
 def _run(
-    steps: Mapping[Path, Sequence[Step]], notify: Mapping[Path, Notify], jobs: int, stale: str, engine: str
+    steps: Mapping[Path, Sequence[Step]],
+    notify: Mapping[Path, Notify],
+    whole: Notify,
+    jobs: int,
+    stale: str,
+    engine: str,
 ) -> dict[Path, dict[str, Any]]:
-    """Run the steps of all folders; return their values by folder and step."""
+    """Run the steps of all folders; return their values by folder and step. `whole` is told of all of them."""
     with contextlib.ExitStack() as locks:
         for folder in steps:
             locks.enter_context(only_writer(folder))
@@ -126,7 +163,7 @@ def _run(
             if engine not in ENGINES:
                 raise InputError(f"engine '{engine}': unknown; known engines: {', '.join(ENGINES)}")
             with ENGINES[engine](jobs) as workers:
-                _perform(runs, workers, jobs)
+                _perform(runs, workers, whole, jobs)
         return {run.folder: run.values for run in runs}
 
 
@@ -149,13 +186,16 @@ def _plan(steps: Sequence[Step], folder: Path, notify: Notify, stale: str, sourc
     return _Run(folder, records, waiting, values, notify)
 
 
-def _perform(runs: Sequence[_Run], workers: Workers, jobs: int) -> None:
+def _perform(runs: Sequence[_Run], workers: Workers, whole: Notify, jobs: int) -> None:
     """Run the remaining steps on `jobs` workers; steps that are finished in another folder are taken over."""
     by_folder = {run.folder: run for run in runs}
-    running: dict[Future[Any], tuple[_Run, Step, int]] = {}
+    running: dict[Future[Any], tuple[_Run, Step, int, float]] = {}  # with its workers, and when it began [s]
+    count, pace = sum(len(run.records) for run in runs), Pace(jobs)
+
+    told = -1
     while running or any(run.waiting for run in runs):
-        free = jobs - sum(taken for _, _, taken in running.values())
-        ready = _list_ready(runs, [(run, step) for run, step, _ in running.values()])
+        free = jobs - sum(taken for _, _, taken, _ in running.values())
+        ready = _list_ready(runs, [(run, step) for run, step, _, _ in running.values()])
         for run, step, taken in _share_workers(ready, free, lent=workers.lent):
             run.waiting.remove(step)
             record = run.records[step.name]
@@ -163,16 +203,21 @@ def _perform(runs: Sequence[_Run], workers: Workers, jobs: int) -> None:
             if take_over(run.folder / step.name, record, others):
                 run.finish(step)
             else:
-                running[workers.submit(run.folder, step.on(taken), record)] = run, step, taken
+                running[workers.submit(run.folder, step.on(taken), record)] = run, step, taken, time.monotonic()
         finished, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
         with contextlib.suppress(Empty):
             while True:
                 folder, *report = workers.reports.get_nowait()
                 by_folder[folder].notify(*report)
         for future in finished:
-            run, step, _ = running.pop(future)
+            run, step, _, began = running.pop(future)
             future.result()
+            pace.add(step, time.monotonic() - began)
             run.finish(step)
+        if (done := sum(len(run.values) for run in runs)) != told:
+            now, told = time.monotonic(), done
+            waiting = [step for run in runs for step in run.waiting]
+            whole(WHOLE, done, count, pace.tell_left(waiting, [(one, now - at) for _, one, _, at in running.values()]))
 
 
 def _list_ready(runs: Sequence[_Run], running: Sequence[tuple[_Run, Step]]) -> list[tuple[_Run, Step]]:

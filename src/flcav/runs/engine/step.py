@@ -21,6 +21,7 @@ from flcav.storage.records import flatten_record
 
 Notify = Callable[[str, int, int, str], None]  # step, done, total, note
 DONE_NOW, DONE_BEFORE, KEPT = FINISHED = ("done", "done before", "kept, of other code")  # notes of finished steps
+WHOLE = ""  # in place of a step: how many of all steps are finished, with the time left as note
 DONE, STARTED = "done.json", "started.json"
 Stale = str  # one of STALE
 STALE = ("refuse", "redo", "keep")  # what to do with steps of other code; "redo": of other arguments, too
