@@ -34,7 +34,8 @@ INTRO = """\
 The commands of `flcav` by group. The page of a group shows the arguments and options of its commands, and an example
 with its output. `flcav COMMAND --help` prints the same descriptions. The exit code is 0 for success, 2 for bad input
 (with one sentence about it on stderr), 130 after Ctrl-C, and 1 for any other failure. `--json` prints one JSON object
-and nothing else. Terms are in the [glossary](glossary.md).
+and nothing else. On a terminal, long work shows the time left, and a command ends with the one that usually follows.
+Terms are in the [glossary](glossary.md).
 """
 MADE = """\
 These pages are made by `python tools/commands_page.py`, which runs the examples of `src/flcav/cli/commands.yaml` in the

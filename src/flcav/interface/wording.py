@@ -53,6 +53,15 @@ def plural(number: int, noun: str) -> str:
     return f"{number} {noun}{'' if number == 1 else 's'}"
 
 
+def describe_megabytes(megabytes: float) -> str:
+    """Return megabytes in words, with a decimal below one.
+
+    >>> describe_megabytes(12.3), describe_megabytes(0.52)
+    ('12 MB', '0.5 MB')
+    """
+    return f"{megabytes:.{1 if megabytes < 1 else 0}f} MB"
+
+
 def describe_number(text: str, field: str) -> str:
     """Return the advice for a `text` that is no number: the number in the unit that the field's name ends with.
 

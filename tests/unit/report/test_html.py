@@ -12,7 +12,7 @@ from flcav.report.pages.run_page import Seen, page
 from flcav.runs.recipe import MAIN
 from flcav.runs.results.plans import Plan
 from flcav.runs.results.run import Run
-from flcav.runs.results.tests import HomeCost, RunFinding
+from flcav.runs.results.tests import FoundCount, HomeCost, RunFinding
 from flcav.runs.running import RESULTS
 from flcav.statistics.estimates import Estimate
 
@@ -122,6 +122,17 @@ def test_the_map_of_changes_comes_first_with_its_counts() -> None:
     assert next(tag for tag, _ in read.tags if tag in ("svg", "img")) == "svg"
     assert f"{changes.gone} of 61 errors in grid are gone, 2 are new." in read.text
     assert "Pole 2 of 9, by most errors in reach: 19 of them within 40 m, 0 in sight past the houses." in read.text
+
+
+def test_the_score_from_which_detections_count_is_that_of_their_task() -> None:
+    run = made_up_run.run()
+    counted = FoundCount("main", "edge", "grid", "objects", "cars", 20, 12.0, 3.0, 1)
+    said = "Counts are of test frames, of detections that score 0.3 or more."
+    for counts, told in (((counted,), said), ((replace(counted, task="weather", false=None),), said[:25] + ".")):
+        assert told in Page(render(page(replace(run, counts=counts)), {})).text
+    both = (counted, replace(counted, task="signs"))
+    told = Page(render(page(replace(run, counts=both)), {})).text
+    assert "of objects detections that score 0.3 or more, of signs detections that score" in told
 
 
 def test_plans_that_were_made_anew_are_told() -> None:

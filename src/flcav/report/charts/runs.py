@@ -9,6 +9,7 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import LogLocator, NullLocator
 from matplotlib.transforms import offset_copy
 
+from flcav.interface.wording import describe_megabytes
 from flcav.report import style
 from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN
 from flcav.runs.results.run import ArmCost
@@ -154,7 +155,7 @@ def draw_megabytes(axes: Axes, rows: Sequence[Row], budgets: Mapping[str, float]
         for sent, colour in zip(sums[link].values(), style.STAGE_COLOURS, strict=False):
             axes.barh(y, sent, left=left, height=0.42, color=colour, edgecolor="white")
             if sent > 0.05 * widest:
-                axes.text(left + sent / 2, y, f"{sent:.0f}", ha="center", va="center_baseline")
+                axes.text(left + sent / 2, y, describe_megabytes(sent).split()[0], ha="center", va="center_baseline")
             left += sent
         axes.plot([budget, budget], [y - 0.34, y + 0.30], color=style.INK, linewidth=2)
         axes.text(budget, y - 0.37, f"{left:.0f} of {budget:.0f} MB", ha="right", va="bottom", fontsize=style.SMALL)

@@ -17,6 +17,8 @@ from flcav.geometry import Boxes
 from flcav.network.clock.records import load_rounds
 from flcav.perception.errors import load_errors
 from flcav.perception.objects.truth import choose_lidar
+from flcav.perception.task import Scores
+from flcav.perception.tasks import task_named
 from flcav.plugins import load_named
 from flcav.report import style
 from flcav.report.charts import figures
@@ -110,6 +112,7 @@ def page(run: Run, seen: Seen | None = None) -> dict[str, Any]:
         "seen": seen or Seen(),
         "packed": _pack_scene(seen),
         "tasks": list(recipe.tasks),
+        "from_scores": _list_thresholds(run),
         "regions": {role: recipe.with_role(role) for role in ("pretrain", "federate", "unseen")},
         "means": list_stage_means(run),
         "answer": tell_answer(run),
@@ -140,6 +143,12 @@ def page(run: Run, seen: Seen | None = None) -> dict[str, Any]:
         "caveats": [caveat for caveat in run.caveats if caveat != PLACED_BARE],
         "bare": PLACED_BARE if PLACED_BARE in run.caveats else None,
     }
+
+
+def _list_thresholds(run: Run) -> dict[str, float]:
+    """Return the score from which detections count, by task; of tasks whose counts have false ones alone."""
+    counted = dict.fromkeys(count.task for count in run.counts or () if count.false is not None)
+    return {name: task.threshold for name in counted if isinstance(task := task_named(name), Scores)}
 
 
 def _pack_scene(seen: Seen | None) -> Mapping[str, str]:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flcav.interface.wording import describe_megabytes
 from flcav.network.ledger import LINKS
 from flcav.runs.analysis.costs import list_home_costs
 from flcav.runs.analysis.findings import OVER_EDGE, OVER_PRETRAINING
@@ -105,7 +106,7 @@ def _tell_edge(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[str
         else:
             means = [_average(run, task, stage, places) for stage in (PRETRAIN, EDGE)]
             right = f"{_measure(run, task)} of {task} {means[0]:.3f} → {means[1]:.3f}"
-        told.append(f"{right}, for {_sent(run, task, EDGE, ('wireless',)):.0f} MB of radio")
+        told.append(f"{right}, for {describe_megabytes(_sent(run, task, EDGE, ('wireless',)))} of radio")
     places = max(regions.values(), key=len)
     count = NUMBERS[len(places)] if len(places) < len(NUMBERS) else len(places)
     noun = f"{_name_places(run, places)}{'' if len(places) == 1 else 's'}"
@@ -131,7 +132,7 @@ def _tell_cloud(run: Run, regions: Mapping[str, tuple[str, ...]]) -> Iterator[st
             told.append(f"has {_measure(run, task)} {_average(run, task, CLOUD, places):.3f}")
     if told:
         everywhere = f"One network for all {_name_places(run, run.recipe.regions)}s"
-        yield f"{everywhere}, averaged by the cloud for {sent:.0f} MB more, {', '.join(told)}."
+        yield f"{everywhere}, averaged by the cloud for {describe_megabytes(sent)} more, {', '.join(told)}."
 
 
 def _tell_home(home: Sequence[HomeCost]) -> Iterator[str]:
