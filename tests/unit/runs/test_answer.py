@@ -135,11 +135,14 @@ def test_counts_take_the_place_of_the_measure_and_are_summed_over_towns() -> Non
 def test_tiles_have_the_gain_the_control_the_budget_and_the_cost() -> None:
     tiles = list_tiles(Run.load(RUNS / "demo/earlier/float32", RESULTS))
     assert [tile.title for tile in tiles] == [
-        "AP50 in grid and ring", "As many steps without FL", "Radio budget, all stages", "AP70 at home, in suburb",
+        "AP50 in grid and ring", "As many steps without FL", "Radio, all vehicles and stages",
+        "AP70 at home, in suburb",
     ]  # fmt: skip
     assert tiles[0].note == "+0.067 (+0.036 to +0.099)"
     assert tiles[1].note == "FL minus it: +0.067 (+0.035 to +0.098)"
     assert tiles[2].value == "78 of 80 MB"
+    sent = "27 MB pretraining, 47 MB edge FL of 7 vehicles, 5 MB cloud FL"
+    assert tiles[2].note == f"{sent}; wireline: 28 of 40 MB"
     assert tiles[3].value == "0.506 → 0.239"
 
 

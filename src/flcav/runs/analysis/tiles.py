@@ -5,8 +5,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from flcav.interface.wording import describe_megabytes, plural
 from flcav.runs.analysis.answer import fell, select_claims
 from flcav.runs.analysis.costs import list_home_costs
+from flcav.runs.analysis.findings import NAMES
 from flcav.runs.recipe import CENTRAL, EDGE, MAIN, PRETRAIN
 from flcav.runs.results.run import Run
 from flcav.runs.results.tests import Difference, RunFinding
@@ -70,11 +72,16 @@ def _list_controls(run: Run, task: str) -> list[tuple[Difference, RunFinding]]:
 
 
 def _tell_megabytes(run: Run) -> Iterator[Tile]:
-    links = run.arms[MAIN].links
-    first, *others = links.items()
+    """Yield the megabytes of the first link with its budget, by stage, and those of the others."""
+    main = run.arms[MAIN]
+    (link, first), *others = main.links.items()
     rest = [f"{name}: {use.used_mb:.0f} of {use.budget_mb:.0f} MB" for name, use in others]
-    sent = f"{first[1].used_mb:.0f} of {first[1].budget_mb:.0f} MB"
-    yield Tile("Radio budget, all stages", sent, ", ".join(rest))
+    sums = {stage: sum(row.mb for row in select(main.spent, link=link, stage=stage)) for stage in NAMES}
+    vehicles = sum(each.clients for each in select(main.stages, stage=EDGE, task=next(iter(run.recipe.tasks))))
+    names = NAMES | {EDGE: f"{NAMES[EDGE]} of {plural(vehicles, 'vehicle')}"}
+    parts = ", ".join(f"{describe_megabytes(mb)} {names[stage]}" for stage, mb in sums.items() if mb)
+    sent = f"{first.used_mb:.0f} of {first.budget_mb:.0f} MB"
+    yield Tile("Radio, all vehicles and stages", sent, "; ".join((parts, *rest)))
 
 
 def _tell_home(run: Run) -> Iterator[Tile]:
