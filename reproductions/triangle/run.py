@@ -1,278 +1,234 @@
-"""Fig. 6b of Wang et al. (IEEE Network 37(3), 2023), trained once and small: three plans of three tasks.
+"""Fig. 6b of Wang et al. (IEEE Network 37(3), 2023), trained: the triangles of three plans under one pair of budgets.
 
-The recipe is recipes/runs/triangle.yaml. The triangle of a plan has the accuracies of its networks after stage III on
-test frames of both federating regions, beside those that the curves of `reproductions/fig6b` predict for the same
-counts. The same frames through the networks of the plans, as in the article's examples: stop signs under clouds, and
-what is found at cross-roads, from above.
+The recipe is recipes/runs/triangle.yaml. Corners are what the networks of a plan reach after stage III, in the mean of
+the federating towns, beside what the run's curves predict for the plan. Intervals are over test scenes: of an area, and
+of a difference of areas of networks on the same frames, by the delta method.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.patches import Rectangle
 
-from flcav.dataset.store import Dataset
+from flcav.arrays import Array
+from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
-from flcav.geometry import Boxes
-from flcav.geometry.poses import inverse
-from flcav.optimization.curves.fitting import fit
-from flcav.perception.marks import CloudBoxes, PictureBoxes
-from flcav.perception.objects.task import OBJECTS
-from flcav.perception.signs.task import SIGNS
-from flcav.perception.task import Finding, Task
-from flcav.perception.weights import load_network
 from flcav.report import style
-from flcav.report.pictures.clouds import draw_boxes, on_page
-from flcav.report.pictures.inference import boxes_in_picture
-from flcav.reproductions.fig6b.run import (
-    COLOURS,
-    RULES,
-    TASKS,
-    AtBudget,
-    Plan,
-    compare_plans,
-    draw_axes,
-    draw_triangle,
-    measure_area,
-    refit_curves,
-)
+from flcav.reproductions.fig6b.run import LOOKS, RULES, TASKS, Plan, draw_axes, draw_triangle, measure_area
 from flcav.reproductions.plan_search.run import JOINT
-from flcav.runs.frames import Frames
+from flcav.reproductions.triangle.strips import Counted, film_crossings, film_stops
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CLOUD, MAIN
 from flcav.runs.results.run import Run
-from flcav.runs.results.saved import WEIGHTS
-from flcav.runs.tables import load_known_history
-from flcav.statistics.estimates import Estimate
-from flcav.storage.markdown import format_table
+from flcav.statistics.estimates import Estimate, average_estimates
+from flcav.storage.markdown import format_signed, format_table
 from flcav.storage.records import Record
-from flcav.world.weather import classify_weather
 
 ARMS = {"max-throughput": "most", "equal-stages": "equal", JOINT: MAIN}  # by rule
-STOP, STOP_TOWN, CROSS_TOWN = "stop", "suburb", "grid"
-CLOUDY = ("cloudy", "overcast")
-SHOWN = 4  # frames of a strip
-REACH_M = 40.0  # [m] shown around a vehicle
-SIGNS_FROM, OBJECTS_FROM = 0.25, 0.3  # scores from which marks are drawn
 
 
 @dataclass(frozen=True)
-class Realised:
-    """What the networks of a plan reach after stage III, in the mean over both regions."""
+class Trained:
+    """A plan, what the curves predict for it and what its networks reach."""
 
     plan: Plan
-    accuracy: Mapping[str, Estimate]  # by task, intervals over test scenes
+    predicted: Mapping[str, float]  # accuracy by task
+    predicted_area: float  # 1: all accuracies are 1
+    accuracy: Mapping[str, Estimate]  # by task
+    area: Estimate
+
+
+@dataclass(frozen=True)
+class Gain:
+    """The joint plan minus another one."""
+
+    predicted: float  # of the area
+    accuracy: Mapping[str, Estimate]  # by task, on the same frames
     area: Estimate
 
 
 @dataclass(frozen=True)
 class TrainedTriangles(Record):
-    """Predicted and realised triangles by rule."""
+    """Triangles and gains by rule, and what is found in the frames of the strips."""
 
-    predicted: AtBudget
-    realised: Mapping[str, Realised]
+    triangles: Mapping[str, Trained]
+    gains: Mapping[str, Gain]
+    strips: Mapping[str, Mapping[str, Counted]]  # by strip and rule
+    recipe: Mapping[str, Json]  # without its seed
     provenance: Provenance
 
     def sentences(self) -> list[str]:
-        """Return predicted and realised areas in words."""
-        return [
-            f"{rule}: area predicted {self.predicted.triangles[rule].area.describe()}, realised {own.area.describe()}"
-            for rule, own in self.realised.items()
+        """Return areas and gains in words."""
+        areas = [
+            f"{rule}: area predicted {own.predicted_area:.3f}, trained {own.area.describe()}"
+            for rule, own in self.triangles.items()
+        ]
+        return areas + [
+            f"area of the joint plan - {rule}: predicted {own.predicted:+.3f}, trained {own.area.describe(sign=True)}"
+            for rule, own in self.gains.items()
         ]
 
 
-def average(estimates: Sequence[Estimate], weights: Sequence[float]) -> Estimate:
-    """Return the weighted sum of independent estimates; the halves of intervals add in squares (delta method)."""
-    mean = float(np.dot(weights, [each.mean for each in estimates]))
-    below, above = (
-        float(np.linalg.norm([weight * (end - each.mean) for weight, each, end in zip(weights, estimates, ends)]))
-        for ends in zip(*((each.low, each.high) for each in estimates), strict=True)
-        if None not in ends
-    )
-    return Estimate(mean, mean - below, mean + above)
+def find_slopes(accuracies: Array) -> Array:
+    """Return the derivatives (3,) of `measure_area` by the accuracies (3,) of its corners."""
+    return (accuracies.sum() - accuracies) / 3
 
 
-def find_area(accuracy: Mapping[str, Estimate]) -> Estimate:
-    """Return the area of the triangle, with an interval by the delta method; tasks are tested on other scenes."""
-    values = np.array([accuracy[task].mean for task in TASKS])
-    slopes = (values.sum() - values) / 3
-    spread = average([accuracy[task] for task in TASKS], slopes.tolist())
-    area = float(measure_area(values))
-    assert spread.low is not None
-    assert spread.high is not None
-    return Estimate(area, area - (spread.mean - spread.low), area + (spread.high - spread.mean))
+def estimate_area(accuracy: Mapping[str, Estimate]) -> Estimate:
+    """Return the area of the triangle; tasks are tested on scenes of their own."""
+    means = np.array([accuracy[task].mean for task in TASKS])
+    return carry_intervals(float(measure_area(means)), find_slopes(means), accuracy)
 
 
-def measure_rule(run: Run, rule: str) -> Realised:
-    """Return the counts of a rule's plan and what its networks reach."""
-    arm, home = ARMS[rule], run.recipe.with_role("federate")
-    tasks = run.arms[arm].plan.tasks
-    plan = {task: (tasks[task].samples, tasks[task].edge_rounds, tasks[task].cloud_rounds) for task in TASKS}
+def estimate_gain(one: Mapping[str, Estimate], other: Mapping[str, Estimate], gain: Mapping[str, Estimate]) -> Estimate:
+    """Return the area of `one` minus that of `other`, from the paired differences `gain` of their accuracies.
+
+    An area is of second degree in its corners, so that the slopes half way between both give the exact difference.
+    """
+    middle = np.array([(one[task].mean + other[task].mean) / 2 for task in TASKS])
+    slopes = find_slopes(middle)
+    return carry_intervals(float(slopes @ [gain[task].mean for task in TASKS]), slopes, gain)
+
+
+def carry_intervals(mean: float, slopes: Array, parts: Mapping[str, Estimate]) -> Estimate:
+    """Return an estimate from independent parts by task: half-widths, times slopes (3,) >= 0, add in quadrature."""
+    estimates = [parts[task] for task in TASKS]
+    below = [each.mean - each.low for each in estimates if each.low is not None]
+    above = [each.high - each.mean for each in estimates if each.high is not None]
+    if min(len(below), len(above)) < len(TASKS):
+        return Estimate(mean, None, None)
+    return Estimate(mean, mean - float(np.linalg.norm(slopes * below)), mean + float(np.linalg.norm(slopes * above)))
+
+
+def measure_plan(run: Run, rule: str) -> Trained:
+    """Return the plan of a rule, its predictions, and what its networks reach in the mean of the federating towns."""
+    plans = run.arms[ARMS[rule]].plan.tasks
+    predicted = {task: (plans[task].predicted or {})[CLOUD] for task in TASKS}
     accuracy = {
-        task: average(
-            [run.test(arm=arm, stage=CLOUD, region=region, task=task).estimate for region in home],
-            [1 / len(home)] * len(home),
+        task: average_estimates(
+            [
+                run.test(arm=ARMS[rule], stage=CLOUD, region=town, task=task).estimate
+                for town in run.recipe.with_role("federate")
+            ]
         )
         for task in TASKS
     }
-    return Realised(plan, accuracy, find_area(accuracy))
+    return Trained(
+        {task: (plans[task].samples, plans[task].edge_rounds, plans[task].cloud_rounds) for task in TASKS},
+        predicted,
+        float(measure_area(np.array([predicted[task] for task in TASKS]))),
+        accuracy,
+        estimate_area(accuracy),
+    )
 
 
-def compare_triangles(run: Run) -> TrainedTriangles:
-    """Return the triangles that a run realised, beside those that the curves predict for the same counts."""
-    realised = {rule: measure_rule(run, rule) for rule in RULES}
-    curves = {task: refit_curves(fit(load_known_history(task), model="best")) for task in TASKS}
-    plans = {rule: own.plan for rule, own in realised.items()}
-    return TrainedTriangles(compare_plans(plans, curves, run.recipe.budgets_mb.wireless), realised, provenance())
+def subtract_accuracy(run: Run, rule: str, task: str) -> Estimate:
+    """Return a task's accuracy by the joint plan minus that by another rule, on the same frames of both towns.
+
+    It is 0 in a town where both rules share their training.
+    """
+    known = {
+        each.region: each.estimate
+        for each in run.differences
+        if (each.arm, each.before_arm, each.stage, each.task) == (MAIN, ARMS[rule], CLOUD, task)
+    }
+    towns = run.recipe.with_role("federate")
+    return average_estimates([known.get(town, Estimate(0.0, 0.0, 0.0)) for town in towns])
 
 
-def choose_stops(data: Dataset, vehicles: Sequence[int]) -> list[int]:
-    """Return the frames under clouds with the largest stop signs, one a scene where there are enough."""
-    config = next(iter(SIGNS.configurations.values()))
-    stop = config.classes.index(STOP)
-    sizes: dict[int, float] = {}
-    for number in vehicles:
-        weather = data.frame(number).weather
-        if weather is None or classify_weather(weather) not in CLOUDY:
-            continue
-        sample = SIGNS.samples(data, config, [number])[0]
-        boxes = sample.boxes[sample.label == stop]
-        if len(boxes):
-            sizes[number] = float((boxes[:, 2:] - boxes[:, :2]).prod(axis=1).max())
-    return take_apart(data, sizes)
+def compare_triangles(run: Run, strips: Mapping[str, Mapping[str, Counted]]) -> TrainedTriangles:
+    """Return the triangles of a run's plans, and the gains of the joint one."""
+    triangles = {rule: measure_plan(run, rule) for rule in RULES}
+    joint, gains = triangles[JOINT], dict[str, Gain]()
+    for rule in (rule for rule in RULES if rule != JOINT):
+        other = triangles[rule]
+        accuracy = {task: subtract_accuracy(run, rule, task) for task in TASKS}
+        area = estimate_gain(joint.accuracy, other.accuracy, accuracy)
+        gains[rule] = Gain(joint.predicted_area - other.predicted_area, accuracy, area)
+    settings = run.recipe.model_dump(mode="json", exclude={"seed"})
+    return TrainedTriangles(triangles, gains, strips, settings, provenance())
 
 
-def choose_crossings(data: Dataset, vehicles: Sequence[int]) -> list[int]:
-    """Return the frames with most road users in reach, one a scene where there are enough."""
-    counts = {number: float(len(near_boxes(data, number))) for number in vehicles}
-    return take_apart(data, counts)
-
-
-def near_boxes(data: Dataset, number: int) -> Boxes:
-    """Return the annotated boxes of road users within `REACH_M` of the LiDAR ahead and aside, in its frame."""
-    frame = data.frame(number)
-    boxes = frame.annotations.boxes.transform(inverse(frame.world_from_sensor(next(iter(frame.lidar)))))
-    return boxes[np.abs(boxes.center[:, :2]).max(axis=1) < REACH_M]
-
-
-def take_apart(data: Dataset, values: Mapping[int, float]) -> list[int]:
-    """Return the `SHOWN` frames of the largest values, the best of each scene before further ones, in their order."""
-    ranked = sorted(values, key=lambda number: -values[number])
-    best = {data.keys[number].scene: number for number in reversed(ranked)}
-    first = sorted(best.values(), key=lambda number: -values[number])
-    return sorted([*first, *(number for number in ranked if number not in first)][:SHOWN])
-
-
-def find_all(run: Run, work: Path, task: Task, town: str, frames: Sequence[int]) -> dict[str, list[Finding]]:
-    """Return what the networks of each plan find in test frames of a town, by rule."""
-    folder = Frames.open(work / run.steps.recording(town, "test", task.name)).data.folder
-    threshold = SIGNS_FROM if task is SIGNS else OBJECTS_FROM
-    found: dict[str, list[Finding]] = {}
-    for rule in RULES:
-        step = run.steps.stage(ARMS[rule], CLOUD, town, task.name)
-        found[rule] = [*task.infer(load_network(task, work / step / WEIGHTS), folder, threshold, frames)]
-    return found
-
-
-def draw_stops(run: Run, work: Path) -> bytes | None:
-    """Return the strip of stop signs as a PNG; None where no test frame under clouds has one."""
-    split = Frames.open(work / run.steps.recording(STOP_TOWN, "test", SIGNS.name))
-    frames = choose_stops(split.data, split.vehicles)
-    if not frames:
-        return None
-    config = next(iter(SIGNS.configurations.values()))
-    truths = SIGNS.samples(split.data, config, frames)
-
-    def draw(axes: Axes, finding: Finding, column: int) -> None:
-        height, width = finding.seen.shape[:2]
-        axes.imshow(finding.seen, extent=(0, width, height, 0))
-        for x1, y1, x2, y2 in truths[column].boxes.tolist():
-            axes.add_patch(Rectangle((x1 - 3, y1 - 3), x2 - x1 + 6, y2 - y1 + 6, fill=False, edgecolor="white"))
-        for mark in finding.marks:
-            if isinstance(mark, PictureBoxes):
-                boxes_in_picture(axes, mark)
-
-    return draw_strip(find_all(run, work, SIGNS, STOP_TOWN, frames), draw, 1.6)
-
-
-def draw_crossings(run: Run, work: Path) -> bytes:
-    """Return the strip of cross-roads from above as a PNG; annotated road users are grey."""
-    split = Frames.open(work / run.steps.recording(CROSS_TOWN, "test", OBJECTS.name))
-    frames = choose_crossings(split.data, split.vehicles)
-    truths = [near_boxes(split.data, number) for number in frames]
-
-    def draw(axes: Axes, finding: Finding, column: int) -> None:
-        axes.scatter(*on_page(finding.seen[:, :2]).T, s=0.3, color=style.POINT, linewidths=0, rasterized=True)
-        draw_boxes(axes, truths[column], style.MUTED, fill=0.3, width=0.6)
-        for mark in finding.marks:
-            if isinstance(mark, CloudBoxes):
-                draw_boxes(axes, mark.boxes, style.BLUE)
-        axes.plot(0, 0, "^", color=style.INK, markersize=5)
-        axes.set(xlim=(-REACH_M, REACH_M), ylim=(-REACH_M, REACH_M), aspect="equal")
-
-    return draw_strip(find_all(run, work, OBJECTS, CROSS_TOWN, frames), draw, 2.3)
-
-
-@style.styled
-def draw_strip(
-    found: Mapping[str, Sequence[Finding]], draw: Callable[[Axes, Finding, int], None], tall: float
-) -> bytes:
-    """Return a PNG with a row for each rule and a column for each frame, `tall` inches high a row."""
-    columns = len(next(iter(found.values())))
-    figure = style.canvas(10.0, tall * len(found) + 0.3)
-    panels = figure.subplots(len(found), columns, squeeze=False)
-    for (rule, findings), row in zip(found.items(), panels, strict=True):
-        for column, (axes, finding) in enumerate(zip(row, findings, strict=True)):
-            style.hide_axes(axes)
-            draw(axes, finding, column)
-        row[0].set_ylabel(rule, fontweight="bold")
-    return style.png(figure, 130)
+def tabulate_triangles(results: TrainedTriangles) -> dict[str, str]:
+    """Return Markdown by name: triangles, gains, strips."""
+    return {
+        "triangles": format_table(
+            ("rule", "task", "samples / edge / cloud", "accuracy, predicted", "trained"),
+            [
+                row
+                for rule, own in results.triangles.items()
+                for row in (
+                    *(
+                        [
+                            rule,
+                            task,
+                            "/".join(map(str, own.plan[task])),
+                            f"{own.predicted[task]:.3f}",
+                            own.accuracy[task].describe(),
+                        ]
+                        for task in TASKS
+                    ),
+                    [rule, "**area**", "", f"{own.predicted_area:.3f}", own.area.describe()],
+                )
+            ],
+        ),
+        "gains": format_table(
+            ("joint plan minus", "area, predicted", "area, trained", *TASKS),
+            [
+                [
+                    rule,
+                    format_signed(own.predicted),
+                    own.area.describe(sign=True),
+                    *(own.accuracy[task].describe(sign=True) for task in TASKS),
+                ]
+                for rule, own in results.gains.items()
+            ],
+        ),
+        "strips": format_table(
+            ("strip", "rule", "found", "of", "false"),
+            [
+                [strip, rule, own.found, own.targets, own.false]
+                for strip, by_rule in results.strips.items()
+                for rule, own in by_rule.items()
+            ],
+        ),
+    }
 
 
 @style.styled
 def draw_both(results: TrainedTriangles) -> bytes:
-    """Return predicted and realised triangles side by side as a PNG."""
+    """Return predicted and trained triangles side by side as a PNG."""
     figure = style.canvas(7.4, 3.8)
-    panels = figure.subplots(1, 2)
-    accuracies = {
-        "predicted": {rule: results.predicted.triangles[rule].accuracy for rule in RULES},
-        "realised": {rule: {task: own.accuracy[task].mean for task in TASKS} for rule, own in results.realised.items()},
-    }
-    for axes, (title, by_rule) in zip(panels, accuracies.items(), strict=True):
-        draw_axes(axes)
-        for rule, width in zip(RULES, (4.5, 2.8, 1.2), strict=True):
-            draw_triangle(axes, by_rule[rule], color=COLOURS[rule], linewidth=width, label=rule)
-        axes.set_title(title, fontweight="bold")
-    style.key(figure, panels[0].get_legend_handles_labels()[0])
+    predicted, trained = figure.subplots(1, 2)
+    draw_axes(predicted, "predicted")
+    draw_axes(trained, "trained")
+    for rule, own in results.triangles.items():
+        draw_triangle(predicted, own.predicted, **LOOKS[rule])
+        draw_triangle(trained, {task: own.accuracy[task].mean for task in TASKS}, **LOOKS[rule])
+    style.key(figure, predicted.get_legend_handles_labels()[0])
     return style.png(figure)
-
-
-def tabulate_triangles(results: TrainedTriangles) -> dict[str, str]:
-    """Return Markdown by name: triangles."""
-    rows = []
-    for rule, own in results.realised.items():
-        predicted = results.predicted.triangles[rule]
-        cells = (
-            f"{'/'.join(map(str, own.plan[task]))}: {predicted.accuracy[task]:.3f}, {own.accuracy[task].describe()}"
-            for task in TASKS
-        )
-        rows.append([rule, *cells, predicted.area.describe(), own.area.describe()])
-    heads = ("rule", *(f"{task}: counts: predicted, realised" for task in TASKS), "area predicted", "area realised")
-    return {"triangles": format_table(heads, rows)}
 
 
 def _run(out: Path, options: Options) -> Outcome[TrainedTriangles]:
     recipe = options.load("triangle", shrink_recipe)
-    runs = options.run_seeds(recipe, out)
-    (work,) = list_works(runs, out)[:1]
-    results = compare_triangles(runs[0])
-    pictures = {"triangles.png": draw_both(results), "crossings.png": draw_crossings(runs[0], work)}
-    if (stops := draw_stops(runs[0], work)) is not None:
-        pictures["stops.png"] = stops
+    (run,) = runs = options.run_seeds(recipe, out)
+    (work,) = list_works(runs, out)
+    stops, crossings = (film(run, work, ARMS) for film in (film_stops, film_crossings))
+    results = compare_triangles(run, {"stop signs": stops.counted, "cross-roads": crossings.counted})
+    pictures = {
+        "triangles.png": draw_both(results),
+        "stops.png": stops.picture,
+        "crossings.png": crossings.picture,
+    }
     return Outcome(results, pictures, results.sentences())
 
 
-EXPERIMENT = Experiment(TrainedTriangles, _run, tabulate_triangles, seeds=1, takes=("scale", "jobs", "engine", "stale"))
+EXPERIMENT = Experiment(
+    TrainedTriangles,
+    _run,
+    tabulate_triangles,
+    seeds=1,
+    takes=("scale", "jobs", "engine", "stale"),
+    recipe="triangle",
+)

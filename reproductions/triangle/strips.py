@@ -1,0 +1,246 @@
+"""Film strips: the same test frames through the networks of several plans, with what each finds and misses.
+
+Signs are shown around a STOP sign under clouds, cars at a cross-road from above. Frames are chosen by their annotations
+alone, before any network sees them.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from matplotlib.axes import Axes
+from matplotlib.lines import Line2D
+from matplotlib.patches import Polygon, Rectangle
+
+from flcav.arrays import Array, Ints, Mask
+from flcav.dataset.store import Dataset
+from flcav.geometry import Boxes, inverse, transform_points
+from flcav.perception.metrics.detection import assign_targets, match_greedily, on_neutral
+from flcav.perception.objects.predict import OVERLAP, detect_in
+from flcav.perception.objects.task import OBJECTS
+from flcav.perception.objects.truth import asked_of, choose_lidar
+from flcav.perception.ops.boxes import rectangle_iou
+from flcav.perception.signs.predict import SignDetections, detect_in_picture
+from flcav.perception.signs.samples import Sample, size_px
+from flcav.perception.signs.task import SIGNS
+from flcav.perception.weights import load_network
+from flcav.report import style
+from flcav.report.pictures.clouds import draw_boxes, draw_points, on_page
+from flcav.runs.frames import Frames
+from flcav.runs.recipe import CLOUD
+from flcav.runs.results.run import Run
+from flcav.runs.results.saved import WEIGHTS
+from flcav.sensors.frame import Frame
+from flcav.world.map.town import Town
+from flcav.world.weather import classify_weather
+
+STOP, STOP_TOWN, CROSS_TOWN = "stop", "suburb", "grid"
+CLOUDY = ("cloudy", "overcast")
+SHOWN = 3  # frames of a strip
+SIGNS_FROM, OBJECTS_FROM = 0.1, 0.3  # scores from which detections are shown
+WINDOW_PX = (200, 120)  # width and height of the part of a picture that is shown
+VIEW_M = (0.0, 48.0, 24.0)  # of a sweep: behind, ahead, aside
+AHEAD_M, ASIDE_M = (5.0, 35.0), 15.0  # where a cross-road's pole is from a vehicle before it
+
+
+@dataclass(frozen=True)
+class Counted:
+    """What a plan's network finds in the frames of a strip."""
+
+    found: int
+    targets: int
+    false: int
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A frame as the network of a plan sees it."""
+
+    counted: Counted
+    draw: Callable[[Axes], None]
+
+
+@dataclass(frozen=True)
+class Strip:
+    """A PNG, and the counts over its frames by rule."""
+
+    picture: bytes
+    counted: Mapping[str, Counted]
+
+
+def take_apart(values: Mapping[int, float], scenes: Mapping[int, str], shown: int = SHOWN) -> list[int]:
+    """Return the `shown` frames of the largest values, the best of each scene before any second one, ascending."""
+    ranked = sorted(values, key=lambda number: (-values[number], number))
+    best = {scenes[number]: number for number in reversed(ranked)}
+    return sorted(sorted(ranked, key=lambda number: number not in best.values())[:shown])
+
+
+def judge(matched: Ints, targets: int) -> tuple[Mask, Mask]:
+    """Return which detections are true (D,) and which targets are found, by the target (D,) of each, -1 for none."""
+    return matched >= 0, np.isin(np.arange(targets), matched)
+
+
+def count(hit: Mask, found: Mask) -> Counted:
+    """Return the numbers of found targets, of targets, and of false detections."""
+    return Counted(int(found.sum()), len(found), int((~hit).sum()))
+
+
+def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
+    """Return the strip of STOP signs under clouds; `arms`: by rule, `work`: the folder of the run's steps."""
+    split = Frames.open(work / run.steps.recording(STOP_TOWN, "test", SIGNS.name))
+    config = next(iter(SIGNS.configurations.values()))
+    samples = dict(zip(split.vehicles, SIGNS.samples(split.data, config, split.vehicles), strict=True))
+    stop = config.classes.index(STOP)
+    sizes = {
+        number: float(size_px(stops).max())
+        for number, sample in samples.items()
+        if len(stops := sample.boxes[sample.label == stop]) and is_cloudy(split.data.frame(number))
+    }
+    frames = take_apart(sizes, name_scenes(split.data))
+
+    def see(arm: str) -> list[Panel]:
+        network = load_network(SIGNS, work / run.steps.stage(arm, CLOUD, STOP_TOWN, SIGNS.name) / WEIGHTS)
+        seen = (samples[number] for number in frames)
+        return [
+            show_signs(sample, detect_in_picture(network, sample.picture, threshold=SIGNS_FROM), stop)
+            for sample in seen
+        ]
+
+    return draw_strip({rule: see(arm) for rule, arm in arms.items()}, WINDOW_PX[1] / WINDOW_PX[0])
+
+
+def film_crossings(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
+    """Return the strip of cross-roads from above; arguments as of `film_stops`."""
+    split = Frames.open(work / run.steps.recording(CROSS_TOWN, "test", OBJECTS.name))
+    town = split.data.town()
+    assert town is not None  # it was simulated
+    networks = {
+        rule: load_network(OBJECTS, work / run.steps.stage(arm, CLOUD, CROSS_TOWN, OBJECTS.name) / WEIGHTS)
+        for rule, arm in arms.items()
+    }
+    config = next(iter(networks.values())).config
+    seen = {number: split.data.frame(number) for number in split.vehicles}
+    wanted = {
+        number: float(len(asked_of(frame, config).targets))
+        for number, frame in seen.items()
+        if faces_crossing(frame.world_from_agent, town)
+    }
+    frames = [seen[number] for number in take_apart(wanted, name_scenes(split.data))]
+    panels = {
+        rule: [
+            show_cars(frame, found, asked_of(frame, config).targets, asked_of(frame, config).neutral, town)
+            for frame, found in zip(frames, detect_in(network, frames, score_threshold=OBJECTS_FROM), strict=True)
+        ]
+        for rule, network in networks.items()
+    }
+    return draw_strip(panels, VIEW_M[1] / (2 * VIEW_M[2]))
+
+
+def is_cloudy(frame: Frame) -> bool:
+    """Return whether a frame was recorded under clouds."""
+    return frame.weather is not None and classify_weather(frame.weather) in CLOUDY
+
+
+def faces_crossing(world_from_agent: Array, town: Town) -> bool:
+    """Return whether a pole of a cross-road stands ahead of an agent of this pose (4, 4)."""
+    poles = town.poles.position[np.array(town.poles.kind) == "cross"]
+    ahead, left, _ = transform_points(inverse(world_from_agent), poles).T
+    return bool(((ahead > AHEAD_M[0]) & (ahead < AHEAD_M[1]) & (np.abs(left) < ASIDE_M)).any())
+
+
+def name_scenes(data: Dataset) -> dict[int, str]:
+    """Return the scene of each frame by number."""
+    return {number: key.scene for number, key in enumerate(data.keys)}
+
+
+def match_signs(found: SignDetections, sample: Sample) -> Ints:
+    """Return the target (D,) of each detection in a picture, of its class; -1 for none, -2 on a sign to be ignored."""
+    box = torch.from_numpy(found.box)
+    overlap = rectangle_iou(box, torch.from_numpy(sample.boxes)).numpy()
+    matched = match_greedily(np.where(found.label[:, None] == sample.label, overlap, 0.0), OVERLAP)
+    ignored = (rectangle_iou(box, torch.from_numpy(sample.ignore)).numpy() > 0).any(axis=1)
+    return np.where((matched < 0) & ignored, -2, matched)
+
+
+def show_signs(sample: Sample, detections: SignDetections, stop: int) -> Panel:
+    """Return the part of a picture around its largest STOP sign, with the signs found and missed."""
+    matched = match_signs(detections, sample)
+    kept = matched > -2
+    box, score = detections.box[kept], detections.score[kept]
+    hit, found = judge(matched[kept], len(sample.boxes))
+    stops = sample.boxes[sample.label == stop]
+    corner = place_window(stops[size_px(stops).argmax()], sample.picture.shape[1::-1])
+
+    def draw(axes: Axes) -> None:
+        height, width = sample.picture.shape[:2]
+        axes.imshow(sample.picture, extent=(0, width, height, 0))
+        for one, seen in zip(sample.boxes, found, strict=True):
+            if not seen:
+                outline(axes, one, style.MISSED, "--")
+        for one, true, value in zip(box, hit, score, strict=True):
+            outline(axes, one, style.SKY if true else style.FALSE, "-", f"{value:.2f}")
+        axes.set(xlim=(corner[0], corner[0] + WINDOW_PX[0]), ylim=(corner[1] + WINDOW_PX[1], corner[1]))
+
+    return Panel(count(hit, found), draw)
+
+
+def place_window(box: Array, size: tuple[int, int]) -> Array:
+    """Return the upper left corner (2,) of a window around a box (4,), inside a picture of this width and height."""
+    middle = (box[:2] + box[2:]) / 2
+    return np.clip(middle - np.array(WINDOW_PX) / 2, 0, np.array(size) - WINDOW_PX)
+
+
+def outline(axes: Axes, box: Array, colour: str, dashes: str, text: str = "") -> None:
+    """Draw a rectangle (4,) [px] with a text above it."""
+    x1, y1, x2, y2 = box.tolist()
+    axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=2, linestyle=dashes))
+    look = {"facecolor": colour, "edgecolor": "none", "pad": 1.0}
+    if text:
+        axes.text(x1, y1 - 2, text, color="white", fontsize=style.SMALL, clip_on=True, va="bottom", bbox=look)
+
+
+def show_cars(frame: Frame, detections: Boxes, targets: Boxes, neutral: Boxes, town: Town) -> Panel:
+    """Return a sweep from above on the town's roads, with the cars found and missed."""
+    matched = assign_targets(detections, targets, OVERLAP)
+    kept = (matched >= 0) | ~on_neutral(detections, neutral)
+    boxes = detections[kept]
+    hit, found = judge(matched[kept], len(targets))
+    lidar = choose_lidar(frame)
+    lidar_from_world = inverse(frame.world_from_sensor(lidar))
+
+    def draw(axes: Axes) -> None:
+        for road in town.roads:
+            corners = transform_points(lidar_from_world, np.column_stack((road, np.zeros(len(road)))))
+            axes.add_patch(Polygon(on_page(corners[:, :2]), color=style.SIDEWALK, zorder=0))
+        draw_points(axes, frame.lidar[lidar], -float(frame.agent_from_sensor[lidar][2, 3]), VIEW_M)
+        draw_boxes(axes, targets[~found], style.MISSED, fill=0.35, width=1.6)
+        draw_boxes(axes, boxes[hit], style.HIT, width=1.8)
+        draw_boxes(axes, boxes[~hit], style.FALSE, width=1.8, dashed=True)
+        style.scale_bar(axes, 10)
+
+    return Panel(count(hit, found), draw)
+
+
+@style.styled
+def draw_strip(panels: Mapping[str, Sequence[Panel]], tall: float) -> Strip:
+    """Return the strip: a row for each rule, a column for each frame, `tall` times as high as wide."""
+    columns = max(map(len, panels.values()))
+    figure = style.canvas(10.0, (10.0 / columns * tall + 0.3) * len(panels) + 0.3)
+    for row, axes_of in zip(panels.items(), figure.subplots(len(panels), columns, squeeze=False), strict=True):
+        rule, seen = row
+        for axes, panel in zip(axes_of, seen, strict=True):
+            style.hide_axes(axes)
+            panel.draw(axes)
+            counted = panel.counted
+            axes.set_title(f"{counted.found} of {counted.targets} found, {counted.false} false")
+        axes_of[0].set_ylabel(rule, fontweight="bold", color=style.INK)
+    colours = {"found, with its score": style.HIT, "missed": style.MISSED, "false": style.FALSE}
+    style.key(figure, [Line2D([], [], color=colour, label=name) for name, colour in colours.items()])
+    return Strip(style.png(figure, 100), {rule: add_counts(seen) for rule, seen in panels.items()})
+
+
+def add_counts(seen: Sequence[Panel]) -> Counted:
+    """Return the sums over the frames of a strip."""
+    return Counted(*(sum(getattr(panel.counted, name) for panel in seen) for name in ("found", "targets", "false")))

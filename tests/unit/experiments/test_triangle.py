@@ -1,0 +1,223 @@
+"""Trained triangles: areas with their intervals, paired gains, and the frames and counts of the film strips."""
+
+from dataclasses import replace
+from io import BytesIO
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from flcav.geometry import Boxes
+from flcav.perception.signs.predict import SignDetections
+from flcav.perception.signs.samples import Sample
+from flcav.reproductions.fig6b.run import RULES, TASKS, measure_area
+from flcav.reproductions.plan_search.run import JOINT
+from flcav.reproductions.triangle import strips
+from flcav.reproductions.triangle.run import (
+    ARMS,
+    EXPERIMENT,
+    TrainedTriangles,
+    compare_triangles,
+    draw_both,
+    estimate_area,
+    estimate_gain,
+    tabulate_triangles,
+)
+from flcav.reproductions.triangle.strips import (
+    WINDOW_PX,
+    Counted,
+    Panel,
+    draw_strip,
+    faces_crossing,
+    match_signs,
+    place_window,
+    show_cars,
+    show_signs,
+    take_apart,
+)
+from flcav.runs.recipe import CLOUD, MAIN, load_run_recipe
+from flcav.sources.recipe import recipe_path
+from flcav.statistics.estimates import Estimate
+from flcav.world.map.town import load_town
+
+RECIPE = load_run_recipe(recipe_path("runs/triangle"))
+MEANS = {"most": (0.5, 0.08, 0.80), "equal": (0.6, 0.09, 0.81), MAIN: (0.62, 0.10, 0.81)}  # in the order of TASKS
+HALF = 0.04  # of every interval
+
+
+def about(mean: float, half: float = HALF) -> Estimate:
+    return Estimate(mean, mean - half, mean + half)
+
+
+def by_task(values: tuple[float, ...], half: float = HALF) -> dict[str, Estimate]:
+    return {task: about(value, half) for task, value in zip(TASKS, values, strict=True)}
+
+
+def make_run() -> Any:
+    """Return a run with the accuracies `MEANS` in both towns; weather of both best plans is one training."""
+
+    def plan(arm: str) -> SimpleNamespace:
+        tasks = {
+            task: SimpleNamespace(samples=40 + number, edge_rounds=2, cloud_rounds=1, predicted={CLOUD: value + 0.01})
+            for number, (task, value) in enumerate(zip(TASKS, MEANS[arm], strict=True))
+        }
+        return SimpleNamespace(plan=SimpleNamespace(tasks=tasks))
+
+    differences = [
+        SimpleNamespace(
+            arm=MAIN,
+            before_arm=arm,
+            stage=stage,
+            task=task,
+            region=town,
+            estimate=about(MEANS[MAIN][number] - MEANS[arm][number] if stage == CLOUD else 9.0, 0.02),
+        )
+        for arm in ("most", "equal")
+        for number, task in enumerate(TASKS)
+        for town in (*RECIPE.with_role("federate"), "grid and ring")
+        for stage in (CLOUD, "edge")
+        if (arm, task) != ("equal", "weather")
+    ]
+
+    def test(arm: str, stage: str, region: str, task: str) -> SimpleNamespace:
+        assert stage == CLOUD
+        shift = {"grid": 0.1, "ring": -0.1}[region]
+        return SimpleNamespace(estimate=about(MEANS[arm][TASKS.index(task)] + shift))
+
+    return SimpleNamespace(recipe=RECIPE, arms={arm: plan(arm) for arm in MEANS}, differences=differences, test=test)
+
+
+def compare() -> TrainedTriangles:
+    counted = {"stop signs": {str(rule): Counted(1, 3, 2) for rule in RULES}}
+    return compare_triangles(cast(Any, make_run()), counted)
+
+
+def test_an_area_has_the_interval_of_many_draws() -> None:
+    accuracy = by_task((0.6, 0.1, 0.9))
+    area = estimate_area(accuracy)
+    draws = np.random.default_rng(1).normal((0.6, 0.1, 0.9), HALF / 1.96, (200_000, 3))
+    low, high = np.quantile(measure_area(draws), (0.025, 0.975))
+    assert area.mean == pytest.approx((0.6 * 0.1 + 0.1 * 0.9 + 0.9 * 0.6) / 3)
+    assert (area.low, area.high) == pytest.approx((low, high), abs=1e-3)
+
+
+def test_a_gain_is_the_difference_of_the_areas_with_the_interval_of_paired_draws() -> None:
+    one, other = (0.62, 0.12, 0.9), (0.5, 0.08, 0.85)
+    gain = by_task(tuple(np.subtract(one, other)), 0.02)
+    found = estimate_gain(by_task(one), by_task(other), gain)
+    assert found.mean == pytest.approx(float(measure_area(np.array(one)) - measure_area(np.array(other))))
+    draws = np.array(other) + np.random.default_rng(1).normal(np.subtract(one, other), 0.02 / 1.96, (200_000, 3))
+    middle = np.quantile(measure_area(draws) - measure_area(np.array(other)), (0.025, 0.975))
+    assert (found.low, found.high) == pytest.approx(tuple(middle), abs=2e-3)
+
+
+def test_an_area_without_an_interval_of_a_task_has_none() -> None:
+    area = estimate_area({**by_task((0.6, 0.1, 0.9)), "signs": Estimate(0.1, None, None)})
+    assert (area.low, area.high) == (None, None)
+
+
+def test_plans_are_compared_after_the_cloud_round_in_the_mean_of_both_towns() -> None:
+    results = compare()
+    for rule, arm in ARMS.items():
+        own = results.triangles[rule]
+        assert [own.accuracy[task].mean for task in TASKS] == pytest.approx(MEANS[arm])
+        low, high = own.accuracy["objects"].low, own.accuracy["objects"].high
+        assert low is not None
+        assert high is not None
+        assert high - low == pytest.approx(2 * HALF / np.sqrt(2))
+        assert own.predicted_area == pytest.approx(float(measure_area(np.array(MEANS[arm]) + 0.01)))
+        assert own.plan["signs"] == (41, 2, 1)
+    joint, equal = results.triangles[JOINT], results.triangles["equal-stages"]
+    gain = results.gains["equal-stages"]
+    assert gain.predicted == pytest.approx(joint.predicted_area - equal.predicted_area)
+    assert gain.area.mean == pytest.approx(joint.area.mean - equal.area.mean)
+    assert gain.accuracy["weather"] == Estimate(0.0, 0.0, 0.0)  # one training
+
+
+def test_tables_and_picture_have_the_results() -> None:
+    results = compare()
+    tables = tabulate_triangles(results)
+    assert "| joint | signs | 41/2/1 | 0.110 | 0.100 (0.072 to 0.128) |" in tables["triangles"]
+    assert results.gains["max-throughput"].area.describe(sign=True) in tables["gains"]
+    assert "| stop signs | joint | 1 | 3 | 2 |" in tables["strips"]
+    assert Image.open(BytesIO(draw_both(results))).width > 1000
+    again = TrainedTriangles.from_json(EXPERIMENT.encode(results), "again")
+    assert again.sentences() == results.sentences()
+
+
+def test_the_arms_are_the_rules_of_the_recipe_and_differ_in_nothing_else() -> None:
+    assert {ARMS[rule] for rule in RULES} == {MAIN, *RECIPE.arms}
+    assert all(RECIPE.arms[ARMS[rule]].plan == rule for rule in RULES if rule != JOINT)
+    assert not any(arm.placement or arm.federation or arm.labels or arm.training for arm in RECIPE.arms.values())
+    assert RECIPE.replan == "none"
+
+
+def test_frames_are_the_best_of_different_scenes_before_any_second_one() -> None:
+    scenes = {1: "a", 2: "a", 3: "b", 4: "b", 5: "c"}
+    values = {1: 5.0, 2: 9.0, 3: 2.0, 4: 1.0, 5: 2.0}
+    assert take_apart(values, scenes, 2) == [2, 3]
+    assert take_apart(values, scenes, 3) == [2, 3, 5]
+    assert take_apart(values, scenes, 4) == [1, 2, 3, 5]
+    assert take_apart({4: 1.0}, scenes, 3) == [4]
+
+
+def test_a_cross_road_is_ahead_of_who_drives_towards_it() -> None:
+    town = load_town("grid")
+    pole = town.poles.position[town.poles.kind.index("cross")]
+    pose = np.eye(4)
+    pose[:3, 3] = pole - (20.0, 5.0, pole[2])
+    assert faces_crossing(pose, town)
+    away = pose.copy()
+    away[:2, :2] *= -1
+    away[:2, 3] = pole[:2] + np.array((-6.0, 200.0))
+    assert not faces_crossing(away, town)
+
+
+def make_sample() -> Sample:
+    picture = np.full((384, 640, 3), 90, np.uint8)
+    boxes = np.array([[300.0, 100, 330, 130], [400, 100, 420, 120], [500, 300, 510, 310]])
+    return Sample(picture, boxes, np.array([0, 1, 1]), np.array([[10.0, 10, 14, 14]]))
+
+
+def make_signs() -> SignDetections:
+    """Return a hit, a sign of another class, one on an ignored sign, and one on nothing."""
+    box = np.array([[301.0, 101, 331, 131], [400, 100, 420, 120], [9, 9, 15, 15], [100, 100, 120, 120]])
+    return SignDetections(box, np.array([0, 0, 0, 1]), np.array([0.9, 0.8, 0.7, 0.6]))
+
+
+def test_signs_are_found_by_class_and_overlap_and_small_ones_are_left_out() -> None:
+    assert match_signs(make_signs(), make_sample()).tolist() == [0, -1, -2, -1]
+    assert show_signs(make_sample(), make_signs(), stop=0).counted == Counted(found=1, targets=3, false=2)
+
+
+def test_the_window_is_around_the_sign_and_inside_the_picture() -> None:
+    width, height = WINDOW_PX
+    assert place_window(np.array([300.0, 100, 330, 130]), (640, 384)).tolist() == [315 - width / 2, 115 - height / 2]
+    assert place_window(np.array([0.0, 0, 10, 10]), (640, 384)).tolist() == [0, 0]
+    assert place_window(np.array([630.0, 374, 640, 384]), (640, 384)).tolist() == [640 - width, 384 - height]
+
+
+def cars(*x: float, score: float | None = None) -> Boxes:
+    size = np.tile((4.0, 2.0, 1.5), (len(x), 1))
+    center = np.column_stack((x, np.zeros(len(x)), np.full(len(x), -1.0)))
+    found = Boxes(center, size, np.zeros(len(x)), np.full(len(x), "Car"))
+    return found if score is None else replace(found, score=np.full(len(x), score))
+
+
+def test_cars_are_found_missed_and_false_and_neutral_ones_left_out() -> None:
+    points = np.random.default_rng(0).uniform(-20, 20, (50, 4)).astype(np.float32)
+    frame: Any = SimpleNamespace(
+        lidar={"lidar": points}, agent_from_sensor={"lidar": np.eye(4)}, world_from_sensor=lambda _: np.eye(4)
+    )
+    panel = show_cars(frame, cars(10, 30, 40, score=0.5), cars(10.2, 20), cars(40), load_town("grid"))
+    assert panel.counted == Counted(found=1, targets=2, false=1)
+    drawn = draw_strip({rule: [panel, panel] for rule in RULES}, 1.0)
+    assert drawn.counted == dict.fromkeys(RULES, Counted(found=2, targets=4, false=2))
+    assert Image.open(BytesIO(drawn.picture)).width == 1000
+
+
+def test_strips_are_as_wide_as_they_are_read() -> None:
+    panel: Panel = show_signs(make_sample(), make_signs(), stop=0)
+    assert Image.open(BytesIO(draw_strip({JOINT: [panel] * strips.SHOWN}, 0.6).picture)).width == 1000
