@@ -40,8 +40,11 @@ STOP, STOP_TOWN, CROSS_TOWN = "stop", "suburb", "grid"
 CLOUDY = ("cloudy", "overcast")
 SHOWN = 3  # frames of a strip
 SIGNS_FROM, OBJECTS_FROM = 0.1, 0.3  # scores from which detections are shown
-WINDOW_PX = (200, 120)  # width and height of the part of a picture that is shown
-VIEW_M = (0.0, 48.0, 24.0)  # of a sweep: behind, ahead, aside
+WINDOW_PX = (100.0, 240.0)  # least and most width of the part of a picture that is shown
+AROUND = 12  # its width in sizes of the STOP sign
+WIDE = 5 / 3  # its width, in heights
+FOUND = style.GREEN  # of annotations
+VIEW_M = (-4.0, 48.0, 24.0)  # of a sweep: behind, ahead, aside
 AHEAD_M, ASIDE_M = (5.0, 35.0), 15.0  # where a cross-road's pole is from a vehicle before it
 
 
@@ -77,6 +80,13 @@ def take_apart(values: Mapping[int, float], scenes: Mapping[int, str], shown: in
     return sorted(sorted(ranked, key=lambda number: number not in best.values())[:shown])
 
 
+def spread_out(values: Mapping[int, float], shown: int = SHOWN) -> list[int]:
+    """Return `shown` frames at equal distances in the order of their values, from the least to the largest."""
+    ranked = sorted(values, key=lambda number: (values[number], number))
+    places = np.linspace(0, len(ranked) - 1, min(shown, len(ranked))).round().astype(int)
+    return [ranked[place] for place in places]
+
+
 def judge(matched: Ints, targets: int) -> tuple[Mask, Mask]:
     """Return which detections are true (D,) and which targets are found, by the target (D,) of each, -1 for none."""
     return matched >= 0, np.isin(np.arange(targets), matched)
@@ -88,7 +98,10 @@ def count(hit: Mask, found: Mask) -> Counted:
 
 
 def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
-    """Return the strip of STOP signs under clouds; `arms`: by rule, `work`: the folder of the run's steps."""
+    """Return the strip of STOP signs under clouds, from far to near, by the networks of each rule.
+
+    `arms`: by rule; `work`: the folder of the run's steps.
+    """
     split = Frames.open(work / run.steps.recording(STOP_TOWN, "test", SIGNS.name))
     config = next(iter(SIGNS.configurations.values()))
     samples = dict(zip(split.vehicles, SIGNS.samples(split.data, config, split.vehicles), strict=True))
@@ -98,7 +111,7 @@ def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
         for number, sample in samples.items()
         if len(stops := sample.boxes[sample.label == stop]) and is_cloudy(split.data.frame(number))
     }
-    frames = take_apart(sizes, name_scenes(split.data))
+    frames = spread_out(sizes)
 
     def see(arm: str) -> list[Panel]:
         network = load_network(SIGNS, work / run.steps.stage(arm, CLOUD, STOP_TOWN, SIGNS.name) / WEIGHTS)
@@ -108,7 +121,7 @@ def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
             for sample in seen
         ]
 
-    return draw_strip({rule: see(arm) for rule, arm in arms.items()}, WINDOW_PX[1] / WINDOW_PX[0])
+    return draw_strip({rule: see(arm) for rule, arm in arms.items()}, 1 / WIDE)
 
 
 def film_crossings(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
@@ -135,7 +148,7 @@ def film_crossings(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
         ]
         for rule, network in networks.items()
     }
-    return draw_strip(panels, VIEW_M[1] / (2 * VIEW_M[2]))
+    return draw_strip(panels, (VIEW_M[1] - VIEW_M[0]) / (2 * VIEW_M[2]))
 
 
 def is_cloudy(frame: Frame) -> bool:
@@ -165,40 +178,64 @@ def match_signs(found: SignDetections, sample: Sample) -> Ints:
 
 
 def show_signs(sample: Sample, detections: SignDetections, stop: int) -> Panel:
-    """Return the part of a picture around its largest STOP sign, with the signs found and missed."""
-    matched = match_signs(detections, sample)
-    kept = matched > -2
-    box, score = detections.box[kept], detections.score[kept]
-    hit, found = judge(matched[kept], len(sample.boxes))
+    """Return the part of a picture around its largest STOP sign, with the signs there that are found and missed."""
     stops = sample.boxes[sample.label == stop]
-    corner = place_window(stops[size_px(stops).argmax()], sample.picture.shape[1::-1])
+    x1, y1, x2, y2 = place_window(stops[size_px(stops).argmax()], sample.picture.shape[1::-1])
+    matched = match_signs(detections, sample)
+    _, found = judge(matched, len(sample.boxes))
+    shown = np.array([is_inside(box, (x1, y1, x2, y2)) for box in sample.boxes], dtype=bool)
+    kept = np.array([is_inside(box, (x1, y1, x2, y2)) for box in detections.box], dtype=bool) & (matched > -2)
+    hit = matched >= 0
 
     def draw(axes: Axes) -> None:
         height, width = sample.picture.shape[:2]
         axes.imshow(sample.picture, extent=(0, width, height, 0))
-        for one, seen in zip(sample.boxes, found, strict=True):
-            if not seen:
-                outline(axes, one, style.MISSED, "--")
-        for one, true, value in zip(box, hit, score, strict=True):
-            outline(axes, one, style.SKY if true else style.FALSE, "-", f"{value:.2f}")
-        axes.set(xlim=(corner[0], corner[0] + WINDOW_PX[0]), ylim=(corner[1] + WINDOW_PX[1], corner[1]))
+        for box, seen in zip(sample.boxes[shown], found[shown], strict=True):
+            outline(axes, box, FOUND if seen else style.MISSED)
+        for box, true, score in zip(detections.box[kept], hit[kept], detections.score[kept], strict=True):
+            outline(axes, box, style.HIT if true else style.FALSE, f"{score:.2f}")
+        axes.set(xlim=(x1, x2), ylim=(y2, y1))
 
-    return Panel(count(hit, found), draw)
-
-
-def place_window(box: Array, size: tuple[int, int]) -> Array:
-    """Return the upper left corner (2,) of a window around a box (4,), inside a picture of this width and height."""
-    middle = (box[:2] + box[2:]) / 2
-    return np.clip(middle - np.array(WINDOW_PX) / 2, 0, np.array(size) - WINDOW_PX)
+    return Panel(count(hit[kept], found[shown]), draw)
 
 
-def outline(axes: Axes, box: Array, colour: str, dashes: str, text: str = "") -> None:
-    """Draw a rectangle (4,) [px] with a text above it."""
+Window = tuple[float, float, float, float]  # left, top, right, bottom [px]
+
+
+def place_window(box: Array, size: tuple[int, int]) -> Window:
+    """Return the window around a box (4,) that is shown, inside a picture of this width and height."""
+    width = float(np.clip(AROUND * size_px(box[None])[0], *WINDOW_PX))
+    sides = np.array([width, width / WIDE])
+    left, top = np.clip((box[:2] + box[2:] - sides) / 2, 0, size - sides)
+    return left, top, left + sides[0], top + sides[1]
+
+
+def is_inside(box: Array, window: Window) -> bool:
+    """Return whether the middle of a box (4,) is in a window."""
+    x, y = (box[:2] + box[2:]) / 2
+    return bool(window[0] < x < window[2] and window[1] < y < window[3])
+
+
+def outline(axes: Axes, box: Array, colour: str, text: str = "") -> None:
+    """Draw a rectangle (4,) [px] with a text above it, below it where it is false."""
     x1, y1, x2, y2 = box.tolist()
-    axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=2, linestyle=dashes))
-    look = {"facecolor": colour, "edgecolor": "none", "pad": 1.0}
+    axes.add_patch(Rectangle((x1, y1), x2 - x1, y2 - y1, fill=False, edgecolor=colour, linewidth=2))
     if text:
-        axes.text(x1, y1 - 2, text, color="white", fontsize=style.SMALL, clip_on=True, va="bottom", bbox=look)
+        write(axes, (x1, y2 if colour == style.FALSE else y1), text, colour)
+
+
+def write(axes: Axes, at: tuple[float, float], text: str, colour: str) -> None:
+    """Write on a ground of `colour` above a place, below it where it is false."""
+    axes.annotate(
+        text,
+        at,
+        (0, -11 if colour == style.FALSE else 3),
+        textcoords="offset points",
+        color="white",
+        fontsize=style.SMALL,
+        annotation_clip=True,
+        bbox={"facecolor": colour, "edgecolor": "none", "pad": 0.8},
+    )
 
 
 def show_cars(frame: Frame, detections: Boxes, targets: Boxes, neutral: Boxes, town: Town) -> Panel:
@@ -215,12 +252,21 @@ def show_cars(frame: Frame, detections: Boxes, targets: Boxes, neutral: Boxes, t
             corners = transform_points(lidar_from_world, np.column_stack((road, np.zeros(len(road)))))
             axes.add_patch(Polygon(on_page(corners[:, :2]), color=style.SIDEWALK, zorder=0))
         draw_points(axes, frame.lidar[lidar], -float(frame.agent_from_sensor[lidar][2, 3]), VIEW_M)
+        draw_boxes(axes, targets[found], FOUND, fill=0.4, width=0.8)
         draw_boxes(axes, targets[~found], style.MISSED, fill=0.35, width=1.6)
-        draw_boxes(axes, boxes[hit], style.HIT, width=1.8)
-        draw_boxes(axes, boxes[~hit], style.FALSE, width=1.8, dashed=True)
+        for part, colour, up in ((boxes[hit], style.HIT, 1.5), (boxes[~hit], style.FALSE, -1.5)):
+            draw_boxes(axes, part, colour, width=1.8)
+            for place, score in zip(on_page(part.center[:, :2]).tolist(), asked_score(part), strict=True):
+                write(axes, (place[0] - 1.5, place[1] + up), f"{score:.2f}", colour)
+        axes.plot(0, 0, "^", color=style.INK, markersize=7, clip_on=False)
         style.scale_bar(axes, 10)
 
     return Panel(count(hit, found), draw)
+
+
+def asked_score(boxes: Boxes) -> list[float]:
+    """Return the scores of detections."""
+    return [] if boxes.score is None else boxes.score.tolist()
 
 
 @style.styled
@@ -236,7 +282,12 @@ def draw_strip(panels: Mapping[str, Sequence[Panel]], tall: float) -> Strip:
             counted = panel.counted
             axes.set_title(f"{counted.found} of {counted.targets} found, {counted.false} false")
         axes_of[0].set_ylabel(rule, fontweight="bold", color=style.INK)
-    colours = {"found, with its score": style.HIT, "missed": style.MISSED, "false": style.FALSE}
+    colours = {
+        "truth, found": FOUND,
+        "truth, missed": style.MISSED,
+        "detection with its score": style.HIT,
+        "false detection": style.FALSE,
+    }
     style.key(figure, [Line2D([], [], color=colour, label=name) for name, colour in colours.items()])
     return Strip(style.png(figure, 100), {rule: add_counts(seen) for rule, seen in panels.items()})
 

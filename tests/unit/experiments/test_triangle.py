@@ -26,7 +26,6 @@ from flcav.reproductions.triangle.run import (
     tabulate_triangles,
 )
 from flcav.reproductions.triangle.strips import (
-    WINDOW_PX,
     Counted,
     Panel,
     draw_strip,
@@ -35,6 +34,7 @@ from flcav.reproductions.triangle.strips import (
     place_window,
     show_cars,
     show_signs,
+    spread_out,
     take_apart,
 )
 from flcav.runs.recipe import CLOUD, MAIN, load_run_recipe
@@ -163,6 +163,14 @@ def test_frames_are_the_best_of_different_scenes_before_any_second_one() -> None
     assert take_apart({4: 1.0}, scenes, 3) == [4]
 
 
+def test_frames_are_spread_from_the_least_to_the_largest() -> None:
+    values = {1: 5.0, 2: 9.0, 3: 2.0, 4: 1.0, 5: 7.0}
+    assert spread_out(values, 3) == [4, 1, 2]
+    assert spread_out(values, 2) == [4, 2]
+    assert spread_out({7: 1.0, 8: 0.5}, 3) == [8, 7]
+    assert spread_out({}) == []
+
+
 def test_a_cross_road_is_ahead_of_who_drives_towards_it() -> None:
     town = load_town("grid")
     pole = town.poles.position[town.poles.kind.index("cross")]
@@ -189,14 +197,23 @@ def make_signs() -> SignDetections:
 
 def test_signs_are_found_by_class_and_overlap_and_small_ones_are_left_out() -> None:
     assert match_signs(make_signs(), make_sample()).tolist() == [0, -1, -2, -1]
-    assert show_signs(make_sample(), make_signs(), stop=0).counted == Counted(found=1, targets=3, false=2)
+    assert show_signs(make_sample(), make_signs(), stop=0).counted == Counted(found=1, targets=2, false=1)
 
 
-def test_the_window_is_around_the_sign_and_inside_the_picture() -> None:
-    width, height = WINDOW_PX
-    assert place_window(np.array([300.0, 100, 330, 130]), (640, 384)).tolist() == [315 - width / 2, 115 - height / 2]
-    assert place_window(np.array([0.0, 0, 10, 10]), (640, 384)).tolist() == [0, 0]
-    assert place_window(np.array([630.0, 374, 640, 384]), (640, 384)).tolist() == [640 - width, 384 - height]
+def test_what_is_beside_the_window_is_neither_shown_nor_counted() -> None:
+    sample = make_sample()
+    small = replace(sample, boxes=np.array([[300.0, 100, 310, 110], [400, 100, 420, 120], [500, 300, 510, 310]]))
+    found = replace(
+        make_signs(), box=np.array([[300.0, 100, 310, 110], [340, 100, 360, 120], [9, 9, 15, 15], [90, 90, 99, 99]])
+    )
+    assert show_signs(small, found, stop=0).counted == Counted(found=1, targets=1, false=1)
+
+
+def test_the_window_is_around_the_sign_as_wide_as_its_size_asks_and_inside_the_picture() -> None:
+    assert place_window(np.array([300.0, 100, 320, 120]), (640, 384)) == pytest.approx((190, 38, 430, 182))
+    assert place_window(np.array([300.0, 100, 310, 110]), (640, 384)) == pytest.approx((245, 69, 365, 141))
+    assert place_window(np.array([0.0, 0, 5, 5]), (640, 384)) == pytest.approx((0, 0, 100, 60))
+    assert place_window(np.array([635.0, 379, 640, 384]), (640, 384)) == pytest.approx((540, 324, 640, 384))
 
 
 def cars(*x: float, score: float | None = None) -> Boxes:
