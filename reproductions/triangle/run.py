@@ -2,25 +2,33 @@
 
 The recipe is recipes/runs/triangle.yaml. Corners are what the networks of a plan reach after stage III, in the mean of
 the federating towns, beside what the run's curves predict for the plan. Intervals are over test scenes: of an area, and
-of a difference of areas of networks on the same frames, by the delta method.
+of a difference of areas of networks on the same frames, by the delta method. Of the run only the steps that these tests
+need are made.
 """
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 
 import numpy as np
 
 from flcav.arrays import Array
 from flcav.config import Json
-from flcav.experiments.experiment import Experiment, Options, Outcome, list_works, shrink_recipe
+from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.report import style
-from flcav.reproductions.fig6b.run import LOOKS, RULES, TASKS, Plan, draw_axes, draw_triangle, measure_area
+from flcav.reproductions.fig6b.run import LOOKS, RULES, TASKS, draw_axes, draw_triangle, measure_area
 from flcav.reproductions.plan_search.run import JOINT
 from flcav.reproductions.triangle.strips import Counted, film_crossings, film_stops
+from flcav.runs.analysis.differences import compare_tests, test_folder
+from flcav.runs.edge_stage import list_needed
+from flcav.runs.engine import run_steps
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CLOUD, MAIN
-from flcav.runs.results.run import Run
+from flcav.runs.results.plans import Plan
+from flcav.runs.results.tests import Tested
+from flcav.runs.running import WORK
+from flcav.runs.stages.graph import Graph
 from flcav.statistics.estimates import Estimate, average_estimates
 from flcav.storage.markdown import format_signed, format_table
 from flcav.storage.records import Record
@@ -32,7 +40,7 @@ ARMS = {"max-throughput": "most", "equal-stages": "equal", JOINT: MAIN}  # by ru
 class Trained:
     """A plan, what the curves predict for it and what its networks reach."""
 
-    plan: Plan
+    plan: Mapping[str, tuple[int, int, int]]  # samples, edge and cloud rounds by task
     predicted: Mapping[str, float]  # accuracy by task
     predicted_area: float  # 1: all accuracies are 1
     accuracy: Mapping[str, Estimate]  # by task
@@ -101,17 +109,18 @@ def carry_intervals(mean: float, slopes: Array, parts: Mapping[str, Estimate]) -
     return Estimate(mean, mean - float(np.linalg.norm(slopes * below)), mean + float(np.linalg.norm(slopes * above)))
 
 
-def measure_plan(run: Run, rule: str) -> Trained:
+def find_test(graph: Graph, work: Path, rule: str, town: str, task: str) -> Path:
+    """Return the folder of the test of a rule's network after stage III in a town."""
+    return work / test_folder(graph, ARMS[rule], CLOUD, town, task)
+
+
+def measure_plan(graph: Graph, work: Path, rule: str) -> Trained:
     """Return the plan of a rule, its predictions, and what its networks reach in the mean of the federating towns."""
-    plans = run.arms[ARMS[rule]].plan.tasks
+    plans = Plan.load(work / graph.names.plan(ARMS[rule])).tasks
     predicted = {task: (plans[task].predicted or {})[CLOUD] for task in TASKS}
+    towns = graph.recipe.with_role("federate")
     accuracy = {
-        task: average_estimates(
-            [
-                run.test(arm=ARMS[rule], stage=CLOUD, region=town, task=task).estimate
-                for town in run.recipe.with_role("federate")
-            ]
-        )
+        task: average_estimates([Tested.load(find_test(graph, work, rule, town, task)).estimate for town in towns])
         for task in TASKS
     }
     return Trained(
@@ -123,31 +132,34 @@ def measure_plan(run: Run, rule: str) -> Trained:
     )
 
 
-def subtract_accuracy(run: Run, rule: str, task: str) -> Estimate:
+def subtract_accuracy(graph: Graph, work: Path, rule: str, task: str) -> Estimate:
     """Return a task's accuracy by the joint plan minus that by another rule, on the same frames of both towns.
 
-    It is 0 in a town where both rules share their training.
+    It is 0 where both rules share their training.
     """
-    known = {
-        each.region: each.estimate
-        for each in run.differences
-        if (each.arm, each.before_arm, each.stage, each.task) == (MAIN, ARMS[rule], CLOUD, task)
-    }
-    towns = run.recipe.with_role("federate")
-    return average_estimates([known.get(town, Estimate(0.0, 0.0, 0.0)) for town in towns])
+    pairs = [
+        [find_test(graph, work, each, town, task) for each in (rule, JOINT)]
+        for town in graph.recipe.with_role("federate")
+    ]
+    return average_estimates(
+        [
+            Estimate(0.0, 0.0, 0.0) if before == after else compare_tests(task, before, after, graph.recipe.seed)
+            for before, after in pairs
+        ]
+    )
 
 
-def compare_triangles(run: Run, strips: Mapping[str, Mapping[str, Counted]]) -> TrainedTriangles:
-    """Return the triangles of a run's plans, and the gains of the joint one."""
-    triangles = {rule: measure_plan(run, rule) for rule in RULES}
+def compare_triangles(graph: Graph, work: Path, strips: Mapping[str, Mapping[str, Counted]]) -> TrainedTriangles:
+    """Return the triangles of the plans that a run trained in `work`, and the gains of the joint one."""
+    triangles = {rule: measure_plan(graph, work, rule) for rule in RULES}
     joint, gains = triangles[JOINT], dict[str, Gain]()
     for rule in (rule for rule in RULES if rule != JOINT):
         other = triangles[rule]
-        accuracy = {task: subtract_accuracy(run, rule, task) for task in TASKS}
+        accuracy = {task: subtract_accuracy(graph, work, rule, task) for task in TASKS}
         area = estimate_gain(joint.accuracy, other.accuracy, accuracy)
         gains[rule] = Gain(joint.predicted_area - other.predicted_area, accuracy, area)
-    settings = run.recipe.model_dump(mode="json", exclude={"seed"})
-    return TrainedTriangles(triangles, gains, strips, settings, provenance())
+    settings = graph.recipe.model_dump(mode="json", exclude={"seed"})
+    return TrainedTriangles(triangles, gains, strips, settings, provenance(graph.recipe.seed))
 
 
 def tabulate_triangles(results: TrainedTriangles) -> dict[str, str]:
@@ -211,11 +223,14 @@ def draw_both(results: TrainedTriangles) -> bytes:
 
 
 def _run(out: Path, options: Options) -> Outcome[TrainedTriangles]:
-    recipe = options.load("triangle", shrink_recipe)
-    (run,) = runs = options.run_seeds(recipe, out)
-    (work,) = list_works(runs, out)
-    stops, crossings = (film(run, work, ARMS) for film in (film_stops, film_crossings))
-    results = compare_triangles(run, {"stop signs": stops.counted, "cross-roads": crossings.counted})
+    graph = Graph(options.load("triangle", shrink_recipe), Path())
+    work = out / WORK
+    tests = {find_test(graph, work, *about).name for about in product(RULES, graph.recipe.with_role("federate"), TASKS)}
+    asked = [step for step in graph.steps if step.name in tests]
+    with options.show_steps(options.title) as notify:
+        run_steps([*list_needed(graph.steps, asked), *asked], work, **options.how(notify))
+    stops, crossings = (film(graph.names, work, ARMS) for film in (film_stops, film_crossings))
+    results = compare_triangles(graph, work, {"stop signs": stops.counted, "cross-roads": crossings.counted})
     pictures = {
         "triangles.png": draw_both(results),
         "stops.png": stops.picture,

@@ -28,9 +28,9 @@ from flcav.perception.signs.task import SIGNS
 from flcav.perception.weights import load_network
 from flcav.report import style
 from flcav.report.pictures.clouds import draw_boxes, draw_points, on_page
+from flcav.runs.arms import Names
 from flcav.runs.frames import Frames
 from flcav.runs.recipe import CLOUD
-from flcav.runs.results.run import Run
 from flcav.runs.results.saved import WEIGHTS
 from flcav.sensors.frame import Frame
 from flcav.world.map.town import Town
@@ -97,12 +97,12 @@ def count(hit: Mask, found: Mask) -> Counted:
     return Counted(int(found.sum()), len(found), int((~hit).sum()))
 
 
-def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
+def film_stops(names: Names, work: Path, arms: Mapping[str, str]) -> Strip:
     """Return the strip of STOP signs under clouds, from far to near, by the networks of each rule.
 
-    `arms`: by rule; `work`: the folder of the run's steps.
+    `names`: of the run's steps, whose folders are in `work`; `arms`: by rule.
     """
-    split = Frames.open(work / run.steps.recording(STOP_TOWN, "test", SIGNS.name))
+    split = Frames.open(work / names.recording(STOP_TOWN, "test", SIGNS.name))
     config = next(iter(SIGNS.configurations.values()))
     samples = dict(zip(split.vehicles, SIGNS.samples(split.data, config, split.vehicles), strict=True))
     stop = config.classes.index(STOP)
@@ -114,7 +114,7 @@ def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
     frames = spread_out(sizes)
 
     def see(arm: str) -> list[Panel]:
-        network = load_network(SIGNS, work / run.steps.stage(arm, CLOUD, STOP_TOWN, SIGNS.name) / WEIGHTS)
+        network = load_network(SIGNS, work / names.stage(arm, CLOUD, STOP_TOWN, SIGNS.name) / WEIGHTS)
         seen = (samples[number] for number in frames)
         return [
             show_signs(sample, detect_in_picture(network, sample.picture, threshold=SIGNS_FROM), stop)
@@ -124,13 +124,13 @@ def film_stops(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
     return draw_strip({rule: see(arm) for rule, arm in arms.items()}, 1 / WIDE)
 
 
-def film_crossings(run: Run, work: Path, arms: Mapping[str, str]) -> Strip:
+def film_crossings(names: Names, work: Path, arms: Mapping[str, str]) -> Strip:
     """Return the strip of cross-roads from above; arguments as of `film_stops`."""
-    split = Frames.open(work / run.steps.recording(CROSS_TOWN, "test", OBJECTS.name))
+    split = Frames.open(work / names.recording(CROSS_TOWN, "test", OBJECTS.name))
     town = split.data.town()
     assert town is not None  # it was simulated
     networks = {
-        rule: load_network(OBJECTS, work / run.steps.stage(arm, CLOUD, CROSS_TOWN, OBJECTS.name) / WEIGHTS)
+        rule: load_network(OBJECTS, work / names.stage(arm, CLOUD, CROSS_TOWN, OBJECTS.name) / WEIGHTS)
         for rule, arm in arms.items()
     }
     config = next(iter(networks.values())).config
