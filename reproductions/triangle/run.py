@@ -169,7 +169,8 @@ def tabulate_triangles(results: TrainedTriangles) -> dict[str, str]:
             ("rule", "task", "samples / edge / cloud", "accuracy, predicted", "trained"),
             [
                 row
-                for rule, own in results.triangles.items()
+                for rule in RULES
+                for own in [results.triangles[rule]]
                 for row in (
                     *(
                         [
@@ -194,7 +195,7 @@ def tabulate_triangles(results: TrainedTriangles) -> dict[str, str]:
                     own.area.describe(sign=True),
                     *(own.accuracy[task].describe(sign=True) for task in TASKS),
                 ]
-                for rule, own in results.gains.items()
+                for rule, own in ((rule, results.gains[rule]) for rule in RULES if rule != JOINT)
             ],
         ),
         "strips": format_table(
@@ -202,7 +203,7 @@ def tabulate_triangles(results: TrainedTriangles) -> dict[str, str]:
             [
                 [strip, rule, own.found, own.targets, own.false]
                 for strip, by_rule in results.strips.items()
-                for rule, own in by_rule.items()
+                for rule, own in ((rule, by_rule[rule]) for rule in RULES)
             ],
         ),
     }

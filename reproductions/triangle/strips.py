@@ -192,8 +192,10 @@ def show_signs(sample: Sample, detections: SignDetections, stop: int) -> Panel:
         axes.imshow(sample.picture, extent=(0, width, height, 0))
         for box, seen in zip(sample.boxes[shown], found[shown], strict=True):
             outline(axes, box, FOUND if seen else style.MISSED)
-        for box, true, score in zip(detections.box[kept], hit[kept], detections.score[kept], strict=True):
-            outline(axes, box, style.HIT if true else style.FALSE, f"{score:.2f}")
+        named = hit | (np.cumsum(kept & ~hit) == 1)  # of false ones the best: scores fall
+        for number in np.flatnonzero(kept):
+            text = f"{detections.score[number]:.2f}" if named[number] else ""
+            outline(axes, detections.box[number], style.HIT if hit[number] else style.FALSE, text)
         axes.set(xlim=(x1, x2), ylim=(y2, y1))
 
     return Panel(count(hit[kept], found[shown]), draw)
