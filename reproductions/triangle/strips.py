@@ -274,12 +274,13 @@ def asked_score(boxes: Boxes) -> list[float]:
 @style.styled
 def draw_strip(panels: Mapping[str, Sequence[Panel]], tall: float) -> Strip:
     """Return the strip: a row for each rule, a column for each frame, `tall` times as high as wide."""
-    columns = max(map(len, panels.values()))
+    columns = max(1, *map(len, panels.values()))
     figure = style.canvas(10.0, (10.0 / columns * tall + 0.3) * len(panels) + 0.3)
     for row, axes_of in zip(panels.items(), figure.subplots(len(panels), columns, squeeze=False), strict=True):
         rule, seen = row
-        for axes, panel in zip(axes_of, seen, strict=True):
+        for axes in axes_of:
             style.hide_axes(axes)
+        for axes, panel in zip(axes_of, seen):  # a trial of few frames may have none to show
             panel.draw(axes)
             counted = panel.counted
             axes.set_title(f"{counted.found} of {counted.targets} found, {counted.false} false")

@@ -188,7 +188,9 @@ def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
     """Return a recipe at toy size, for a trial, with plans that few frames from anywhere suffice for."""
     few = {"samples": 16, "edge_rounds": 1}
     tasks = {
-        name: task.model_copy(update={"plan": task.plan.model_copy(update=few)}) if task.plan else task
+        name: task.model_copy(
+            update={"training": None, "plan": task.plan.model_copy(update=few) if task.plan else None}
+        )
         for name, task in recipe.tasks.items()
     }
     anywhere = recipe.placement.model_copy(update={"group_range_m": 1000.0})  # [m] from a sensor

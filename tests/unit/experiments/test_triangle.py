@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from flcav.experiments.experiment import shrink_recipe
 from flcav.geometry import Boxes
 from flcav.perception.signs.predict import SignDetections
 from flcav.perception.signs.samples import Sample
@@ -230,6 +231,17 @@ def test_cars_are_found_missed_and_false_and_neutral_ones_left_out() -> None:
     drawn = draw_strip({rule: [panel, panel] for rule in RULES}, 1.0)
     assert drawn.counted == dict.fromkeys(RULES, Counted(found=2, targets=4, false=2))
     assert Image.open(BytesIO(drawn.picture)).width == 1000
+
+
+def test_a_strip_of_no_frames_is_empty() -> None:
+    strip = draw_strip({str(rule): [] for rule in RULES}, 1.0)
+    assert strip.counted == dict.fromkeys(RULES, Counted(0, 0, 0))
+
+
+def test_a_trial_trains_every_task_for_few_steps() -> None:
+    quick = shrink_recipe(RECIPE)
+    assert {quick.training_of(task).steps for task in TASKS} == {12}
+    assert all(quick.tasks[task].history for task in TASKS)
 
 
 def test_strips_are_as_wide_as_they_are_read() -> None:
