@@ -324,4 +324,4 @@ def _run(out: Path, options: Options) -> Outcome[AllocationResult]:
     return Outcome(results, {"plans.png": draw_allocation(results)}, sentences)
 
 
-EXPERIMENT = Experiment(AllocationResult, _run, tables)
+EXPERIMENT = Experiment(AllocationResult, _run, tables, recipe="allocation")

@@ -9,8 +9,10 @@ of samples that they were not fitted to (Fig. 3a).
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from matplotlib.axes import Axes
 
 from flcav.arrays import Array
 from flcav.experiments.experiment import Experiment, Options, Outcome
@@ -34,6 +36,10 @@ from flcav.storage.records import Record
 
 TASKS = ("objects", "signs", "weather")
 RULES = ("max-throughput", "equal-stages", JOINT)  # the first is the baseline
+LOOKS = {  # of a rule's triangle
+    rule: {"color": colour, "linewidth": width, "label": rule}
+    for rule, colour, width in zip(RULES, (style.MUTED, style.ORANGE, style.BLUE), (4.5, 2.8, 1.2), strict=True)
+}
 BUDGETS_MB = (160.0, 320.0, 640.0)  # of either link
 
 Plan = Mapping[str, tuple[int, int, int]]  # samples, edge and cloud rounds by task
@@ -193,27 +199,41 @@ def tabulate_triangles(results: Triangles) -> dict[str, str]:
     }
 
 
+def draw_axes(axes: Axes, title: str) -> None:
+    """Draw the tasks' axes, with a line for each quarter of accuracy."""
+    style.hide_axes(axes)
+    for share in (0.25, 0.5, 0.75, 1.0):
+        draw_triangle(axes, dict.fromkeys(TASKS, share), color=style.SIDEWALK, linewidth=1, zorder=0)
+    for task, corner in zip(TASKS, place_corners(), strict=True):
+        axes.plot(*np.vstack(([0, 0], corner)).T, color=style.SIDEWALK, linewidth=1, zorder=0)
+        across, up = (1.14 * corner).tolist()
+        axes.text(across, up, task, ha="center", va="center")
+    axes.set_title(title, fontweight="bold")
+    axes.set(aspect="equal", xlim=(-1.25, 1.25), ylim=(-0.85, 1.3))
+
+
+def draw_triangle(axes: Axes, accuracy: Mapping[str, float], **look: Any) -> None:
+    """Draw the triangle of the tasks' accuracies; `look`: options of `plot`."""
+    ends = place_corners() * np.array([accuracy[task] for task in TASKS])[:, None]
+    across, up = np.vstack((ends, ends[:1])).T
+    axes.plot(across, up, **look)
+
+
+def place_corners() -> Array:
+    """Return the unit vectors (3, 2) of the tasks' axes."""
+    angles = np.pi / 2 + 2 * np.pi / 3 * np.arange(len(TASKS))
+    return np.column_stack((np.cos(angles), np.sin(angles)))
+
+
 @style.styled
 def draw_triangles(results: Triangles) -> bytes:
     """Return the triangles as a PNG, a panel for each budget."""
     figure = style.canvas(3.6 * len(results.budgets), 3.7)
-    angles = np.pi / 2 + 2 * np.pi / 3 * np.arange(len(TASKS))
-    corners = np.column_stack((np.cos(angles), np.sin(angles)))
-    colours = dict(zip(RULES, (style.MUTED, style.ORANGE, style.BLUE), strict=True))
     panels = figure.subplots(1, len(results.budgets), squeeze=False)[0]
     for axes, at in zip(panels, results.budgets, strict=True):
-        style.hide_axes(axes)
-        for share in (0.25, 0.5, 0.75, 1.0):
-            ring = share * np.vstack((corners, corners[:1]))
-            axes.plot(*ring.T, color=style.SIDEWALK, linewidth=1, zorder=0)
-        for task, corner in zip(TASKS, corners, strict=True):
-            axes.plot(*np.vstack(([0, 0], corner)).T, color=style.SIDEWALK, linewidth=1, zorder=0)
-            axes.text(*(1.14 * corner), task, ha="center", va="center")
-        for rule, width in zip(RULES, (4.5, 2.8, 1.2), strict=True):
-            ends = corners * np.array([at.triangles[rule].accuracy[task] for task in TASKS])[:, None]
-            axes.plot(*np.vstack((ends, ends[:1])).T, color=colours[rule], linewidth=width, label=rule)
-        axes.set_title(f"{at.budget_mb:g} MB of either link", fontweight="bold")
-        axes.set(aspect="equal", xlim=(-1.25, 1.25), ylim=(-0.85, 1.3))
+        draw_axes(axes, f"{at.budget_mb:g} MB of either link")
+        for rule, look in LOOKS.items():
+            draw_triangle(axes, at.triangles[rule].accuracy, **look)
     style.key(figure, panels[0].get_legend_handles_labels()[0])
     return style.png(figure)
 

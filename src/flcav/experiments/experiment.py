@@ -112,10 +112,11 @@ class Experiment(Generic[Results]):
 def check_recipe(values: Json, name: str, origin: str) -> None:
     """Raise `InputError` where results are of other settings than the package's recipe `runs/NAME` states.
 
-    Fields that the recipe leaves to their defaults are not compared: results keep those of their day.
+    Fields that the recipe leaves to their defaults are not compared: results keep those of their day. Nor are seed and
+    size, which are the command's.
     """
     recipe = load_run_recipe(recipe_path(f"runs/{name}"))
-    stated = recipe.model_dump(mode="json", exclude={"seed"}, exclude_unset=True)
+    stated = recipe.model_dump(mode="json", exclude={"seed", "size"}, exclude_unset=True)
     held = values.get("recipe") if isinstance(values, Mapping) else None
     if (differs := _find_difference(stated, held, "")) is not None:
         raise InputError(f"{origin}: of another recipe than recipes/runs/{name}.yaml, which has {differs}")
@@ -187,7 +188,9 @@ def shrink_recipe(recipe: RunRecipe) -> RunRecipe:
     """Return a recipe at toy size, for a trial, with plans that few frames from anywhere suffice for."""
     few = {"samples": 16, "edge_rounds": 1}
     tasks = {
-        name: task.model_copy(update={"plan": task.plan.model_copy(update=few)}) if task.plan else task
+        name: task.model_copy(
+            update={"training": None, "plan": task.plan.model_copy(update=few) if task.plan else None}
+        )
         for name, task in recipe.tasks.items()
     }
     anywhere = recipe.placement.model_copy(update={"group_range_m": 1000.0})  # [m] from a sensor

@@ -1,11 +1,15 @@
 """A user's own experiment, a folder anywhere, is repeated and tabulated as those that come with flcav are."""
 
 import json
+import os
+import signal
+import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 from reproduction_pages import main as fill_pages
+from waiting import wait_for
 
 from flcav.cli.main import run
 from flcav.config import InputError
@@ -68,6 +72,23 @@ def test_a_folder_of_ones_own_is_run_in_processes_and_fills_its_page(folder: Pat
     assert (folder / "README.md").read_text() == "<!-- squares -->\n| n |\n|---|\n| 1 |\n| 4 |\n| 9 |\n<!-- end -->\n"
 
 
+@pytest.mark.slow
+def test_a_killed_study_goes_on_after_the_seeds_that_were_done(folder: Path) -> None:
+    waiting = "    while seed == 2 and not Path(__file__).with_name('go').exists():\n        time.sleep(0.01)\n"
+    counting = "    (Path(__file__).parent / f'{seed}-{os.getpid()}').touch()\n"
+    script = SCRIPT.replace("    return seed * seed", f"{counting}{waiting}    return seed * seed")
+    (folder / "run.py").write_text(f"import os\nimport time\n{script}")
+    options = ["reproduce", str(folder), "--seeds", "3", "--jobs", "1", "--out", str(folder / "out")]
+    process = subprocess.Popen([sys.executable, "-m", "flcav", *options], start_new_session=True)
+    wait_for(lambda: [*folder.glob("2-*")], tell=lambda: "the second seed never began")
+    os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+    (folder / "go").touch()
+    subprocess.run([sys.executable, "-m", "flcav", *options], check=True)
+    assert json.loads((folder / "out/result.json").read_text()) == {"squares": [1, 4, 9]}
+    assert [len([*folder.glob(f"{seed}-*")]) for seed in (1, 2, 3)] == [1, 2, 1]
+
+
 def test_what_is_no_experiment_is_refused_in_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
     for name, script, said in (
@@ -91,17 +112,19 @@ def test_each_experiment_of_the_checkout_is_found_by_its_folder_and_by_its_name(
     assert found is load_experiment("federation-groups")
 
 
-def test_results_of_another_recipe_are_refused_by_its_name() -> None:
-    experiment = load_experiment("gap")
-    path = list_experiments()["gap"] / "result.json"
-    held = json.loads(path.read_text())
-    assert "differences" in experiment.tabulate(held, "result.json")
-    steps = held["recipe"]["training"]["steps"]
-    held["recipe"]["training"]["steps"] = 7
+@pytest.mark.parametrize(
+    ("name", "recipe", "table"), [("gap", "gap", "differences"), ("fig6a-allocation", "allocation", "plans")]
+)
+def test_results_of_another_recipe_are_refused_by_its_name(name: str, recipe: str, table: str) -> None:
+    experiment = load_experiment(name)
+    held = json.loads((list_experiments()[name] / "result.json").read_text())
+    assert table in experiment.tabulate(held, "result.json")
+    range_m = held["recipe"]["placement"]["range_m"]
+    held["recipe"]["placement"]["range_m"] = 7
     with pytest.raises(
-        InputError, match=rf"result\.json: of another recipe than recipes/runs/gap\.yaml, .*{steps}, and not 7"
+        InputError, match=rf"result\.json: of another recipe than recipes/runs/{recipe}\.yaml, .*{range_m}, and not 7"
     ):
         experiment.tabulate(held, "result.json")
     del held["recipe"]
-    with pytest.raises(InputError, match="of another recipe than recipes/runs/gap"):
+    with pytest.raises(InputError, match=f"of another recipe than recipes/runs/{recipe}"):
         experiment.tabulate(held, "result.json")
