@@ -109,7 +109,7 @@ def test_around_who_stands_the_lane_does_not_count() -> None:
 
 def test_a_rig_without_a_camera_is_refused() -> None:
     scene = Scene(load_town("ring"), empty_trace("ring"))
-    frame = observe(scene, lidar32(), "pole0", 0, scene_name="x", seed=1, number=0)
+    frame = observe(scene, lidar32(), "pole1", 0, scene_name="x", seed=1, number=0)
     with pytest.raises(InputError, match="the vehicle's rig has no camera 'camera', which its lane is seen by"):
         find_lines(frame, load_road_network())
 
