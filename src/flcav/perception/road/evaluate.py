@@ -160,6 +160,7 @@ class RoadOutcomes:
 
     measure_name = "lane F1"
     redraws = REDRAWS
+    threshold = SCORE
 
     @property
     def further_measures(self) -> Mapping[str, Measure]:
@@ -184,7 +185,7 @@ class RoadOutcomes:
             frame, truth = data.frame(number), _labels(data, number, camera)
             shares, classes = segment_picture(network, read_recorded_picture(data, number, camera))
             plane = GroundPlane.of(frame, camera, ground.height_of(number))
-            traced = [line for line in trace_lines(shares, plane) if line.score >= SCORE]
+            traced = [line for line in trace_lines(shares, plane) if line.score >= self.threshold]
             for name, value in _compare(traced, truth, plane).items():
                 rows[name].append(value)
             rows[CONFUSION].append(count_pixels(truth.classes, classes))

@@ -35,7 +35,6 @@ class RoadTask(RoadOutcomes):
         "weather": {"classes": list(WEATHER_CLASSES)},
     }
     labels = (ANNOTATED,)
-    threshold = SCORE
 
     def study(self) -> StudyRecipe:
         """Return the study recipe: training in three towns, tests on held-out scenes and in a town without any.
