@@ -64,7 +64,7 @@ def _reach(lines: Sequence[Array], pose: Array, aside: Array) -> Array:
     starts = pose[:, :2]
     probes = shapely.linestrings(np.stack((starts, starts + aside[:, None] * left_vectors(pose[:, 2])), axis=1))
     met = shapely.intersection(shapely.MultiLineString(list(lines)), probes)
-    return shapely.distance(shapely.points(starts), met)
+    return np.asarray(shapely.distance(shapely.points(starts), met))
 
 
 def fit_lane(centres: Array, route: Route, along: float) -> SeenLane | None:

@@ -129,7 +129,7 @@ class SureTask(RoadTask):
 def test_lines_count_from_the_score_of_the_task_on(task, counts, monkeypatch):
     lines = [(straight(1.6), 0.95), (straight(-1.6), 0.7)]
     traced = [TracedLine(project(ground), True, score, ground) for ground, score in lines]
-    seen = tuple(SeenLine(line.pixels, np.pad(line.ground, ((0, 0), (0, 1))), "solid") for line in traced)
+    seen = tuple(SeenLine(project(ground), np.pad(ground, ((0, 0), (0, 1))), "solid") for ground, _ in lines)
     labels = RoadLabels(np.zeros((384, 640), np.uint8), seen)
     stubs = {
         "list_pictures": lambda data, frames: [(0, "camera")],
