@@ -10,7 +10,7 @@ from test_closed_loop import CAR, at, see, straight
 from flcav.arrays import Array
 from flcav.config import InputError
 from flcav.driving.driver import decide_controls
-from flcav.driving.lane_keeping import FITTED_M, LEAST, STATIONS_M, SeenLane, find_centres, fit_lane
+from flcav.driving.lines.lane_keeping import FITTED_M, LEAST, STATIONS_M, SeenLane, find_centres, fit_lane
 from flcav.driving.networks import find_lines, load_road_network
 from flcav.driving.studies.lane_gain import LaneTally, compare_aside, summarise_aside, summarise_centres
 from flcav.geometry import left_vectors

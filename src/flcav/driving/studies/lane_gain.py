@@ -14,7 +14,7 @@ import numpy as np
 from flcav.arrays import Array, Ints
 from flcav.driving.driver import Decision, EgoMotion
 from flcav.driving.jobs import begin_worker
-from flcav.driving.lane_keeping import STATIONS_M
+from flcav.driving.lines.lane_keeping import STATIONS_M
 from flcav.driving.loop import LOOP, Loop, drive_staged
 from flcav.driving.measures import DriveResult
 from flcav.driving.networks import NetworkPerception
