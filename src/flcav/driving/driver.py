@@ -6,9 +6,9 @@ each of its long sides; they are closer to each other than the corridor is wide,
 
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
-corridor at the time at which the vehicle would be there. Standing vehicles are passed (`passing`). Where
+corridor at the time at which the vehicle would be there. Standing vehicles are passed (`lines.passing`). Where
 more than `EMERGENCY_MPS2` is needed to avoid a collision, it brakes fully. Steering is pure pursuit (Coulter,
-CMU-RI-TR-92-01, 1992) of the route, or of the lane as a camera sees it (`lane_keeping`) where it sees so far.
+CMU-RI-TR-92-01, 1992) of the route, or of the lane as a camera sees it (`lines.lane_keeping`) where it sees so far.
 """
 
 from collections.abc import Callable, Sequence
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from shapely.geometry.base import BaseGeometry
 
-from flcav.driving.passing import CREEPS_MPS, SLIM_M, ReferenceLine, find_standing, list_lines
+from flcav.driving.lines.passing import CREEPS_MPS, SLIM_M, ReferenceLine, find_standing, list_lines
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
 from flcav.world.commands import Controls

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from flcav.driving.driver import DEFAULT, Decision, DriverSettings, EgoMotion, decide_controls
+from flcav.driving.lines.passing import join_lanes
 from flcav.driving.measures import (
     HARD_MPS2,
     NEAR_S,
@@ -19,7 +20,6 @@ from flcav.driving.measures import (
     name_cause,
     score_drive,
 )
-from flcav.driving.passing import join_lanes
 from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
 from flcav.driving.seen import EGO, Perception, Seen, TruePerception, read_lights
 from flcav.geometry import heading_vectors

@@ -16,9 +16,9 @@ import shapely
 
 from flcav.config import InputError
 from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
-from flcav.driving.lane_keeping import LASTS_S, STATIONS_M, SeenLane, find_centres, fit_lane
+from flcav.driving.lines.lane_keeping import LASTS_S, STATIONS_M, SeenLane, find_centres, fit_lane
+from flcav.driving.lines.passing import join_lanes
 from flcav.driving.obstacles import clear_air, find_obstacles
-from flcav.driving.passing import join_lanes
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen

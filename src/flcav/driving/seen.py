@@ -19,7 +19,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from flcav.driving.lane_keeping import SeenLane
+from flcav.driving.lines.lane_keeping import SeenLane
 from flcav.geometry import Array, Boxes, heading_vectors, wrap_angle
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot

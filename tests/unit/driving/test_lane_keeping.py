@@ -1,6 +1,8 @@
 """The lane that a camera sees: its centre between lines, when it is believed, and that the driver steers along it."""
 
+from contextlib import nullcontext
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,8 +12,10 @@ from test_closed_loop import CAR, at, see, straight
 from flcav.arrays import Array
 from flcav.config import InputError
 from flcav.driving.driver import decide_controls
-from flcav.driving.lane_keeping import FITTED_M, LEAST, STATIONS_M, SeenLane, find_centres, fit_lane
+from flcav.driving.lines.lane_keeping import FITTED_M, LEAST, STATIONS_M, SeenLane, find_centres, fit_lane
 from flcav.driving.networks import find_lines, load_road_network
+from flcav.driving.scenarios import find_scenarios
+from flcav.driving.studies import lane_gain
 from flcav.driving.studies.lane_gain import LaneTally, compare_aside, summarise_aside, summarise_centres
 from flcav.geometry import left_vectors
 from flcav.sensors.observe import observe
@@ -124,6 +128,13 @@ def test_lateral_errors_are_means_over_steps_and_differences_are_paired() -> Non
     assert more.mean == pytest.approx(0.3 - 0.2)
     assert (more.low, more.high) == pytest.approx((0.1, 0.1))  # both drives alike
     assert compare_aside(first[:1], second[:1]).low is None
+
+
+def test_drives_in_which_nobody_moves_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    pool = SimpleNamespace(map=lambda work, *given: [(SimpleNamespace(scenario="x"), LaneTally())] * 2)
+    monkeypatch.setattr(lane_gain, "process_pool", lambda *_: nullcontext(pool))
+    with pytest.raises(InputError, match="no vehicle reaches 1 m/s in these drives; let them last longer"):
+        lane_gain.measure_lane_gain(find_scenarios(["ring-none-clear"]), [1])
 
 
 def test_errors_of_centres_by_distance() -> None:

@@ -12,9 +12,10 @@ from itertools import pairwise, product
 import numpy as np
 
 from flcav.arrays import Array, Ints
+from flcav.config import InputError
 from flcav.driving.driver import Decision, EgoMotion
 from flcav.driving.jobs import begin_worker
-from flcav.driving.lane_keeping import STATIONS_M
+from flcav.driving.lines.lane_keeping import STATIONS_M
 from flcav.driving.loop import LOOP, Loop, drive_staged
 from flcav.driving.measures import DriveResult
 from flcav.driving.networks import NetworkPerception
@@ -123,7 +124,10 @@ def measure_lane_gain(
     processes: int = 1,
     progress: Report = ignore_progress,
 ) -> LaneGain:
-    """Return the lateral errors of drives of these scenarios and seeds, by the map and by the lanes that are seen."""
+    """Return the lateral errors of drives of these scenarios and seeds, by the map and by the lanes that are seen.
+
+    Raises `InputError` where no vehicle moves, and what the drives raise.
+    """
     jobs = [(*drive, loop, lanes) for drive, lanes in product(product(scenarios, seeds), (False, True))]
     driven = list[tuple[DriveResult, LaneTally]]()
     with process_pool(processes, begin_worker) as pool:
@@ -131,6 +135,8 @@ def measure_lane_gain(
             driven.append(one)
             progress(done, len(jobs), one[0].scenario)
     by_map, by_lanes = ([tally for _, tally in driven[arm::2]] for arm in (0, 1))
+    if not all(any(tally.aside_m for tally in tallies) for tallies in (by_map, by_lanes)):
+        raise InputError(f"no vehicle reaches {MOVES_MPS:g} m/s in these drives; let them last longer")
     centres = np.concatenate([np.reshape(tally.centres, (-1, len(STATIONS_M))) for tally in by_lanes])
     return LaneGain(
         by_map=summarise_aside(by_map),
@@ -143,13 +149,12 @@ def measure_lane_gain(
 
 
 def summarise_aside(tallies: Sequence[LaneTally]) -> LateralError:
-    """Return the lateral error over the steps of drives; NaN without any."""
+    """Return the lateral error over the steps of drives, of which there is one at least."""
     off = np.abs(np.concatenate([tally.aside_m for tally in tallies]))
     steered = [by for tally in tallies for by in tally.steered]
     sums, steps = _sums(tallies)
     mean = _estimate(lambda times: (times @ sums) / (times @ steps), len(tallies))
-    high = float(np.quantile(off, HIGH)) if len(off) else float("nan")
-    return LateralError(mean, high, len(off), steered.count("lane") / max(len(steered), 1))
+    return LateralError(mean, float(np.quantile(off, HIGH)), len(off), steered.count("lane") / len(steered))
 
 
 def compare_aside(first: Sequence[LaneTally], second: Sequence[LaneTally]) -> Estimate:
@@ -180,4 +185,5 @@ def _estimate(measure: Callable[[Ints], Array], drives: int) -> Estimate:
     value = float(measure(np.ones((1, drives), np.int64))[0])
     if drives < 2:
         return Estimate(value, None, None)
-    return Estimate(value, *bootstrap_over_scenes(measure, np.arange(drives), rng=stream(0, "lanes")))
+    with np.errstate(invalid="ignore"):  # of draws of drives in which nobody moves, which are left out
+        return Estimate(value, *bootstrap_over_scenes(measure, np.arange(drives), rng=stream(0, "lanes")))

@@ -14,7 +14,7 @@ import shapely
 from numpy.typing import ArrayLike
 
 from flcav.arrays import Array
-from flcav.driving.passing import move_aside
+from flcav.driving.lines.passing import move_aside
 from flcav.geometry import left_vectors
 from flcav.world.map.roads import Route
 
