@@ -2,8 +2,7 @@
 
 A region has its town, light and wear. Its vehicles train on the map's labels and send their weights, an edge server
 averages them. F1 of lane lines is measured in the region before and after, and at home: in a town of the network's
-training, with fresh paint. Lines count from a score of `SURE` on, before and after: worn paint makes the networks draw
-lines where none are, with lower scores. Seeds differ in order and augmentation; they share recordings and the first
+training, with fresh paint. Seeds differ in order and augmentation; they share recordings and the first
 network, so that intervals over seeds cover local training alone.
 """
 
@@ -21,7 +20,7 @@ from flcav.network.ledger import Ledger, LinkMegabytes
 from flcav.perception.client import TaskClient
 from flcav.perception.networks import resolve_network
 from flcav.perception.road.evaluate import RoadEvaluation
-from flcav.perception.road.task import ROAD, RoadTask
+from flcav.perception.road.task import ROAD
 from flcav.perception.study import RecipeFields, read_recipe
 from flcav.perception.weights import from_arrays, to_arrays
 from flcav.report import style
@@ -36,7 +35,6 @@ HOME = "home"
 GAIN = 0.05  # aim: least gain of F1 in a region
 EFFECT = 0.02  # deviation from the aim that the experiment should detect
 WORN = 0.9
-SURE = 0.9  # least score of a lane line, chosen on other scenes of the regions
 VEHICLES, SCENES, TEST_SCENES = 4, 2, 3
 ROUNDS, STEPS, RATES = 3, 10, (1e-3, 3e-4)
 BUDGET_MB = 10_000.0  # of no effect: what is sent is counted
@@ -78,15 +76,6 @@ class RegionsResult:
     provenance: Provenance
 
 
-class SureRoad(RoadTask):
-    """The road task with the lane lines alone whose score is `SURE` or more."""
-
-    threshold = SURE
-
-
-TASK = SureRoad()
-
-
 def recording(region: str, split: str) -> RecipeFields:
     """Return the recipe of a region's recording to train on or to test on."""
     about = REGIONS[region]
@@ -105,7 +94,7 @@ def recording(region: str, split: str) -> RecipeFields:
 def test_packaged(work: Work, *, region: str) -> Json:
     """Return the evaluation of the packaged network in a region, as JSON."""
     network = resolve_network(ROAD, None)
-    return TASK.evaluate(network, open_split(work.inputs[_step(region, "test")]), progress=work.report).as_json()
+    return ROAD.evaluate(network, open_split(work.inputs[_step(region, "test")]), progress=work.report).as_json()
 
 
 def teach(work: Work, *, region: str, seed: int) -> Json:
@@ -121,7 +110,7 @@ def teach(work: Work, *, region: str, seed: int) -> Json:
     result = federate(clients, to_arrays(network), schedule, Account(ledger, "edge", ROAD.name, "wireless"))
     from_arrays(network, result.weights)
     tests = {name: open_split(work.inputs[_step(name, "test")]) for name in (region, HOME)}
-    found = {name: TASK.evaluate(network, test, progress=ignore_progress).as_json() for name, test in tests.items()}
+    found = {name: ROAD.evaluate(network, test, progress=ignore_progress).as_json() for name, test in tests.items()}
     return {"region": found[region], "home": found[HOME], "wireless_mb": ledger.used_mb("wireless")}
 
 

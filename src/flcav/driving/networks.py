@@ -26,7 +26,6 @@ from flcav.geometry import Array, Boxes, concatenate, heading_vectors, inverse, 
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
-from flcav.perception.road.evaluate import SCORE as LINE_SCORE
 from flcav.perception.road.lines import GroundPlane, trace_lines
 from flcav.perception.road.model import RoadNetwork
 from flcav.perception.road.predict import segment_picture
@@ -50,6 +49,7 @@ from flcav.world.snapshot import Snapshot
 from flcav.world.weather import draw_weather
 
 SCORE = 0.3  # least score of detected objects
+LINE_SCORE = 0.6  # least score of lane lines: below that of the task, since those of other lanes are left out
 LIGHT_SCORE = 0.25  # least score of detected lights
 CAMERA_STEPS = 5  # of 0.1 s between two pictures
 BESIDE_M = 1.0  # of the lanes, where obstacles of no class are looked for, too

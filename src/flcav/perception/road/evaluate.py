@@ -30,7 +30,7 @@ from flcav.statistics.bootstrap import REDRAWS
 from flcav.storage.records import Class
 from flcav.world.weather import find_nearest_class
 
-SCORE = 0.6  # least score of a lane line
+SCORE = 0.9  # least score of a lane line, by the F1 on validation scenes
 RANGES_M = (0.0, 10.0, 20.0, 40.0)  # borders of the ranges of the error on the ground
 NIGHT, DAY = "night", "day"  # by civil twilight
 HITS, FOUND, WANTED, SAME_KIND = "hits", "found", "wanted", "same_kind"
