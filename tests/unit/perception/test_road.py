@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -140,9 +140,9 @@ def test_lines_count_from_the_score_of_the_task_on(score, counts, monkeypatch):
         monkeypatch.setattr(evaluate, name, stub)
     frame = SimpleNamespace(weather=None)
     data: Any = SimpleNamespace(frame=lambda number: frame, keys=[SimpleNamespace(scene="a")])
-    task = RoadTask()
+    task, unused = RoadTask(), cast("RoadNetwork", None)
     monkeypatch.setattr(task, "threshold", score)
-    arrays = task.outcomes(None, data, [0]).arrays
+    arrays = task.outcomes(unused, data, [0]).arrays
     assert tuple(int(arrays[name].sum()) for name in ("hits", "found", "wanted")) == counts
 
 
