@@ -1,6 +1,6 @@
 """Closed-loop driving on the networks of the package, compared with ground truth.
 
-Both arms drive the same scenarios and seeds with the same driver, which passes standing vehicles (`driving.passing`).
+Both arms drive the same scenarios and seeds with the same driver, which passes standing vehicles (`lines.passing`).
 Driver and tracker were tuned on seeds below 100.
 """
 

@@ -180,7 +180,7 @@ TAKEN: dict[str, dict[str, str | tuple[str, ...]]] = {
     "drive": dict.fromkeys(
         (
             *("--scenario", "--seeds", "--first-seed", "--perception", "--errors", "--lasts", "--margin", "--sigmas"),
-            *("--pole", "--measure", "--jobs", "--list", "--night"),
+            *("--pole", "--lanes", "--measure", "--jobs", "--list", "--night"),
         ),
         ALWAYS,
     ),

@@ -53,6 +53,12 @@ def drive(
     pole: list[int] = typer.Option(
         [], "--pole", help="Number of a pole that sends what it finds, with --perception networks; several times."
     ),
+    lanes: bool = typer.Option(
+        False,
+        "--lanes",
+        help="With --perception networks: drive each along the map's route and along the lanes that the camera sees, "
+        "and compare the lateral errors.",
+    ),
     measure: Path | None = typer.Option(
         None, "--measure", help="JSON file to write: the errors of the networks on these drives."
     ),
@@ -71,6 +77,7 @@ def drive(
     from flcav.driving.scenario_files import read_scenarios
     from flcav.driving.scenarios import DrivingScenario
     from flcav.driving.studies.error_measurement import measure_errors
+    from flcav.driving.studies.lane_gain import measure_lane_gain
     from flcav.driving.studies.pole_gain import measure_pole_gain
     from flcav.interface.progress import show_progress
     from flcav.storage.files import check_writable, write_json
@@ -83,9 +90,13 @@ def drive(
         yield {"scenarios": [to_json(each, DrivingScenario) for each in chosen]}
         yield from (each.line() for each in chosen)
         return
-    for option, given in (("--pole", bool(pole)), ("--measure", measure is not None)):
+    for option, given in (("--pole", bool(pole)), ("--lanes", lanes), ("--measure", measure is not None)):
         if given and perception != Perceives.networks:
             raise InputError(f"{option}: needs --perception networks, since sensors are simulated")
+    if pole and lanes:
+        raise InputError("--lanes: compares drives of the vehicle alone, without --pole")
+    if lanes and measure is not None:
+        raise InputError("--measure: measures the networks along the map's route, without --lanes")
     if pole and measure is not None:
         raise InputError("--measure: measures the vehicle's networks alone, without --pole")
     if pole:
@@ -95,8 +106,8 @@ def drive(
     if measure is not None:
         check_writable(measure.parent)
     if out is not None:
-        if pole or measure is not None:
-            raise InputError("--out: writes the report of drives, without --pole and --measure")
+        if pole or lanes or measure is not None:
+            raise InputError("--out: writes the report of drives, without --pole, --lanes and --measure")
         check_writable(out)
     sensed = Sensed(perception.value, read_model(perception, errors))
     loop = Loop(DriverSettings(margin, sigmas), lasts)
@@ -112,6 +123,12 @@ def drive(
             gain = measure_pole_gain(chosen, numbers, pole, loop, report)
         yield gain.as_json()
         yield from gain.lines()
+        return
+    if lanes:
+        with show_progress("drive") as report:
+            compared = measure_lane_gain(chosen, numbers, loop, jobs, report)
+        yield compared.as_json()
+        yield from compared.lines()
         return
     with show_progress("drive") as report:
         tasks = [DriveJob(each, seed, loop=loop) for each in chosen for seed in numbers]

@@ -6,21 +6,21 @@ each of its long sides; they are closer to each other than the corridor is wide,
 
 Longitudinal control is the Intelligent Driver Model (Treiber, Hennecke and Helbing, Phys. Rev. E 62, 2000) behind the
 nearest of several leaders: road users in the corridor, a stop line, and the place where a predicted path crosses the
-corridor at the time at which the vehicle would be there. Standing vehicles are passed (`passing`). Where
+corridor at the time at which the vehicle would be there. Standing vehicles are passed (`lines.passing`). Where
 more than `EMERGENCY_MPS2` is needed to avoid a collision, it brakes fully. Steering is pure pursuit (Coulter,
-CMU-RI-TR-92-01, 1992).
+CMU-RI-TR-92-01, 1992) of the route, or of the lane as a camera sees it (`lines.lane_keeping`) where it sees so far.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.distance import cdist
 from shapely.geometry.base import BaseGeometry
 
-from flcav.driving.passing import CREEPS_MPS, SLIM_M, ReferenceLine, find_standing, list_lines
+from flcav.driving.lines.passing import CREEPS_MPS, SLIM_M, ReferenceLine, find_standing, list_lines
 from flcav.driving.seen import TIMES_S, Seen
 from flcav.geometry import Array, Boxes, heading_vectors, left_vectors, rotate
 from flcav.world.commands import Controls
@@ -105,6 +105,7 @@ EMERGENCY_MPS2 = 4.0  # from this need on all brakes are used
 ASIDE_MPS2 = 2.5  # greatest lateral acceleration in curves
 LINE_M = 4.0  # from the front to a stop line: the signal head at the line stays in the camera's field of view
 SAME_WAY = 0.7  # cosine between a road user's course and the route above which it counts as a leader
+NEAR_M, AIM_S = 3.5, 0.35  # distance at which the vehicle aims, and its growth with the speed
 CURVES_M = np.arange(0.0, 45.0, 3.0)
 FARTHEST_GAP_M = 1e3
 
@@ -132,6 +133,9 @@ class EgoMotion:
     along: float  # distance along the route [m]
 
 
+Steered = Literal["route", "lane", "beside"]  # the route, the lane that a camera sees, a line around who stands
+
+
 @dataclass(frozen=True)
 class Decision:
     """Controls of a driver at one step, with the acceleration that they aim at."""
@@ -140,6 +144,7 @@ class Decision:
     acceleration: float  # target [m/s^2]
     emergency: bool  # whether it brakes fully
     cause: int | str | None = None  # of slowing down: a row of `Seen`, or the name of a light; None on a free road
+    steered: Steered = "route"  # what it steers along
 
 
 Need = tuple[float, int | str | None]  # an acceleration [m/s^2], and its cause as in `Decision`
@@ -171,9 +176,13 @@ def decide_controls(
     pedal = acceleration / (GAIN_MPS2 * 2 if acceleration > 0 else vehicle.brake_mps2)
     if own.speed < 0.3 and acceleration <= 0.1:
         pedal = -1.0  # stand still
-    steer = _steer(line, own, vehicle)
+    aim_m = own.along + NEAR_M + AIM_S * own.speed
+    steered: Steered = "route" if line is route else "beside"
+    if steered == "route" and seen.lane is not None and aim_m <= seen.lane.to_m:
+        line, steered = seen.lane, "lane"
+    steer = _steer(line, aim_m, own, vehicle)
     throttle, brake = float(np.clip(pedal, 0, 1)), float(np.clip(-pedal, 0, 1))
-    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency, cause)
+    return Decision(Controls(throttle=throttle, steer=steer, brake=brake), acceleration, emergency, cause, steered)
 
 
 def _least(needs: Sequence[Need]) -> Need:
@@ -303,9 +312,9 @@ def _cover(speed: float, wanted: float, gain: float) -> Array:
     return speed * early + gain * early**2 / 2 + max(wanted, speed) * (TIMES_S - early)
 
 
-def _steer(route: ReferenceLine, ego: EgoMotion, vehicle: BodyBlueprint) -> float:
-    """Return the steering by pure pursuit, as a share of the greatest angle in [-1, 1]; left is positive."""
-    aim_x, aim_y, _ = route.at(ego.along + 3.5 + 0.35 * ego.speed)
+def _steer(line: ReferenceLine, aim_m: float, ego: EgoMotion, vehicle: BodyBlueprint) -> float:
+    """Return the steering by pure pursuit of a line's place `aim_m` [m], as a share in [-1, 1]; left is positive."""
+    aim_x, aim_y, _ = line.at(aim_m)
     ahead, left = rotate(aim_x - ego.x, aim_y - ego.y, -ego.yaw)
     angle = np.arctan(2 * vehicle.wheelbase_m * left / (ahead**2 + left**2))
     return float(np.clip(angle / vehicle.steer_limit_rad, -1, 1))

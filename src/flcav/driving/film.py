@@ -4,6 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from flcav.driving.driver import Decision, EgoMotion
+from flcav.driving.measures import name_cause
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, Seen, find_around
 from flcav.geometry import Array
@@ -46,7 +48,7 @@ class FilmCamera:
         self._instants: list[Instant] = []
         self._steps = 0
 
-    def watch(self, snapshot: Snapshot, seen: Seen, slows_for: str) -> None:
+    def watch(self, snapshot: Snapshot, seen: Seen, own: EgoMotion, decision: Decision) -> None:
         """Record every second step (`EVERY`)."""
         self._steps += 1
         if (self._steps - 1) % EVERY:
@@ -57,6 +59,7 @@ class FilmCamera:
         near = np.hypot(*(seen.boxes.center[:, :2] - trace.position[0, row, :2]).T) <= AROUND_M
         perceived = np.column_stack((seen.boxes.center[:, :2], seen.boxes.yaw, seen.boxes.size[:, :2]))[near]
         speed = float(np.hypot(*trace.velocity[0, row, :2]))
+        slows_for = name_cause(decision.cause, seen, snapshot)
         (ego,) = _boxes(whole[[row]])
         self._instants.append(
             Instant(round(snapshot.time_s, 1), ego, round(speed, 1), _boxes(whole[rows]), _boxes(perceived), slows_for)

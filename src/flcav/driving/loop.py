@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from flcav.driving.driver import DEFAULT, DriverSettings, EgoMotion, decide_controls
+from flcav.driving.driver import DEFAULT, Decision, DriverSettings, EgoMotion, decide_controls
+from flcav.driving.lines.passing import join_lanes
 from flcav.driving.measures import (
     HARD_MPS2,
     NEAR_S,
@@ -19,7 +20,6 @@ from flcav.driving.measures import (
     name_cause,
     score_drive,
 )
-from flcav.driving.passing import join_lanes
 from flcav.driving.scenarios import DT_S, DrivingScenario, StagedScenario
 from flcav.driving.seen import EGO, Perception, Seen, TruePerception, read_lights
 from flcav.geometry import heading_vectors
@@ -48,7 +48,7 @@ def sense_truth(staged: StagedScenario, seed: int) -> Perception:
     return TruePerception(staged.scenario.weather)
 
 
-Watch = Callable[[Snapshot, Seen, str], None]  # called at every step: world, perception, cause of slowing down
+Watch = Callable[[Snapshot, Seen, EgoMotion, Decision], None]  # called at every step
 
 
 def drive_scenario(
@@ -90,7 +90,7 @@ def drive_staged(
         seen = perception.look(now)
         decision = decide_controls(route, ego, seen, body, loop.driver, lanes)
         if watch is not None:
-            watch(now, seen, name_cause(decision.cause, seen, now))
+            watch(now, seen, ego, decision)
         ttc.append(measure_ttc(route, ego, truth.look(now), size))
         before, now = now, world.step({EGO: decision.controls})
         after = find_motion(now, route, ego.along)

@@ -14,16 +14,21 @@ from typing import NamedTuple
 import numpy as np
 import shapely
 
+from flcav.config import InputError
 from flcav.driving.following import CERTAIN, FollowedTracks, Following, PathSpread
+from flcav.driving.lines.lane_keeping import LASTS_S, STATIONS_M, SeenLane, find_centres, fit_lane
+from flcav.driving.lines.passing import join_lanes
 from flcav.driving.obstacles import clear_air, find_obstacles
-from flcav.driving.passing import join_lanes
 from flcav.driving.road import RoadUnits, merge_detections
 from flcav.driving.scenarios import StagedScenario
 from flcav.driving.seen import EGO, WEATHER_SPEED, Seen
-from flcav.geometry import Boxes, concatenate, heading_vectors, inverse, transform_points
+from flcav.geometry import Array, Boxes, concatenate, heading_vectors, inverse, transform_points
 from flcav.perception.networks import resolve_network
 from flcav.perception.objects.model import Second
 from flcav.perception.objects.predict import detect_in
+from flcav.perception.road.lines import GroundPlane, trace_lines
+from flcav.perception.road.model import RoadNetwork
+from flcav.perception.road.predict import segment_picture
 from flcav.perception.signs.model import SignDetector
 from flcav.perception.signs.predict import detect_in_picture
 from flcav.perception.tasks import task_named
@@ -37,12 +42,14 @@ from flcav.sensors.frame import Frame
 from flcav.sensors.observe import observe
 from flcav.sensors.rig import Rig, car, lidar32
 from flcav.statistics.streams import stream
+from flcav.world.map.roads import Route
 from flcav.world.map.town import Town, load_town
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
 from flcav.world.weather import draw_weather
 
 SCORE = 0.3  # least score of detected objects
+LINE_SCORE = 0.6  # least score of lane lines: below that of the task, since those of other lanes are left out
 LIGHT_SCORE = 0.25  # least score of detected lights
 CAMERA_STEPS = 5  # of 0.1 s between two pictures
 BESIDE_M = 1.0  # of the lanes, where obstacles of no class are looked for, too
@@ -79,6 +86,12 @@ def name_network(task: str) -> str:
 def load_road_map(town: str) -> RoadMap:
     """Return the road map of a town for the trajectory network, cached."""
     return road_map(load_town(town))
+
+
+@lru_cache(maxsize=1)
+def load_road_network() -> RoadNetwork:
+    """Return the package's network of the road task, cached."""
+    return resolve_network(task_named("road"), None)
 
 
 class LightReader:
@@ -128,6 +141,43 @@ class LightReader:
         return closed, frozenset(link for link, letter in fresh.items() if letter == "y")
 
 
+def find_lines(frame: Frame, network: RoadNetwork) -> list[Array]:
+    """Return the lane lines in a frame's picture: x, y (K, 2) on the ground, world frame [m].
+
+    Raises `InputError` where the frame has no such camera.
+    """
+    if CAMERA not in frame.images:
+        raise InputError(f"the vehicle's rig has no camera '{CAMERA}', which its lane is seen by")
+    shares, _ = segment_picture(network, frame.images[CAMERA].rgb)
+    traced = trace_lines(shares, GroundPlane.of(frame, CAMERA))
+    to_camera = frame.assumed.agent_from_sensor[CAMERA]
+    world_from_agent = frame.assumed_world_from_sensor(CAMERA) @ inverse(to_camera)
+    ground = [line.ground for line in traced if line.score >= LINE_SCORE and line.ground is not None]
+    return [transform_points(world_from_agent, np.pad(points, ((0, 0), (0, 1))))[:, :2] for points in ground]
+
+
+class LaneReader:
+    """Reader of the vehicle's lane beside its route in camera pictures, with a memory of `LASTS_S`."""
+
+    def __init__(self, route: Route, along: float) -> None:
+        self._route, self._along = route, along
+        self.centres: Array = np.full(len(STATIONS_M), np.nan)  # of the last picture, as of `find_centres`
+        self._last: tuple[float, SeenLane | None] = (-LASTS_S, None)
+
+    def read(self, frame: Frame, network: RoadNetwork, time_s: float) -> None:
+        """Look for the lane in the frame's picture, taken at `time_s` [s]; raises `InputError` without a camera."""
+        x, y = frame.world_from_agent[:2, 3].tolist()
+        self._along, _ = self._route.project(x, y, self._along)
+        self.centres = find_centres(find_lines(frame, network), self._route, self._along)
+        if (lane := fit_lane(self.centres, self._route, self._along)) is not None:
+            self._last = time_s, lane
+
+    def lane(self, time_s: float) -> SeenLane | None:
+        """Return the lane at `time_s` [s] as it was last seen; None where that is longer ago than `LASTS_S`."""
+        read_s, lane = self._last
+        return lane if time_s - read_s <= LASTS_S else None
+
+
 class NetworkPerception:
     """Perception of a drive by the networks, from its sensors."""
 
@@ -138,8 +188,9 @@ class NetworkPerception:
         *,
         spread: PathSpread = CERTAIN,
         road: RoadUnits | None = None,
+        lanes: bool = False,
     ) -> None:
-        """Take a drive and its seed, the calibrated uncertainty, and roadside units if any."""
+        """Take a drive and its seed, the calibrated uncertainty, roadside units if any, and if lanes are looked for."""
         self.networks = load_networks()
         self.scene = Scene(staged.town, staged.world.snapshot.trace)
         self._seed, self._name = seed, staged.scenario.name
@@ -147,7 +198,8 @@ class NetworkPerception:
         self.weather = staged.scenario.sky or drawn
         self.lights = LightReader(staged.town)
         self._following = Following(self.networks.trajectory, load_road_map(staged.scenario.town), spread)
-        self._step = 0
+        self.lanes = LaneReader(staged.route, staged.start_m) if lanes else None
+        self._step, self.pictured = 0, False  # steps so far, and whether the last one had a picture
         self.named, self.heads, self.lights_read_s = "clear", dict[str, str | None](), -1.0  # in the last picture
         self._road = road
         self._town, self._lanes = staged.town, join_lanes(staged.town).buffer(BESIDE_M)
@@ -159,14 +211,16 @@ class NetworkPerception:
     def look(self, snapshot: Snapshot) -> Seen:
         """Return the perception at this instant: observe the world with the rig, and run the networks."""
         self.scene.follow(snapshot.trace)
-        pictured = self._step % CAMERA_STEPS == 0
-        rig = Rig(lidars=lidar32().lidars, cameras=car().cameras if pictured else {})
+        self.pictured = self._step % CAMERA_STEPS == 0
+        rig = Rig(lidars=lidar32().lidars, cameras=car().cameras if self.pictured else {})
         self._step += 1
         named = {"scene_name": self._name, "seed": self._seed, "number": snapshot.step, "weather": self.weather}
         frame = observe(self.scene, rig, EGO, 0, **named)
-        if pictured:
+        if self.pictured:
             self.heads = self.lights.read(frame, self.networks.signs, snapshot.time_s)
             self.named, self.lights_read_s = self.name_weather(frame), snapshot.time_s
+            if self.lanes is not None:
+                self.lanes.read(frame, load_road_network(), snapshot.time_s)
         frame = replace(frame, lidar={LIDAR: clear_air(frame.lidar[LIDAR])})
         detections = detect_in(self.networks.objects, [frame], score_threshold=SCORE)[0]
         self.own = self.found = detections.transform(frame.assumed_world_from_sensor(LIDAR))
@@ -188,6 +242,7 @@ class NetworkPerception:
             amber,
             WEATHER_SPEED[self.named],
             name_network("objects"),
+            None if self.lanes is None else self.lanes.lane(snapshot.time_s),
         )
 
     def name_weather(self, frame: Frame) -> str:

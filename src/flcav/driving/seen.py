@@ -19,6 +19,7 @@ from typing import Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from flcav.driving.lines.lane_keeping import SeenLane
 from flcav.geometry import Array, Boxes, heading_vectors, wrap_angle
 from flcav.world.scene import Scene
 from flcav.world.snapshot import Snapshot
@@ -50,6 +51,7 @@ class Seen:
     amber: frozenset[str]  # the yellow ones among them
     speed_share: float = 1.0  # share of the speed limit to drive in the weather
     found_by: str = "the truth"  # source of the boxes, in words
+    lane: SeenLane | None = None  # the vehicle's lane as a camera sees it; None: as the map has it
 
 
 class Perception(Protocol):

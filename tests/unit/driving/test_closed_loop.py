@@ -45,7 +45,7 @@ HALF_M = CAR.size[0] / 2
 
 def straight(stop: tuple[tuple[float, str], ...] = ()) -> Route:
     along = np.linspace(0.0, 300.0, 301)
-    return Route(np.stack((along, np.zeros_like(along)), axis=1), along, np.full(301, 13.9), stop)
+    return Route(np.stack((along, np.zeros_like(along)), axis=1), along, np.full(301, 13.9), stop, np.full(301, 3.5))
 
 
 def see(*rows: tuple[float, float, float, float, float], closed: str = "", amber: bool = False) -> Seen:

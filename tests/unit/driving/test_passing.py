@@ -10,7 +10,7 @@ from test_closed_loop import CAR, at, see, straight
 
 from flcav.driving.driver import decide_controls
 from flcav.driving.following import CERTAIN, CONFIRMED, Confirmed, Following
-from flcav.driving.passing import CREEPS_MPS, SLIM_M, Beside, join_lanes, list_lines
+from flcav.driving.lines.passing import CREEPS_MPS, SLIM_M, Beside, join_lanes, list_lines
 from flcav.geometry import Boxes
 from flcav.world.map.town import load_town
 

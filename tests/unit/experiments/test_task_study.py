@@ -67,7 +67,7 @@ RECORDED = {
     "signs": "af6031549073e2c9",
     "objects": "98f2d23f0988e5c6",
     "objects-streets": "7621a783ce5d6a7b",  # of the third training of the page
-    "road": "c8cca2e37e0f0f63",
+    "road": "ac77a8f1e233102d",
     "trajectory": "3b5f95cc2d111a7a",
     "trajectory-cameras": "9889f4d36a9b6fc9",
 }

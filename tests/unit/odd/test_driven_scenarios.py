@@ -184,7 +184,7 @@ def test_parameters_and_speeds_by_time_are_read(samples: dict[str, SampledScenar
 def play(script: Script, seconds: float, ego: tuple[float, float] = (0.0, 0.0)) -> dict[str, np.ndarray]:
     """Return the poses (T, 3) of a script's actors on a straight route along x from 100 m on."""
     along = np.linspace(0.0, 400.0, 401)
-    route = Route(np.c_[along - 200.0, np.zeros(401)], along, np.full(401, 10.0), ())
+    route = Route(np.c_[along - 200.0, np.zeros(401)], along, np.full(401, 10.0), (), np.full(401, 3.5))
     with LiveWorld(load_town("suburb"), World(parked=False, dt_s=0.1, remembers=False)) as world:
         world.apply(Spawn(EGO, "car", 3, *ego, anywhere=True))
         player, rows = ScriptPlayer(world, [script], route, 200.0), []
@@ -223,7 +223,7 @@ def test_a_child_runs_when_the_vehicle_is_near(x: float, runs: bool) -> None:
 @pytest.mark.parametrize("wanted", [(150.0, 2.0), (110.0, 1.0, 0.3)])
 def test_a_drive_begins_at_a_pose_or_before_a_place(wanted: tuple[float, ...]) -> None:
     along = np.linspace(0.0, 400.0, 401)
-    route = Route(np.c_[along, np.zeros(401)], along, np.full(401, 10.0), ())
+    route = Route(np.c_[along, np.zeros(401)], along, np.full(401, 10.0), (), np.full(401, 3.5))
     assert find_start(route, wanted, 3.0) == pytest.approx(110.0)
     assert find_start(route, wanted, 0.5) is None
     assert find_start(route, (150.0, 0.0, 3.0), 3.0) is None  # against the route

@@ -2,7 +2,7 @@
 
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -15,17 +15,19 @@ from flcav.dataset.road_labels import (
     IGNORED,
     ROAD_CLASSES,
     SOLID,
+    RoadLabels,
     SeenLine,
     leads_away,
 )
 from flcav.geometry import pose
+from flcav.perception.road import evaluate
 from flcav.perception.road.evaluate import count_pixels, mean_overlap, measure_offsets, overlaps
 from flcav.perception.road.lines import GroundPlane, TracedLine, trace_lines
 from flcav.perception.road.loss import DICE, SMOOTH_PX, WEIGHTS, segmentation_loss
 from flcav.perception.road.model import STRIDE, RoadNetwork
 from flcav.perception.road.predict import predict_logits, segment_picture
 from flcav.perception.road.samples import Sample, draw_window
-from flcav.perception.road.task import ROAD
+from flcav.perception.road.task import ROAD, RoadTask
 from flcav.sensors.frame import Calibration
 from flcav.sensors.lens import BODY_FROM_OPTICAL, Lens, project_points
 
@@ -117,6 +119,31 @@ def test_offsets_are_distances_from_the_true_line_by_range():
     total, count = measure_offsets(found, truth, np.array([0.5, 0.0]))
     assert count.tolist() == [2, 0, 1]  # the first lies before the true line's beginning
     assert total == pytest.approx([0.1 + 0.3, 0, 0.5])
+
+
+@pytest.mark.parametrize(("score", "counts"), [(0.6, (2, 2, 2)), (0.9, (1, 1, 2))])
+def test_lines_count_from_the_score_of_the_task_on(score, counts, monkeypatch):
+    lines = [(straight(1.6), 0.95), (straight(-1.6), 0.7)]
+    traced = [TracedLine(project(ground), True, score, ground) for ground, score in lines]
+    seen = tuple(SeenLine(project(ground), np.pad(ground, ((0, 0), (0, 1))), "solid") for ground, _ in lines)
+    labels = RoadLabels(np.zeros((384, 640), np.uint8), seen)
+    stubs = {
+        "list_pictures": lambda data, frames: [(0, "camera")],
+        "read_recorded_picture": lambda *_: None,
+        "_labels": lambda *_: labels,
+        "segment_picture": lambda *_: (None, labels.classes),
+        "DatasetGround": lambda data: SimpleNamespace(height_of=lambda number: 0.0),
+        "GroundPlane": SimpleNamespace(of=lambda *_: PLANE),
+        "trace_lines": lambda *_: traced,
+    }
+    for name, stub in stubs.items():
+        monkeypatch.setattr(evaluate, name, stub)
+    frame = SimpleNamespace(weather=None)
+    data: Any = SimpleNamespace(frame=lambda number: frame, keys=[SimpleNamespace(scene="a")])
+    task, unused = RoadTask(), cast("RoadNetwork", None)
+    monkeypatch.setattr(task, "threshold", score)
+    arrays = task.outcomes(unused, data, [0]).arrays
+    assert tuple(int(arrays[name].sum()) for name in ("hits", "found", "wanted")) == counts
 
 
 def test_iou_by_class_is_that_of_sets_of_pixels():

@@ -1,1 +1,1 @@
-"""Studies over many drives: errors of the networks, importance of tasks, benefit of roadside units."""
+"""Studies over many drives: errors of the networks, importance of tasks, what roadside units and seen lanes bring."""

@@ -30,7 +30,7 @@ from flcav.statistics.bootstrap import REDRAWS
 from flcav.storage.records import Class
 from flcav.world.weather import find_nearest_class
 
-SCORE = 0.6  # least score of a lane line
+SCORE = 0.9  # least score of a lane line, by the F1 on validation scenes
 RANGES_M = (0.0, 10.0, 20.0, 40.0)  # borders of the ranges of the error on the ground
 NIGHT, DAY = "night", "day"  # by civil twilight
 HITS, FOUND, WANTED, SAME_KIND = "hits", "found", "wanted", "same_kind"
@@ -160,6 +160,7 @@ class RoadOutcomes:
 
     measure_name = "lane F1"
     redraws = REDRAWS
+    threshold = SCORE
 
     @property
     def further_measures(self) -> Mapping[str, Measure]:
@@ -184,7 +185,7 @@ class RoadOutcomes:
             frame, truth = data.frame(number), _labels(data, number, camera)
             shares, classes = segment_picture(network, read_recorded_picture(data, number, camera))
             plane = GroundPlane.of(frame, camera, ground.height_of(number))
-            traced = [line for line in trace_lines(shares, plane) if line.score >= SCORE]
+            traced = [line for line in trace_lines(shares, plane) if line.score >= self.threshold]
             for name, value in _compare(traced, truth, plane).items():
                 rows[name].append(value)
             rows[CONFUSION].append(count_pixels(truth.classes, classes))

@@ -22,7 +22,7 @@ from flcav.runs.tables import HistoryPoint
 from flcav.storage.records import select
 
 AMPLE_MB = 1e6  # budgets that no run exhausts [MB]
-UNUSED = Split(scenes=2, spins=1, cavs=1)  # test frames
+UNUSED = Split(scenes=2, spins=2, cavs=3)  # test frames: so many that they hold something to find
 ORIGIN = "history.json"
 
 

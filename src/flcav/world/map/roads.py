@@ -14,7 +14,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import ArrayLike
 
-from flcav.arrays import Array
+from flcav.arrays import Array, Ints
 from flcav.config import InputError, read_xml, shorten
 
 LaneKind = Literal["driving", "bicycle", "parking", "shoulder", "sidewalk", "crossing", "walkingarea"]
@@ -208,12 +208,13 @@ WINDOW_M = 30.0  # distance from the last place on a route within which the next
 
 @dataclass(frozen=True)
 class Route:
-    """A route through a town: its centre line, speed limits and traffic lights."""
+    """A route through a town: its centre line, speed limits, traffic lights and lane widths."""
 
     points: Array  # (K, 2) world frame [m]
     along: Array  # (K,) distance from the start [m], ascending
     speed: Array  # (K,) speed limit from the point on [m/s]
     stops: tuple[tuple[float, str], ...]  # traffic lights on the route: distance [m], entry of `Trace.light`
+    width: Array  # (K,) of its lane from the point on [m]
 
     @property
     def length_m(self) -> float:
@@ -231,7 +232,15 @@ class Route:
 
     def limit(self, along: float) -> float:
         """Return the speed limit [m/s] at a distance [m]."""
-        return float(self.speed[max(int(np.searchsorted(self.along, along, side="right")) - 1, 0)])
+        return float(self.speed[self._piece(along)])
+
+    def lane_width(self, along: ArrayLike) -> Array:
+        """Return the width [m] of the lane at distances (...) [m]."""
+        return self.width[self._piece(along)]
+
+    def _piece(self, along: ArrayLike) -> Ints:
+        """Return the index of the last point at or before distances [m], 0 before the start."""
+        return np.maximum(np.searchsorted(self.along, along, side="right") - 1, 0)
 
     def project(self, x: float, y: float, near: float) -> tuple[float, float]:
         """Project x, y [m] on the route: return the distance along it and the offset to its left [m].
@@ -291,13 +300,15 @@ def _through(
 
 def _join(lanes: list[Lane], stops: tuple[tuple[float, str], ...]) -> Route:
     points = np.concatenate([lane.shape for lane in lanes])
-    speed = np.concatenate([np.full(len(lane.shape), lane.speed) for lane in lanes])
+    speed, width = (
+        np.concatenate([np.full(len(lane.shape), value) for lane, value in zip(lanes, values)])
+        for values in ([lane.speed for lane in lanes], [lane.width for lane in lanes])
+    )
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     kept = np.concatenate(([True], steps > 1e-3))
     points = points[kept]
-    speed = speed[kept]
     along = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
-    return Route(points, along, speed, stops)
+    return Route(points, along, speed[kept], stops, width[kept])
 
 
 def _length(shape: Array) -> float:

@@ -47,13 +47,17 @@ class Beside:
     def at(self, along: ArrayLike) -> Array:
         """Return x, y [m] and heading [rad] (..., 3) at these distances along the route [m]."""
         along = np.asarray(along, np.float64)
-        pose = self.route.at(along)
         # Cubic smoothstep: no lateral slope at either end, so that the heading is continuous.
         share = np.clip((along - self.begins_m) / self.over_m, 0.0, 1.0)
         aside = self.from_m + (self.to_m - self.from_m) * share**2 * (3 - 2 * share)
         slope = (self.to_m - self.from_m) * 6 * share * (1 - share) / self.over_m
-        place = pose[..., :2] + aside[..., None] * left_vectors(pose[..., 2])
-        return np.concatenate((place, (pose[..., 2] + np.arctan(slope))[..., None]), axis=-1)
+        return move_aside(self.route.at(along), aside, slope)
+
+
+def move_aside(pose: Array, aside: Array, slope: Array) -> Array:
+    """Return poses x, y [m], heading [rad] (..., 3) moved `aside` (...) [m] to their left, by `slope` (...) a metre."""
+    place = pose[..., :2] + aside[..., None] * left_vectors(pose[..., 2])
+    return np.concatenate((place, (pose[..., 2] + np.arctan(slope))[..., None]), axis=-1)
 
 
 def list_lines(
