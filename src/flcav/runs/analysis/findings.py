@@ -163,7 +163,7 @@ def word_arm(main: Setting, other: Setting, recipe: RunRecipe, each: Difference)
             return poles[other.placement.rule]
     if (main.labels[each.task], other.labels[each.task]) == ("road", "ideal-road"):
         return "labels of an ideal road detector"
-    told = ", ".join(_list_settings(recipe.arms[other.name].model_dump(exclude_unset=True, mode="json")))
+    told = ", ".join(_list_settings(recipe.arms[other.name].model_dump(exclude_defaults=True, mode="json")))
     return f"the same with {told}" if 0 < len(told) <= LONGEST else f"the arm {other.name}"
 
 
