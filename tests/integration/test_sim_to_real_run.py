@@ -59,7 +59,7 @@ def test_it_runs_with_the_shipped_weights(
     assert scores["Car", "3d", 0.5]["targets"] == len(results["frames"][0]["cars"]) == labels.count("Car")
     assert scores["Car", "3d", 0.5]["found"] == sum(0.5 in car["found_at"] for car in results["frames"][0]["cars"])
     clouds = results["clouds"]
-    assert list(clouds) == ["KITTI", "beams alone", "simulated"]
+    assert list(clouds) == ["KITTI", "simulated", "beams alone"]
     returns = len(np.fromfile(kitti / "training" / "velodyne" / f"{name}.bin", np.float32)) / 4
     assert all(clouds[each]["returns"] > 0 for each in clouds)
     assert clouds["KITTI"]["returns"] <= returns
