@@ -2,8 +2,8 @@
 
 A region has its town, light and wear. Its vehicles train on the map's labels and send their weights, an edge server
 averages them. F1 of lane lines is measured in the region before and after, and at home: in a town of the network's
-training, with fresh paint. Seeds differ in order and augmentation; they share recordings and the first
-network, so that intervals over seeds cover local training alone.
+training, with fresh paint. Seeds differ in order and augmentation; they share recordings and the first network, so that
+intervals over seeds cover local training alone.
 """
 
 from collections.abc import Mapping, Sequence

@@ -160,7 +160,7 @@ def escape_markup(command: click.Command) -> click.Command:
     return command
 
 
-SHORT_OF_IT = ("as_json", "dry", "listed")  # options after which nothing follows
+WITHOUT_NEXT = ("as_json", "dry", "listed")  # options after which nothing follows
 SHOWN = Path(__file__).with_name("commands.yaml")  # groups of commands, with examples
 
 
@@ -185,7 +185,7 @@ def add_examples(app: click.Group) -> None:
 def add_next_steps(app: click.Group) -> None:
     """Let each command of `app` print on stderr, once it is done, the command that usually follows, by `SHOWN`.
 
-    Words in capitals are the user's to replace. Nothing is printed after the options `SHORT_OF_IT`.
+    Words in capitals are the user's to replace. Nothing is printed after the options `WITHOUT_NEXT`.
     """
     named = dict(_walk(app))
     for section in yaml.safe_load(SHOWN.read_text(encoding="utf-8")):
@@ -203,7 +203,7 @@ def _tell_after(command: Callable[..., object], template: str) -> Callable[..., 
         first = {name: value[0] if isinstance(value, list) and value else value for name, value in given.items()}
         told = {name: shlex.quote(str(value)) for name, value in first.items() if value not in (None, [])}
         needed = {name for _, name, _, _ in string.Formatter().parse(template) if name}
-        if needed <= told.keys() and not any(given.get(name) for name in SHORT_OF_IT):
+        if needed <= told.keys() and not any(given.get(name) for name in WITHOUT_NEXT):
             echo(f"next: {template.format_map(told)}", err=True)
         return answer
 

@@ -129,9 +129,8 @@ class Pace:
     def tell_left(self, waiting: Sequence[Step], running: Sequence[tuple[Step, float]]) -> str:
         """Return the time left for steps, in words; of running ones the time so far [s] counts.
 
-        It is empty where no step is left, and before the first is finished.
-
-        A step takes as long as those of its function did, or else as all did.
+        A step takes as long as those of its function did, or else as all did. Empty where no step is left, and before
+        the first is finished.
         """
         every = [took_s for times in self._times.values() for took_s in times]
         if not every or not (waiting or running):
