@@ -146,7 +146,8 @@ def test_ctrl_c_stops_the_cluster(tmp_path: Path) -> None:
         import test_steps_on_ray as t
         try:
             steps = [t.Step("a", t.kill_never, {})]
-            t.run_steps(steps, Path(sys.argv[1]), jobs=1, notify=lambda *event: print(*event, flush=True), engine="ray")
+            tell = lambda step, *event: step and print(step, *event, flush=True)  # those of all steps have no name
+            t.run_steps(steps, Path(sys.argv[1]), jobs=1, notify=tell, engine="ray")
         except KeyboardInterrupt:
             print("stopped", flush=True)
         """
