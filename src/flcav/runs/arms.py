@@ -153,9 +153,15 @@ def _setting(recipe: RunRecipe, labels: Mapping[str, str], name: str, repeat: in
         arm.uploads,
         arm.compressed,
         arm.regions or recipe.with_role("federate"),
-        (CENTRAL,) if arm.central else arm.stages,
+        (CENTRAL,) if arm.central else list_stages(recipe, arm),
         learned and recipe.replan != "none" and calls == find_calls(recipe, recipe.federation),
     )
+
+
+def list_stages(recipe: RunRecipe, arm: Arm) -> tuple[str, ...]:
+    """Return an arm's stages of federated learning: those it names, less cloud FL if no plan has a round of it."""
+    none = all(task.plan is not None and task.plan.cloud_rounds == 0 for task in recipe.tasks.values())
+    return tuple(stage for stage in arm.stages if not (none and stage == CLOUD))
 
 
 def find_calls(recipe: RunRecipe, how: Federation) -> CalledNumbers | None:

@@ -76,6 +76,14 @@ def test_arms_of_which_only_stage_three_differs_share_stage_two() -> None:
         assert {name: armed[name] for name in plain} == plain
 
 
+@pytest.mark.parametrize(("rounds", "trains"), [(0, False), (1, True)])
+def test_stage_three_is_trained_and_tested_where_a_plan_has_rounds_of_it(rounds: int, trains: bool) -> None:
+    plan = {"samples": 40, "edge_rounds": 1, "cloud_rounds": rounds}
+    names = steps_of(recipe_of(tasks={"objects": {"plan": plan}}))
+    assert any("cloud-fl" in name for name in names) == trains
+    assert "test-grid-edge-fl-objects-grid" in names
+
+
 def test_a_plan_within_a_horizon_reckons_with_the_network() -> None:
     def plan(**changes: Any) -> Any:
         return next(step for step in Graph(recipe_of(**changes), Path()).steps if step.name == "plan")
