@@ -52,6 +52,7 @@ def test_points_are_as_written(tmp_path: Path):
     [
         (b"", "empty"),
         (b"\0" * 17, "truncated; 17 bytes"),
+        (b"Car 0.00 0 -1.6001\n", "a text file; wanted are 4 columns of float32"),
         (np.array([[0, 0, 0, 0], [0, np.nan, 0, 0]], np.float32).tobytes(), "point 1 is not finite"),
     ],
 )

@@ -60,6 +60,8 @@ def read_points(path: Path) -> NDArray[np.float32]:
 
 def _refuse_points(data: bytes, path: Path) -> Never:
     """Raise `InputError`, naming what the bytes are instead of a point cloud."""
+    if data.isascii() and b"\0" not in data:
+        raise InputError(f"{path}: a text file; wanted are {LAYOUT}: {POINT}")
     if (largest := find_millimetres(data)) is not None:
         raise InputError(f"{path}: coordinates up to {largest:.0f}, millimetres by their size; wanted are metres")
     if (layout := describe_numbers(data)) not in ("", LAYOUT):
