@@ -15,7 +15,7 @@ STYLE = re.compile(r"""(?:@import\s+(?:url\()?|url\()\s*["']?(?!data:|#)([^"')\s
 
 
 class Page(HTMLParser):
-    """What a page loads and what it links to."""
+    """Addresses that an HTML page loads and links to."""
 
     def __init__(self, text: str) -> None:
         super().__init__()

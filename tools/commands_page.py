@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Iterator, Mapping
 from pathlib import Path
+from typing import Annotated
 
 import click
 import typer
@@ -151,6 +152,11 @@ def examples_in(text: str) -> dict[str, str]:
     return dict(re.findall(r"^## flcav (.*?)\n.*?^(```console\n.*?^```)$", text, re.M | re.S))
 
 
+def read_examples() -> dict[str, str]:
+    """Return the example of each command from the pages as they are."""
+    return examples_in("\n".join(path.read_text(encoding="utf-8") for path in sorted(GROUPS.glob("*.md"))))
+
+
 def run_examples(folder: Path) -> dict[str, str]:
     """Run every example in a folder and return what was typed and printed; raises RuntimeError where one fails."""
     shutil.copytree(ROOT / "recipes", folder / "recipes")
@@ -203,8 +209,16 @@ def shorten(lines: list[str]) -> list[str]:
     return [*lines[:HEAD], f"[{len(lines) - HEAD - len(last)} more lines]", *last]
 
 
-if __name__ == "__main__":
+def main(
+    keep_examples: Annotated[bool, typer.Option(help="Keep the examples' output as it stands on the pages.")] = False,
+) -> None:
+    """Write the pages of all commands; their examples take some ten minutes."""
     with tempfile.TemporaryDirectory() as scratch:
-        for path, text in pages(run_examples(Path(scratch) / "examples")).items():
-            path.write_text(text, encoding="utf-8")
-            print(path)
+        printed = read_examples() if keep_examples else run_examples(Path(scratch) / "examples")
+    for path, text in pages(printed).items():
+        path.write_text(text, encoding="utf-8")
+        print(path)
+
+
+if __name__ == "__main__":
+    typer.run(main)

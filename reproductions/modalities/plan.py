@@ -27,7 +27,7 @@ LEAST_B = 0.01  # of a curve's exponent, where more samples do not help
 
 @dataclass(frozen=True)
 class Choice:
-    """What is known of a network: what its samples take, its errors by their number, and what a retraining reached."""
+    """A network that a plan may choose: bytes of its samples, measured errors, and the error of a retraining."""
 
     sample_mb: float
     measured: tuple[tuple[float, float], tuple[float, float]]  # samples and error (1 - AP50): few, and all

@@ -64,7 +64,7 @@ Tests = Mapping[str, Sequence[Path]]  # folders of a network's tests in a region
 
 @dataclass(frozen=True)
 class Reached:
-    """What a network reaches on the test frames of a region, as means over trainings."""
+    """Accuracy of a network on the test frames of a region, means over trainings."""
 
     ap50: Estimate  # with its interval over scenes and trainings
     cars: float  # AP in 3D at IoU 0.5 of cars alone

@@ -73,7 +73,7 @@ class Split:
 
 @dataclass(frozen=True)
 class Expectation:
-    """What was expected of a difference in AP50 before the run, and what came."""
+    """The interval in which a difference in AP50 was expected before the run, and the measured mean."""
 
     low: float
     high: float

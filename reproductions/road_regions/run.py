@@ -42,7 +42,7 @@ BUDGET_MB = 10_000.0  # of no effect: what is sent is counted
 
 @dataclass(frozen=True)
 class Region:
-    """How a region is recorded."""
+    """Recording settings of a region."""
 
     town: str
     seed: int

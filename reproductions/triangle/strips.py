@@ -50,7 +50,7 @@ AHEAD_M, ASIDE_M = (5.0, 35.0), 15.0  # where a cross-road's pole is from a vehi
 
 @dataclass(frozen=True)
 class Counted:
-    """What a plan's network finds in the frames of a strip."""
+    """Detections of a plan's network in the frames of a strip: right and false ones, and the targets."""
 
     found: int
     targets: int

@@ -169,7 +169,7 @@ def give_pictures(pictures: Mapping[str, Pictures], fleet: Fleet, setting: str) 
 
 @dataclass(frozen=True)
 class Begun:
-    """What all ways of a seed and setting begin with."""
+    """The common start of all ways of a seed and setting: vehicles, links, data and initial weights."""
 
     fleet: Fleet
     links: Sequence[RadioLinks]  # by scene

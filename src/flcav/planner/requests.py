@@ -62,7 +62,7 @@ class AskedNew(AskedPlacement):
 
 
 class AskedLook(Body):
-    """What a sensor on a pole, or at a place of one's own, sees."""
+    """A query for the area that a sensor sees from a pole, or from a place of one's own."""
 
     workspace: str = Field(max_length=64)
     pole: int | None = Field(default=None, ge=0)
@@ -106,7 +106,7 @@ class AskedError(Body):
 
 
 class DroppedRun(Body):
-    """What the page took from a run's folder that was dropped on it: texts of base64 by path in the folder."""
+    """The files of a run whose folder was dropped on the page, as base64 by path in the folder."""
 
     name: Name
     files: dict[Name, Annotated[str, Field(max_length=MOST_BYTES)]] = Field(max_length=100)

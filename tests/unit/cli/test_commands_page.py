@@ -10,7 +10,7 @@ import typer
 from flcav.cli.main import app
 
 PAGES = {path: path.read_text(encoding="utf-8") for path in (commands_page.INDEX, *commands_page.GROUPS.glob("*.md"))}
-EXAMPLES = {name: shown for text in PAGES.values() for name, shown in commands_page.examples_in(text).items()}
+EXAMPLES = commands_page.read_examples()
 SECTIONS = commands_page.sections()
 SHOWN = {name: example for section in SECTIONS for name, example in section.commands.items()}
 

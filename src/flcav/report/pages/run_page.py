@@ -82,7 +82,7 @@ def write_report(run: Run, out: Path | str) -> Path:
 
 @dataclass(frozen=True)
 class Seen:
-    """What the steps of a run have beside its results: errors before and after by region, and the chosen sweep."""
+    """Errors of a run before and after learning, by region, and the sweep that its page shows: from its steps."""
 
     changes: Mapping[str, ErrorChanges] = field(default_factory=dict)
     sweep: SweepComparison | None = None

@@ -44,7 +44,7 @@ class LoopRound:
 
 @dataclass(frozen=True)
 class Loop:
-    """What the animation of a run shows of one region."""
+    """The content of a run's animation: one region's errors before and after, by time."""
 
     region: str
     task: str

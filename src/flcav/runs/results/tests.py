@@ -157,7 +157,7 @@ class HomeCost:
 
 @dataclass(frozen=True)
 class FoundCount(Record):
-    """What an arm's network found of the targets of a region's test frames after a stage, as means over trainings."""
+    """Numbers of targets, found ones and false detections of an arm in a region after a stage, means over trainings."""
 
     arm: str
     stage: str
