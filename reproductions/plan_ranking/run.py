@@ -17,6 +17,7 @@ from flcav.config import Json
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.optimization.curves.fitting import fit
 from flcav.optimization.curves.held_out import rank_correlation
+from flcav.optimization.curves.history import History
 from flcav.report import style
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CLOUD, EDGE, PRETRAIN, FixedPlan, RunRecipe
@@ -103,6 +104,22 @@ def read_plan(run: Run) -> TrainedPlan:
         stage: {town: run.test(stage=stage, region=town, task=TASK).estimate.mean for town in towns} for stage in STAGES
     }
     return TrainedPlan((plan.samples, plan.edge_rounds, plan.cloud_rounds), arm.links[WIRELESS].used_mb, ap50)
+
+
+def collect_history(seeds: Mapping[str, Sequence[TrainedPlan]], towns: Sequence[str]) -> History:
+    """Return what plans reached after each of their stages in the mean of towns, as the history of a learning curve.
+
+    Plans of a seed that have as many samples share their pretrained network, which is one point.
+    """
+    points = {
+        (seed, spent, float(np.mean([plan.ap50[stage][town] for town in towns])))
+        for seed, plans in seeds.items()
+        for plan in plans
+        for samples, edge, cloud in [plan.counts]
+        for stage, spent in zip(STAGES, ((samples, 0, 0), (samples, edge, 0), (samples, edge, cloud)), strict=True)
+    }
+    names, spent, accuracy = zip(*sorted(points), strict=True)
+    return History(np.array(spent, float), np.array(accuracy), np.ones(len(points)), seeds=names)
 
 
 def predict(plans: Sequence[Counts]) -> dict[str, Array]:

@@ -12,14 +12,18 @@ from pathlib import Path
 
 import numpy as np
 
+from flcav.config import read_json
+from flcav.experiments import FOLDER
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.network.ledger import LinkMegabytes
 from flcav.network.plan import MessageSizes
 from flcav.optimization.allocation.baselines import baseline
+from flcav.optimization.curves.history import History
 from flcav.optimization.problem import Budgets
 from flcav.optimization.problem import Problem as AllocationProblem
 from flcav.optimization.solvers.instance import Infeasible
 from flcav.report import style
+from flcav.reproductions.plan_ranking.run import PlanRanking, collect_history
 from flcav.runs.allocation import PlanRequest, PlanSettings, allocate_tasks, make_plan, make_task_plan
 from flcav.runs.provenance import Provenance, provenance
 from flcav.runs.recipe import CLOUD, PlanLimits
@@ -28,6 +32,7 @@ from flcav.storage.markdown import format_signed, format_table
 from flcav.storage.records import Record
 
 WORTH = 0.03  # predicted difference that is worth a training
+ACROSS = 4  # heat tables side by side
 JOINT, RIVALS = "joint", ("equal-stages", "equal-tasks")
 WIRELESS_MB = tuple(np.geomspace(20, 640, 11).tolist())
 WIRELINE_MB = tuple(np.geomspace(10, 320, 6).tolist())
@@ -39,6 +44,7 @@ SIZES_MB = {  # of a sample and of an update, by history: those of the networks 
     "weather": (0.077, 0.25),
 }
 FORMS = {"whole": 1.0, "8 bits": 0.27}  # of updates: share of their bytes
+TOWNS = {"both towns": ("grid", "ring"), "all like grid": ("grid",), "all like ring": ("ring",)}
 IMPORTANCES = ((1.0, 1.0, 1.0), (4.0, 1.0, 1.0), (1.0, 4.0, 1.0))  # of objects, signs, weather
 
 
@@ -49,11 +55,16 @@ class Problem:
     name: str
     tasks: Mapping[str, str]  # task -> name of its history
     rival: str
+    towns: tuple[str, ...] = ()  # whose curve: of plans that were trained apart there; none: that of the history
 
 
 PROBLEMS = (
     Problem("objects, labels by the road", {"objects": "objects"}, RIVALS[0]),
     Problem("objects, labels by road and tracks", {"objects": "tracks"}, RIVALS[0]),
+    *(
+        Problem(f"objects, plans trained apart, {where}", {"objects": "tracks"}, RIVALS[0], towns)
+        for where, towns in TOWNS.items()
+    ),
     Problem("three tasks, equal stages", {name: name for name in ("objects", "signs", "weather")}, RIVALS[0]),
     Problem("three tasks, equal tasks", {name: name for name in ("objects", "signs", "weather")}, RIVALS[1]),
 )
@@ -128,13 +139,21 @@ def search_plans(problem: Problem) -> Iterator[Found]:
             )
 
 
+def read_histories(problem: Problem) -> dict[str, History]:
+    """Return the histories of a problem's tasks: those of the package, or what a town's plans reached."""
+    if problem.town is None:
+        return {
+            task: parse_history(task, read_history(task, name, Path()), name) for task, name in problem.tasks.items()
+        }
+    ranking = PlanRanking.from_json(read_json(FOLDER / "plan_ranking" / "result.json"), "plan_ranking")
+    return dict.fromkeys(problem.tasks, collect_history(ranking.seeds, problem.towns))
+
+
 def pose(
     problem: Problem, sizes: Mapping[str, MessageSizes], fleet: tuple[int, ...], importance: Sequence[float]
 ) -> AllocationProblem:
     """Return the allocation problem of a fleet, with budgets to be set; counts end where the histories do."""
-    histories = {
-        task: parse_history(task, read_history(task, name, Path()), name) for task, name in problem.tasks.items()
-    }
+    histories = read_histories(problem)
     requests = tuple(
         PlanRequest(task, weight, sizes[task], int(history.resources[:, 0].max()), history, None)
         for (task, history), weight in zip(histories.items(), importance, strict=True)
@@ -175,10 +194,13 @@ def summarise(found: Mapping[str, Sequence[Found]], most: int = 3) -> SearchResu
 @style.styled
 def draw_search(results: SearchResult) -> bytes:
     """Return the predicted difference by budgets as a PNG, a heat table for each problem."""
-    figure = style.canvas(3.0 * len(results.maps) + 1.2, 3.4)
-    panels = figure.subplots(1, len(results.maps))
+    lines = -(-len(results.maps) // ACROSS)
+    figure = style.canvas(3.0 * ACROSS + 1.2, 3.4 * lines)
+    panels = figure.subplots(lines, ACROSS, squeeze=False)
     top = max(WORTH, *(row[2] for rows in results.maps.values() for row in rows))
-    for axes, (name, rows) in zip(panels, results.maps.items(), strict=True):
+    for axes in panels.ravel()[len(results.maps) :]:
+        axes.set_axis_off()
+    for axes, (name, rows) in zip(panels.ravel(), results.maps.items(), strict=False):
         budgets = [sorted({row[link] for row in rows}) for link in (0, 1)]
         table = np.full([len(of) for of in reversed(budgets)], np.nan)
         for wireless, wireline, difference in rows:
@@ -191,8 +213,11 @@ def draw_search(results: SearchResult) -> bytes:
             axis.set_ticks(range(len(of)), [f"{megabytes:.0f}" for megabytes in of], fontsize=style.SMALL)
         axes.set_xlabel("wireless budget [MB]")
         axes.set_title(name.replace(", ", ",\n"))
-    panels[0].set_ylabel("wireline budget [MB]")
-    figure.colorbar(panels[0].images[0], ax=panels, label=f"predicted gain of the joint plan\n(dots: {WORTH} or more)")
+    for axes in panels[:, 0]:
+        axes.set_ylabel("wireline budget [MB]")
+    figure.colorbar(
+        panels[0, 0].images[0], ax=panels, label=f"predicted gain of the joint plan\n(dots: {WORTH} or more)"
+    )
     return style.png(figure)
 
 

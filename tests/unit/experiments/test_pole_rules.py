@@ -29,7 +29,7 @@ def test_a_seed_that_studies_share_counts_once_by_its_mean() -> None:
 
 
 def test_signs_are_those_of_seeds_with_two_poles_and_both_claims_are_corrected() -> None:
-    results = compare_rules(STUDIES, {61: 0.02, 62: 0.03, 63: 0.04})
+    results = compare_rules(STUDIES, {61: 0.02, 62: 0.03, 63: 0.04}, {})
     assert (results.above, results.below) == (7, 1)
     assert results.sign_p == pytest.approx(2 * (comb(8, 0) + comb(8, 1)) / 2**8)
     assert results.fresh.mean == pytest.approx(0.03)
@@ -49,7 +49,7 @@ def test_the_recipe_differs_in_the_rule_alone_and_claims_that_it_matters() -> No
 
 
 def test_a_mean_below_nothing_did_not_hold() -> None:
-    results = compare_rules({}, {seed: -0.02 - 0.0001 * seed for seed in range(61, 71)})
+    results = compare_rules({}, {seed: -0.02 - 0.0001 * seed for seed in range(61, 71)}, {})
     assert results.verdicts() == ("did not hold", "did not hold")
 
 
@@ -61,4 +61,4 @@ def test_committed_studies_are_read_with_the_numbers_of_their_pages() -> None:
     assert means["retraining, grid"] == pytest.approx(0.009, abs=5e-4)
     assert means["placement, grid"] == pytest.approx(0.083, abs=5e-4)
     assert means["placement, quarter"] == pytest.approx(-0.010, abs=5e-4)
-    assert "| placement, quarter | 8 | 7 | 0 | 1 |" in tabulate_rules(compare_rules(studies, {61: 0.1}))["studies"]
+    assert "| placement, quarter | 8 | 7 | 0 | 1 |" in tabulate_rules(compare_rules(studies, {61: 0.1}, {}))["studies"]
