@@ -242,7 +242,7 @@ def draw_ranking(results: PlanRanking) -> bytes:
     ends = [min(plan.predicted[CLOUD] for plan in results.plans), max(plan.predicted[CLOUD] for plan in results.plans)]
     axes.plot(ends, ends, color=style.MUTED, linewidth=1, label="as predicted")
     axes.set_xlabel("AP50 after cloud FL, predicted by the curve")
-    axes.set_ylabel("trained, mean over seeds, 95 % interval")
+    axes.set_ylabel(f"trained, mean of {len(results.seeds)} seeds, 95 % interval")
     axes.grid(visible=True)
     handles, labels = axes.get_legend_handles_labels()
     style.key(figure, [*dict(zip(labels, handles, strict=True)).values()])

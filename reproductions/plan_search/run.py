@@ -141,7 +141,7 @@ def search_plans(problem: Problem) -> Iterator[Found]:
 
 def read_histories(problem: Problem) -> dict[str, History]:
     """Return the histories of a problem's tasks: those of the package, or what a town's plans reached."""
-    if problem.town is None:
+    if not problem.towns:
         return {
             task: parse_history(task, read_history(task, name, Path()), name) for task, name in problem.tasks.items()
         }

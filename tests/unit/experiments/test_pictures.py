@@ -31,6 +31,7 @@ DRAWN = {  # experiment -> module and function that draw it
     "networks": ("networks", "draw_networks"),
     "people": ("people", "draw_people"),
     "placement": ("placement", "draw_proof"),
+    "plan_ranking": ("plan_ranking", "draw_ranking"),
     "pole_rules": ("pole_rules", "draw_rules"),
     "predictions": ("predictions", "draw_predictions"),
     "radio_labels": ("radio_labels", "draw_labels"),
