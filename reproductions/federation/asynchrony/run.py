@@ -377,7 +377,7 @@ def draw_trajectories(found: Mapping[str, Mapping[str, Mapping[str, Reached]]], 
             rows = [_hold(seeds[seed][name], grid) for seed in seeds]
             panel.plot(grid, np.mean(rows, axis=0), color=colour, label=name, linewidth=1.4)
         panel.set(xlabel="seconds on the network", title=setting)
-    panels[0].set(ylabel="accuracy")
+    panels[0].set(ylabel=f"accuracy, mean of {len(next(iter(found.values())))} seeds")
     style.key(figure, panels[0].get_legend_handles_labels()[0], ncols=3)
     return figure
 

@@ -66,6 +66,7 @@ REGION, SCENES = "ring", 6
 RARE = (6, 7)  # classes of weather that only stragglers see, in the second setting
 ALIKE, UNLIKE = "vehicles alike", "stragglers alone see two weathers"
 SETTINGS = (ALIKE, UNLIKE)
+FIRST_SEED = 11  # those before it were looked at before the number of seeds was planned
 
 
 EVERYBODY, PUNCTUAL = Selection(), Selection(rule="deadline", deadline_s=DEADLINE_S)
@@ -322,13 +323,14 @@ def compare_ways(out: Path, seeds: int, progress: Report = ignore_progress) -> S
     courses: dict[str, dict[str, dict[str, Course]]] = {setting: {} for setting in SETTINGS}
     drawn: dict[str, tuple[str, ...]] = {}
     pictures = 0
-    for seed in range(1, seeds + 1):
+    for number in range(seeds):
+        seed = FIRST_SEED + number
         begun = begin_seed(record_drives(out / f"seed{seed}", seed, progress), seed)
         drawn[str(seed)] = tuple(name.removeprefix(f"{REGION}/") for name in begun[ALIKE].fleet.speeds)
         pictures = len(begun[ALIKE].test.labels)
         for setting, own in begun.items():
             courses[setting][str(seed)] = {name: run_way(way, own) for name, way in WAYS.items()}
-        progress(seed, seeds, f"seed {seed}")
+        progress(number + 1, seeds, f"seed {seed}")
     return summarise(pictures, drawn, courses)
 
 
@@ -394,4 +396,4 @@ def _run(out: Path, options: Options) -> Outcome[StragglersResult]:
     return Outcome(results, {"stragglers.png": draw_courses(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(StragglersResult, _run, tabulate_stragglers, seeds=10, takes=("seeds",))
+EXPERIMENT = Experiment(StragglersResult, _run, tabulate_stragglers, seeds=40, takes=("seeds",))
