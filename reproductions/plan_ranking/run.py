@@ -33,6 +33,7 @@ TASK, HISTORY, WIRELESS = "objects", "tracks", "wireless"
 STAGES = (PRETRAIN, EDGE, CLOUD)
 SAMPLES, ROUNDS = (40, 80, 160), ((1, 4), (3, 1), (6, 4), (10, 1))  # rounds: of edge and cloud FL
 ALIKE = 1.3  # plans are rivals where one costs at most so many times the wireless megabytes of the other
+APART = 0.002  # in predicted AP50, by which the picture parts plans of other samples
 COLOURS = (style.BLUE, style.ORANGE, style.GREEN)  # by samples
 RANKED, RIGHT = "rank correlation of all plans", "pairs of rivals in the right order, less half"
 
@@ -227,22 +228,37 @@ def tabulate_ranking(results: PlanRanking) -> dict[str, str]:
 
 @style.styled
 def draw_ranking(results: PlanRanking) -> bytes:
-    """Return trained against predicted AP50 after cloud FL as a PNG: means over seeds, a colour by samples."""
-    figure = style.canvas(5.6, 4.4)
+    """Return trained against predicted AP50 after cloud FL as a PNG: means over seeds, a colour by samples.
+
+    What seeds differ by on all plans is taken from their rows, so that intervals tell plans of the same seeds apart.
+    """
+    reached = np.array([[plan.reached() for plan in own] for own in results.seeds.values()])
+    level = reached - reached.mean(axis=1, keepdims=True) + reached.mean()
+    figure = style.canvas(6.4, 4.4)
     axes = figure.add_subplot()
     samples = sorted({plan.counts[0] for plan in results.plans})
-    for plan in results.plans:
+    for plan, rows in zip(results.plans, level.T, strict=True):
         count, edge, cloud = plan.counts
-        at, reached = plan.predicted[CLOUD], plan.reached[CLOUD]
-        colour = COLOURS[samples.index(count)]
-        if reached.low is not None and reached.high is not None:
-            axes.plot([at, at], [reached.low, reached.high], color=colour, linewidth=1, alpha=0.5)
-        axes.plot(at, reached.mean, "o", color=colour, markersize=6, label=f"{count} samples")
-        axes.annotate(f"{edge}/{cloud}", (at, reached.mean), (6, 0), textcoords="offset points", va="center")
+        number = samples.index(count)
+        at, mean = plan.predicted[CLOUD] + APART * (number - (len(samples) - 1) / 2), mean_over_seeds(rows.tolist())
+        if mean.low is not None and mean.high is not None:
+            axes.plot([at, at], [mean.low, mean.high], color=COLOURS[number], linewidth=1.5, alpha=0.5)
+        axes.plot(at, mean.mean, "o", color=COLOURS[number], markersize=6, label=f"{count} samples")
+        left = number == 1
+        axes.annotate(
+            f"{edge}/{cloud}",
+            (at, mean.mean),
+            (-7 if left else 7, 0),
+            textcoords="offset points",
+            va="center",
+            ha="right" if left else "left",
+            fontsize=style.SMALL,
+            color=COLOURS[number],
+        )
     ends = [min(plan.predicted[CLOUD] for plan in results.plans), max(plan.predicted[CLOUD] for plan in results.plans)]
     axes.plot(ends, ends, color=style.MUTED, linewidth=1, label="as predicted")
-    axes.set_xlabel("AP50 after cloud FL, predicted by the curve")
-    axes.set_ylabel(f"trained, mean of {len(results.seeds)} seeds, 95 % interval")
+    axes.set_xlabel("AP50 after cloud FL, predicted by the curve; labels: edge/cloud rounds")
+    axes.set_ylabel(f"trained, mean of {len(results.seeds)} seeds without\ntheir levels, 95 % interval")
     axes.grid(visible=True)
     handles, labels = axes.get_legend_handles_labels()
     style.key(figure, [*dict(zip(labels, handles, strict=True)).values()])

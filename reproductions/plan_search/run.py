@@ -32,7 +32,7 @@ from flcav.storage.markdown import format_signed, format_table
 from flcav.storage.records import Record
 
 WORTH = 0.03  # predicted difference that is worth a training
-ACROSS = 4  # heat tables side by side
+ACROSS, MOST_TICKS = 4, 6  # heat tables side by side; labels of an axis that has room for them
 JOINT, RIVALS = "joint", ("equal-stages", "equal-tasks")
 WIRELESS_MB = tuple(np.geomspace(20, 640, 11).tolist())
 WIRELINE_MB = tuple(np.geomspace(10, 320, 6).tolist())
@@ -210,7 +210,9 @@ def draw_search(results: SearchResult) -> bytes:
                 axes.plot(at[1], at[0], "o", color="white", markersize=4)
         axes.imshow(table, origin="lower", vmin=0, vmax=top, cmap="viridis", aspect="auto")
         for axis, of in zip((axes.xaxis, axes.yaxis), budgets, strict=True):
-            axis.set_ticks(range(len(of)), [f"{megabytes:.0f}" for megabytes in of], fontsize=style.SMALL)
+            every = 2 if len(of) > MOST_TICKS else 1
+            ticks = range(0, len(of), every)
+            axis.set_ticks(ticks, [f"{of[tick]:.0f}" for tick in ticks], fontsize=style.SMALL)
         axes.set_xlabel("wireless budget [MB]")
         axes.set_title(name.replace(", ", ",\n"))
     for axes in panels[:, 0]:
