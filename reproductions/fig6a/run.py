@@ -14,7 +14,7 @@ from flcav.experiments import FOLDER
 from flcav.experiments.experiment import Experiment, Options, Outcome
 from flcav.report import style
 from flcav.runs.provenance import Provenance, provenance
-from flcav.runs.results.run import Run, Summary
+from flcav.runs.results.run import Summary
 from flcav.statistics.seeds import MeanOverSeeds, mean_over_seeds
 from flcav.storage.markdown import format_table
 from flcav.storage.records import Record, from_json
@@ -60,26 +60,13 @@ class Listed:
 
 
 @dataclass(frozen=True)
-class Retrained:
-    """A difference that the trainings of one run have, by name."""
-
-    name: str
-
-    def read(self, folder: Path) -> MeanOverSeeds:
-        """Return its mean over the run's trainings, whose interval is over these and over test scenes."""
-        found = next(each for each in Run.load(folder).differences if each.name == self.name)
-        assert found.over_trainings is not None
-        return found.over_trainings
-
-
-@dataclass(frozen=True)
 class Step:
     """A row of the table: what is compared with what, and where its numbers are."""
 
     name: str
     kind: str  # `SCHEME` or `CONTROL`
     study: str  # folder of reproductions
-    source: Stored | Paired | Listed | Retrained
+    source: Stored | Paired | Listed
 
 
 JOINED, TRACKS = "tracks and road labels, {} pole", "tracks, no road sensor"
@@ -157,13 +144,13 @@ STEPS = (
         "joint plan - equal stages, 80 MB + 20 MB, after edge FL",
         SCHEME,
         "runs/allocation_tracks",
-        Retrained("grid and ring, objects: edge FL - edge FL (equal)"),
+        Listed("grid and ring, objects: edge FL - edge FL (equal)"),
     ),
     Step(
         "joint plan - equal stages, 80 MB + 20 MB, after cloud FL",
         SCHEME,
         "runs/allocation_tracks",
-        Retrained("grid and ring, objects: edge + cloud FL - edge + cloud FL (equal)"),
+        Listed("grid and ring, objects: edge + cloud FL - edge + cloud FL (equal)"),
     ),
     Step(
         "two vehicles a round by importance - all",
@@ -226,13 +213,12 @@ def read_steps(reproductions: Path) -> SchemesResult:
 
 def tabulate_schemes(results: SchemesResult) -> dict[str, str]:
     """Return Markdown by name: schemes."""
-    heads = ("difference", "kind", "mean, 95 % interval", "seeds or trainings", "study")
+    heads = ("difference", "kind", "mean, 95 % interval", "seeds", "study")
     rows = []
     for step in STEPS:
         mean = results.differences[step.name]
         link = f"[{step.study.rpartition('/')[2]}](../{step.study}/README.md)"
-        of = "trainings" if isinstance(step.source, Retrained) else "seeds"
-        rows.append([step.name, step.kind, mean.describe(sign=True), f"{mean.seeds} {of}", link])
+        rows.append([step.name, step.kind, mean.describe(sign=True), f"{mean.seeds} seeds", link])
     return {"schemes": format_table(heads, rows)}
 
 

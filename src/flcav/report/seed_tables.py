@@ -89,7 +89,10 @@ def _labels(runs: Sequence[Run]) -> str:
 
 
 def draw_seeds(runs: Sequence[Run]) -> bytes:
-    """Return a PNG of the differences of the primary claims and of the dearest cost at home, a row per seed."""
+    """Return a PNG of the differences of the primary claims and of the dearest cost at home, a row per seed.
+
+    A claim of arms that do not differ up to its stage, in no seed, is left out if there are others.
+    """
     panels: dict[str, dict[str, Estimate]] = {}
     settings = resolve_settings(runs[0].recipe)
     for run in runs:
@@ -99,6 +102,7 @@ def draw_seeds(runs: Sequence[Run]) -> bytes:
             panels.setdefault(f"{claim}:\n{run.tested[0].measure} in {difference.region}", {})[seed] = (
                 difference.estimate
             )
+    panels = {title: rows for title, rows in panels.items() if any(each.mean for each in rows.values())} or panels
     mean = {(row.region, row.task, row.measure): 0.0 for row in list_home_costs(runs[0])}
     for run in runs:
         for row in list_home_costs(run):

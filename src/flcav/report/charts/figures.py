@@ -130,7 +130,8 @@ def seeds(panels: Mapping[str, Mapping[str, Estimate]]) -> Figure:
         lines = [line for part in title.splitlines() for line in textwrap.wrap(part, TITLE)]
         axes.set_title("\n".join(lines), fontweight="bold")
         told = [f"{word} 0 in {count}" for word, count in (("above", better), ("below", worse)) if count]
-        axes.set_xlabel(f"{', '.join(told) or 'containing 0'} of {len(rows)} intervals (95 %)")
+        counted = f"{', '.join(told)} of" if told else "0 in all of"
+        axes.set_xlabel(f"{counted} {len(rows)} intervals (95 %)")
         axes.set_yticks(range(len(names)), names)
         axes.set_ylim(len(names) - 0.5, -0.5)
         axes.grid(axis="x")
