@@ -13,7 +13,7 @@ from typing import Any
 
 from scipy.stats import binomtest
 
-from flcav.config import read_json
+from flcav.config import Json, read_json
 from flcav.experiments import FOLDER
 from flcav.experiments.experiment import Experiment, Options, Outcome, shrink_recipe
 from flcav.report import style
@@ -53,6 +53,7 @@ class PoleRules(Record):
     below: int
     sign_p: float  # of the sign test, two-sided
     corrected: tuple[float, float]  # p-values of the fresh seeds' mean and of the signs, after Holm
+    recipe: Mapping[str, Json]  # of the fresh seeds, without their seed
     provenance: Provenance
 
     def verdicts(self) -> tuple[str, str]:
@@ -128,8 +129,11 @@ def pool_seeds(studies: Mapping[str, Study]) -> dict[tuple[str, int], float]:
     return {key: sum(own) / len(own) for key, own in found.items()}
 
 
-def compare_rules(studies: Mapping[str, Study], fresh: Differences) -> PoleRules:
-    """Return both claims: the mean of the fresh seeds is above 0, and the signs of all seeds are mostly positive."""
+def compare_rules(studies: Mapping[str, Study], fresh: Differences, recipe: Mapping[str, Json]) -> PoleRules:
+    """Return both claims: the mean of the fresh seeds is above 0, and the signs of all seeds are mostly positive.
+
+    `recipe` is that of the fresh seeds.
+    """
     every = {**studies, FRESH: Study(TOWN, fresh)}
     pooled = pool_seeds(every).values()
     above, below = sum(value > 0 for value in pooled), sum(value < 0 for value in pooled)
@@ -137,7 +141,7 @@ def compare_rules(studies: Mapping[str, Study], fresh: Differences) -> PoleRules
     mean = mean_over_seeds([*fresh.values()])
     own_p = mean.p_value()
     first, second = correct_p_values([1.0 if own_p is None else own_p, sign_p])
-    return PoleRules(every, mean, above, below, sign_p, (first, second), provenance())
+    return PoleRules(every, mean, above, below, sign_p, (first, second), recipe, provenance())
 
 
 def tabulate_rules(results: PoleRules) -> dict[str, str]:
@@ -199,8 +203,8 @@ def draw_rules(results: PoleRules) -> bytes:
 def _run(out: Path, options: Options) -> Outcome[PoleRules]:
     recipe = options.load("poles", shrink_recipe)
     fresh = read_runs(options.run_seeds(recipe, out))
-    results = compare_rules(read_studies(FOLDER), fresh)
+    results = compare_rules(read_studies(FOLDER), fresh, recipe.model_dump(mode="json", exclude={"seed"}))
     return Outcome(results, {"rules.png": draw_rules(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(PoleRules, _run, tabulate_rules, seeds=12)
+EXPERIMENT = Experiment(PoleRules, _run, tabulate_rules, seeds=40, recipe="poles")
