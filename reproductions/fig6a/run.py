@@ -116,6 +116,7 @@ STEPS = (
         "distillation",
         Paired((JOINED.format("VRCSP"), "ap50"), (JOINED.format("densest"), "ap50")),
     ),
+    Step("VRCSP pole - densest pole, fresh seeds", SCHEME, "pole_rules", Stored(("fresh",))),
     Step(
         "edge + cloud FL - edge FL, in grid",
         SCHEME,
