@@ -121,7 +121,8 @@ def test_infer_takes_files_folders_and_datasets(data, weights, tmp_path, capsys)
     ("content", "sentence"),
     [
         (b"", "empty"),
-        (b"123456789", "truncated"),
+        (b"\x00\x00\x80\x3f56789", "truncated"),
+        (b"123456789", "a text file"),
         (np.full((3, 4), np.nan, np.float32).tobytes(), "not finite"),
         (None, "no such file"),
     ],
