@@ -278,4 +278,4 @@ def _run(out: Path, options: Options) -> Outcome[PlanRanking]:
     return Outcome(results, {"ranking.png": draw_ranking(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(PlanRanking, _run, tabulate_ranking, seeds=6, recipe="plan_ranking")
+EXPERIMENT = Experiment(PlanRanking, _run, tabulate_ranking, seeds=4, recipe="plan_ranking")

@@ -207,4 +207,4 @@ def _run(out: Path, options: Options) -> Outcome[PoleRules]:
     return Outcome(results, {"rules.png": draw_rules(results)}, results.sentences())
 
 
-EXPERIMENT = Experiment(PoleRules, _run, tabulate_rules, seeds=40, recipe="poles")
+EXPERIMENT = Experiment(PoleRules, _run, tabulate_rules, seeds=30, recipe="poles")
