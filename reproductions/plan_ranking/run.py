@@ -1,8 +1,8 @@
 """Predicted against realised accuracy of plans that are trained apart: how the learning curve of MLGRA ranks them.
 
 Each plan is a run of its own, from its samples to its last cloud round (recipes/runs/plan_ranking.yaml); runs of a seed
-share their recorded frames, and those of as many samples their pretrained network. The curve is that of the history
-`tracks`, which is of other seeds and has the rounds of one long run as its points.
+share pool, registry and test frames, and those of as many samples end pretraining with the same network. The curve is
+that of the history `tracks`, which is of other seeds and has the rounds of one long run as its points.
 """
 
 from collections.abc import Mapping, Sequence
@@ -110,7 +110,7 @@ def read_plan(run: Run) -> TrainedPlan:
 def collect_history(seeds: Mapping[str, Sequence[TrainedPlan]], towns: Sequence[str]) -> History:
     """Return what plans reached after each of their stages in the mean of towns, as the history of a learning curve.
 
-    Plans of a seed that have as many samples share their pretrained network, which is one point.
+    Plans of a seed that have as many samples begin with the same pretrained network, which is one point.
     """
     points = {
         (seed, spent, float(np.mean([plan.ap50[stage][town] for town in towns])))

@@ -323,14 +323,13 @@ def compare_ways(out: Path, seeds: int, progress: Report = ignore_progress) -> S
     courses: dict[str, dict[str, dict[str, Course]]] = {setting: {} for setting in SETTINGS}
     drawn: dict[str, tuple[str, ...]] = {}
     pictures = 0
-    for number in range(seeds):
-        seed = FIRST_SEED + number
+    for done, seed in enumerate(range(FIRST_SEED, FIRST_SEED + seeds), start=1):
         begun = begin_seed(record_drives(out / f"seed{seed}", seed, progress), seed)
         drawn[str(seed)] = tuple(name.removeprefix(f"{REGION}/") for name in begun[ALIKE].fleet.speeds)
         pictures = len(begun[ALIKE].test.labels)
         for setting, own in begun.items():
             courses[setting][str(seed)] = {name: run_way(way, own) for name, way in WAYS.items()}
-        progress(number + 1, seeds, f"seed {seed}")
+        progress(done, seeds, f"seed {seed}")
     return summarise(pictures, drawn, courses)
 
 
